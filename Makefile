@@ -1,0 +1,55 @@
+.POSIX:
+PYTHON ?= python3
+BIN = .venv/bin
+PIP = $(BIN)/python -m pip --quiet --disable-pip-version-check install
+
+.PHONY: help fit test test-fast bench clean
+
+help:
+	@echo "make fit        fit a bundled measured target; writes report and figure to out/fit"
+	@echo "make test       ruff, basedpyright and the whole test suite"
+	@echo "make test-fast  the tests that are not marked slow"
+	@echo "make bench      measure speed; writes out/bench.json"
+	@echo "make clean      remove outputs and caches, but not .venv"
+	@echo "Another interpreter: make PYTHON=python3.12 fit"
+
+fit: .venv/.stamp-run
+	$(BIN)/jaxmuscle fit vastus-lateralis-26mvc --out out/fit
+
+test: .venv/.stamp-test
+	$(BIN)/ruff check
+	$(BIN)/ruff format --check
+	$(BIN)/basedpyright
+	$(BIN)/python -m pytest -q
+
+test-fast: .venv/.stamp-test
+	$(BIN)/python -m pytest -q -m "not slow"
+
+bench: .venv/.stamp-bench
+	$(BIN)/python benchmarks/run.py --out out/bench.json
+
+clean:
+	rm -rf out dist build .test-out .pytest_cache .ruff_cache .hypothesis
+	find . -path ./.venv -prune -o -type d -name __pycache__ -prune -exec rm -rf {} +
+
+.venv/.stamp-run: pyproject.toml
+	@command -v $(PYTHON) >/dev/null || \
+	  { echo "error: $(PYTHON) not found; name a Python >= 3.11: make PYTHON=/path/to/python" >&2; exit 1; }
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
+	  { echo "error: jaxmuscle needs Python >= 3.11, but $(PYTHON) is $$($(PYTHON) --version 2>&1);" \
+	         "name another: make PYTHON=/path/to/python" >&2; exit 1; }
+	@echo "Installing jaxmuscle into .venv (a few minutes the first time)"
+	@$(PYTHON) -m venv .venv
+	@$(PIP) --upgrade pip
+	@$(PIP) --editable '.[all]'
+	@touch $@
+
+.venv/.stamp-test: .venv/.stamp-run
+	@echo "Installing the test tools into .venv"
+	@$(PIP) --group test
+	@touch $@
+
+.venv/.stamp-bench: .venv/.stamp-run
+	@echo "Installing the benchmark tools into .venv"
+	@$(PIP) --group bench
+	@touch $@

@@ -1,0 +1,35 @@
+"""What the fitting scripts share: arguments, fit, report, files."""
+
+import argparse
+from pathlib import Path
+
+import jaxmuscle as jm
+from jaxmuscle.plot import fit as figure
+
+
+def arguments(description: str, *, csv: bool) -> argparse.Namespace:
+    """Command line of a script; `csv` adds the user's own digitised spectrum."""
+    parser = argparse.ArgumentParser(description=description)
+    if csv:
+        parser.add_argument("csv", nargs="?", help="your own digitised spectrum (two columns: Hz, proportional power)")
+        parser.add_argument("--segments", type=int, help="Welch segments behind that spectrum")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--out", type=Path, default=None, help="default: out/fitting/NAME")
+    return parser.parse_args()
+
+
+def load(name: str, options: argparse.Namespace) -> jm.Target:
+    """The user's CSV if one was given, else the bundled target."""
+    if getattr(options, "csv", None):
+        return jm.load_target(options.csv, quantity=jm.load_target(name).quantity, segments=options.segments)
+    return jm.load_target(name)
+
+
+def report(result: jm.FitResult, name: str, out: Path | None) -> None:
+    """Print the result and write `fit.json` and `fit.png`."""
+    folder = out or Path("out/fitting") / name
+    folder.mkdir(parents=True, exist_ok=True)
+    result.save(folder / "fit.json")
+    figure(result).savefig(folder / "fit.png", dpi=150)
+    print(result)
+    print(f"written: {folder}/fit.json, fit.png")

@@ -1,0 +1,17 @@
+"""Index-finger abduction force at 45 % MVC, measured: mean of two people, 4 Welch segments in all."""
+
+from common import arguments, load, report
+
+import jaxmuscle as jm
+
+NAME = "fdi-abduction-45mvc"
+
+
+def fit(target: jm.Target, seed: int = 0) -> jm.FitResult:
+    """All default parameters free, band-limited noise."""
+    return jm.fit(jm.task_for(target), target, key=seed)
+
+
+if __name__ == "__main__":
+    options = arguments(__doc__ or "", csv=False)
+    report(fit(load(NAME, options), options.seed), NAME, options.out)

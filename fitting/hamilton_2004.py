@@ -1,0 +1,17 @@
+"""Hamilton, Jones & Wolpert (2004): reconstructed from the text, or your own digitised figure."""
+
+from common import arguments, load, report
+
+import jaxmuscle as jm
+
+NAME = "hamilton-2004"
+
+
+def fit(target: jm.Target, seed: int = 0) -> jm.FitResult:
+    """All default parameters free, band-limited noise."""
+    return jm.fit(jm.task_for(target), target, key=seed)
+
+
+if __name__ == "__main__":
+    options = arguments(__doc__ or "", csv=True)
+    report(fit(load(NAME, options), options.seed), NAME, options.out)

@@ -1,0 +1,17 @@
+"""Knee-extension force at 26 % MVC, measured: one person, 12 Welch segments."""
+
+from common import arguments, load, report
+
+import jaxmuscle as jm
+
+NAME = "vastus-lateralis-26mvc"
+
+
+def fit(target: jm.Target, seed: int = 0) -> jm.FitResult:
+    """All default parameters free, band-limited noise."""
+    return jm.fit(jm.task_for(target), target, key=seed)
+
+
+if __name__ == "__main__":
+    options = arguments(__doc__ or "", csv=False)
+    report(fit(load(NAME, options), options.seed), NAME, options.out)

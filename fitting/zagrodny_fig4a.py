@@ -1,0 +1,62 @@
+"""The paper's Figure 4a: Task 1 with the paper's noise and harmonic frequency, reconstructed from the text.
+
+This is the fit behind the preset `zagrodny-slifkin`; `--preset FILE` writes it (four significant digits). The masses,
+reference displacements and the starting values are those of design.md, section 12, which shows that such parameters
+exist; noise amplitudes and harmonic frequency are the paper's and stay fixed.
+"""
+
+import argparse
+from pathlib import Path
+
+import jax
+import numpy as np
+from common import load, report
+
+import jaxmuscle as jm
+from jaxmuscle import save_preset
+
+NAME = "zagrodny-fig4a"
+OTHER = "slifkin-newell-1999-95mvc"
+FREE = ("k_w", "k_z", "c_w", "c_z", "harmonic_amplitude")
+START = {"m_w": 0.1, "k_w": 1.25e6, "k_z": 1.25e6, "c_w": 2.0, "c_z": 130.0, "F_ext": 10.0, "x_z": 0.0,
+         "harmonic_amplitude": 4e-4, "harmonic_frequency": 4.25}  # fmt: skip
+PAPER_NOISE = {"K_w": 0.0016, "K_z": 0.0016, "C_w": 1e-4, "C_z": 1e-4}
+
+
+def fit(target: jm.Target, seed: int = 0) -> jm.FitResult:
+    """Stiffness, damping and harmonic amplitude free."""
+    task = jm.PrescribedMotion(noise=jm.BandLimitedNoise(PAPER_NOISE), settings=target.settings).replace(**START)
+    return jm.fit(task, target, free=FREE, starts=4, key=seed)
+
+
+def rounded(task: jm.AbstractTask) -> jm.AbstractTask:
+    """The fitted values to four significant digits."""
+    return task.replace(**{name: float(f"{float(task[name]):.4g}") for name in FREE})
+
+
+def distance(task: jm.AbstractTask, target: jm.Target) -> float:
+    """Root mean square of the log ratio between the mean spectrum of 200 seeds and a target."""
+    power = jm.ensemble(task, jax.random.key(1), seeds=200).spectrum().mean().proportional
+    return float(np.std(np.log(np.asarray(power)) - np.log(target.proportional_power)))
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("csv", nargs="?", help="your own digitised spectrum (two columns: Hz, proportional power)")
+    parser.add_argument("--segments", type=int, help="Welch segments behind that spectrum")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--out", type=Path, default=None, help="default: out/fitting/NAME")
+    parser.add_argument("--preset", type=Path, help="write the preset to this file")
+    options = parser.parse_args()
+    target = load(NAME, options)
+    result = fit(target, options.seed)
+    report(result, NAME, options.out)
+    task = rounded(result.task)
+    near, far = distance(task, target), distance(task, jm.load_target(OTHER))
+    print(f"rms log distance of the preset: {near:.3f} to {NAME}, {far:.3f} to {OTHER}")
+    if options.preset:
+        description = "Task 1 with the paper's noise (0.16 %, 0.01 %) and 4.25 Hz harmonic, fitted to zagrodny-fig4a"
+        made = {"target": target.name, "command": "python fitting/zagrodny_fig4a.py", "seed": options.seed,
+                "rms_log_distance": {NAME: round(near, 3), OTHER: round(far, 3)},
+                "jaxmuscle": result.versions["jaxmuscle"]}  # fmt: skip
+        save_preset(options.preset, task, description=description, fit=made)

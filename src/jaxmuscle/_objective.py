@@ -1,0 +1,195 @@
+"""What a Monte Carlo fit compares: mean Welch powers over fixed noise paths, as a function of free coordinates."""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.signal
+from jaxtyping import Array, Float
+
+from ._noise import Realisation
+from ._parameter import PARAMETERS, Parameter, set_parameters
+from ._path import Grid
+from ._simulate import respond
+from ._spectrum import SpectrumSettings
+from ._task import AbstractTask
+
+
+class Coordinates(eqx.Module):
+    """Free parameters as unconstrained numbers.
+
+    `θ = (ln v - ln v0) / sd` for positive parameters, `(v - v0) / sd` for others, v0 the task's own value and sd the
+    prior's; a parameter with two finite bounds is `θ = low + (high - low) sigmoid(s)`, otherwise θ = s.
+    """
+
+    names: tuple[str, ...] = eqx.field(static=True)
+    centre: Float[np.ndarray, " free"]
+    sd: Float[np.ndarray, " free"]
+    positive: np.ndarray
+    low: Float[np.ndarray, " free"]
+    high: Float[np.ndarray, " free"]
+
+    @classmethod
+    def of(cls, values: dict[str, float], bounds: dict[str, tuple[float, float]], sds: dict[str, float]) -> "Coordinates":
+        """Coordinates about the given values. Raises `ValueError` for one that cannot be fitted."""
+        rows = {name: PARAMETERS.get(name, _generic(name)) for name in values}
+        low, high = [], []
+        for name, value in values.items():
+            row = rows[name]
+            a, b = bounds.get(name, (row.fit_lower, row.fit_upper))
+            if row.positive and not value > 0:
+                raise ValueError(
+                    f"{name} = {value} cannot be fitted: it is fitted in log space, start from a positive value"
+                )
+            if not a < value < b:
+                raise ValueError(f"{name} = {value} {row.unit} must lie inside its bounds ({a}, {b})")
+            low.append((_log(a) - np.log(value)) / sds[name] if row.positive else (a - value) / sds[name])
+            high.append((_log(b) - np.log(value)) / sds[name] if row.positive else (b - value) / sds[name])
+        positive = np.array([rows[name].positive for name in values])
+        centre = np.array([float(v) for v in values.values()])
+        sd = np.array([sds[name] for name in values])
+        return cls(tuple(values), centre, sd, positive, *_both_or_none(np.array(low), np.array(high)))
+
+    def theta(self, s: Float[Array, " free"]) -> Float[Array, " free"]:
+        """Coordinates in standard deviations of the prior."""
+        bounded = jnp.isfinite(self.low)
+        low, high = jnp.where(bounded, self.low, 0.0), jnp.where(bounded, self.high, 1.0)
+        return jnp.where(bounded, low + (high - low) * jax.nn.sigmoid(s), s)
+
+    def from_theta(self, theta: Float[np.ndarray, "*batch free"]) -> Float[np.ndarray, "*batch free"]:
+        """The reverse of `theta`, clipped into the bounds."""
+        bounded = np.isfinite(self.low)
+        low, high = np.where(bounded, self.low, 0.0), np.where(bounded, self.high, 1.0)
+        share = np.clip((theta - low) / (high - low), 1e-3, 1 - 1e-3)
+        return np.where(bounded, np.log(share / (1 - share)), theta)
+
+    def values(self, theta: Float[Array, " free"]) -> dict[str, Float[Array, ""]]:
+        """Natural values of the parameters at θ."""
+        centre = jnp.asarray(self.centre)
+        step = jnp.asarray(self.sd) * theta
+        natural = jnp.where(
+            jnp.asarray(self.positive),
+            centre * jnp.exp(jnp.where(jnp.asarray(self.positive), step, 0.0)),
+            centre + step,
+        )
+        return dict(zip(self.names, natural, strict=True))
+
+    def slope(self, values: Float[np.ndarray, " free"]) -> Float[np.ndarray, " free"]:
+        """dv/dθ at natural values."""
+        return np.where(self.positive, values, 1.0) * self.sd
+
+
+def _log(value: float) -> float:
+    return -np.inf if value <= 0 else float(np.log(value))
+
+
+def _generic(name: str) -> Parameter:
+    return Parameter(name, name, "", 1.0, 0.0, np.inf, 1.0, True, "", "a user's own", 0.0, np.inf)
+
+
+def _both_or_none(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Where only one bound is finite the other is set 20 prior standard deviations beyond the centre."""
+    some = np.isfinite(low) | np.isfinite(high)
+    low = np.where(some & ~np.isfinite(low), -20.0, low)
+    high = np.where(some & ~np.isfinite(high), 20.0, high)
+    return np.where(some, low, -np.inf), np.where(some, high, np.inf)
+
+
+def welch_operator(
+    settings: SpectrumSettings, samples: int, window: tuple[float, float]
+) -> Float[np.ndarray, "parts samples"]:
+    """The linear part of `spectrum_of` as one matrix.
+
+    Low-pass, window, detrending, taper and transform are linear, so a Welch power is `Σ (A x)²` over the rows of its
+    bin; the rows are ordered (segments and real/imaginary part, bins), scaled so that the sum is the power itself.
+    """
+    x = np.eye(samples)
+    if settings.sections is not None:
+        both = settings.filter_direction == "both"
+        low_pass: Any = scipy.signal.sosfiltfilt if both else scipy.signal.sosfilt
+        x = np.asarray(low_pass(settings.sections, x))
+    x = x[:, round(window[0] * settings.rate) : round(window[1] * settings.rate)]
+    count, n = settings.segments(x.shape[1]), settings.length
+    if count < 1:
+        raise ValueError(f"window {window} s is shorter than one segment of {n} samples at {settings.rate} Hz")
+    parts = []
+    bins = np.arange(settings.first_bin, settings.last_bin + 1)
+    doubled = np.where((bins == 0) | (2 * bins == n), 1.0, 2.0)
+    scale = np.sqrt(doubled / (settings.rate * np.sum(settings.taper**2) * count))
+    for k in range(count):
+        segment = x[:, k * settings.step : k * settings.step + n]
+        if settings.detrend != "none":
+            segment = scipy.signal.detrend(segment, type=settings.detrend)
+        transform = np.fft.rfft(np.asarray(segment) * settings.taper)[:, bins] * scale
+        parts += [transform.real.T, transform.imag.T]
+    return np.concatenate(parts)
+
+
+class Moments(NamedTuple):
+    """Mean over seeds of what is compared: Welch power per bin, that of the harmonic alone, mean and variance."""
+
+    power: Float[Array, " bins"]
+    line: Float[Array, " bins"]
+    mean: Float[Array, ""]
+    variance: Float[Array, ""]
+
+    @property
+    def proportional(self) -> Float[Array, " bins"]:
+        """Proportional power on the compared bins."""
+        return self.power / jnp.sum(self.power)
+
+    @property
+    def variation(self) -> Float[Array, ""]:
+        """Coefficient of variation."""
+        return jnp.sqrt(self.variance) / jnp.abs(self.mean)
+
+
+class MonteCarlo(eqx.Module):
+    """Mean spectrum of a task over fixed noise paths (common random numbers).
+
+    `noise` holds normals, or unit paths when no free parameter changes them; its first entry is zero, which gives the
+    harmonic's own response. That is taken off every seed before the spectrum and its power added after: the cross term
+    between line and noise has expectation zero, yet for fixed paths it makes the cost ripple with the frequency.
+    """
+
+    noise: Any
+    operator: Float[Array, "parts samples"]
+    chosen: np.ndarray
+    grid: Grid
+    window: tuple[float, float] = eqx.field(static=True)
+
+    @classmethod
+    def of(cls, task: AbstractTask, normals: Any, grid: Grid, chosen: np.ndarray, window: tuple[float, float], *,
+           colour_free: bool) -> "MonteCarlo":  # fmt: skip
+        """Prepare for the task's settings; `chosen` are the positions of the compared bins among the settings' bins."""
+        normals = jnp.concatenate([jnp.zeros_like(normals[:1]), normals])
+        noise = normals if colour_free else jax.jit(jax.vmap(lambda z: task.noise.realise(z, grid.dt)))(normals)
+        operator = welch_operator(task.settings, grid.steps // grid.every + 1, window)
+        return cls(noise, jnp.asarray(operator), chosen, grid, window)
+
+    def moments(self, task: AbstractTask) -> Moments:
+        """Moments of the task's output."""
+        settings = task.settings
+
+        def one(entry):
+            path = entry if isinstance(entry, Realisation) else task.noise.realise(entry, self.grid.dt)
+            return respond(task, path, self.grid, settings.sampling)[1]
+
+        outputs = jax.vmap(one)(self.noise)
+        quiet, noisy = outputs[:1], outputs[1:] - outputs[:1]
+        start, stop = (round(edge * settings.rate) for edge in self.window)
+        line, random = jnp.mean(self._power(quiet, settings), 0), jnp.mean(self._power(noisy, settings), 0)
+        variance = jnp.var(quiet[0, start:stop]) + jnp.mean(jnp.var(noisy[:, start:stop], axis=1))
+        return Moments(line + random, line, jnp.mean(outputs[1:, start:stop]), variance)
+
+    def _power(self, outputs: Float[Array, "seeds samples"], settings: SpectrumSettings) -> Float[Array, "seeds bins"]:
+        bins = settings.last_bin - settings.first_bin + 1
+        parts = (outputs @ self.operator.T).reshape(len(outputs), -1, bins)
+        return jnp.sum(parts**2, axis=1)[:, self.chosen]
+
+
+def at(task: AbstractTask, coordinates: Coordinates, theta: Float[Array, " free"]) -> AbstractTask:
+    """The task at coordinates θ."""
+    return set_parameters(task, coordinates.values(theta))

@@ -1,0 +1,74 @@
+"""The operating point of a task: equilibrium under its held inputs, and its eigenvalues."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+from jaxtyping import Array, Float
+
+from ._parameter import as_arrays
+from ._task import AbstractTask
+
+HOLD = 15.0
+
+
+class OperatingPointError(ValueError):
+    """A task has no usable equilibrium."""
+
+
+def equilibrium(task: AbstractTask, time: float = HOLD) -> Float[Array, " states"]:
+    """State y with `vector_field(time, y, 0) = 0` [m, m/s], by Newton's method; differentiable (implicitly).
+
+    Not finite where there is none: `operating_point` turns that into an error.
+    """
+    task = as_arrays(task)
+    still = jnp.zeros(4)
+    dtype = jnp.result_type(float)
+    tolerance = 1e-12 if dtype == jnp.float64 else 1e-6
+    solution = optx.root_find(
+        lambda y, _: task.vector_field(jnp.asarray(time, dtype), y, still),
+        optx.Newton(rtol=tolerance, atol=tolerance),
+        task.initial_state(),
+        max_steps=200,
+        throw=False,
+    )
+    return jnp.where(solution.result == optx.RESULTS.successful, solution.value, jnp.nan)
+
+
+def jacobian(task: AbstractTask, y: Float[Array, " states"], time: float = HOLD) -> Float[Array, "states states"]:
+    """Jacobian [1/s] of the vector field with respect to the state at y."""
+    task = as_arrays(task)
+    return jax.jacfwd(lambda y: task.vector_field(jnp.asarray(time, y.dtype), y, jnp.zeros(4)))(y)
+
+
+def slowest_rate(task: AbstractTask, time: float = HOLD) -> Float[Array, ""]:
+    """Smallest |eigenvalue| [1/s] at the operating point; differentiable."""
+    eigenvalues = jnp.linalg.eigvals(jacobian(task, equilibrium(task, time), time))
+    return jnp.min(jnp.abs(eigenvalues))
+
+
+def operating_point(task: AbstractTask, time: float = HOLD) -> tuple[np.ndarray, np.ndarray]:
+    """Equilibrium and its eigenvalues as numbers. Raises `OperatingPointError` if there is no equilibrium."""
+    with jax.enable_x64(True):
+        points, jacobians = _linearisations(as_arrays(task), (time,))
+        if not np.all(np.isfinite(points[-1])):
+            raise OperatingPointError(
+                f"{type(task).__name__} has no equilibrium at t = {time} s under its inputs "
+                f"(K_w0, K_z0, C_w0, C_z0 = {np.asarray(as_arrays(task).muscle.base())}): a stiffness must balance them"
+            )
+        return np.asarray(points[-1]), np.linalg.eigvals(np.asarray(jacobians[-1]))
+
+
+def fastest_rate(task: AbstractTask, duration: float) -> float:
+    """Largest |eigenvalue| [1/s] at the start and under the inputs at mid-run and end, for the stability of a step."""
+    with jax.enable_x64(True):
+        _, jacobians = _linearisations(as_arrays(task), (duration / 2, duration))
+        return float(max(np.abs(np.linalg.eigvals(j)).max() for j in np.asarray(jacobians) if np.all(np.isfinite(j))))
+
+
+@eqx.filter_jit
+def _linearisations(task, times):
+    """Initial state and equilibria at the given times, with the Jacobians there."""
+    points = jnp.stack([task.initial_state(), *(equilibrium(task, t) for t in times)])
+    return points, jnp.stack([jacobian(task, y, t) for y, t in zip(points, (times[-1], *times), strict=True)])

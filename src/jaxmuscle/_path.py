@@ -1,0 +1,155 @@
+"""The integrator: a Brownian path on the step grid and a sub-cycled Heun solver, for diffrax."""
+
+from typing import Any, ClassVar
+
+import diffrax as dfx
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import lineax as lx
+from jaxtyping import Array, Float
+
+from ._noise import Realisation
+from ._task import AbstractTask
+
+
+class Grid(eqx.Module):
+    """Time steps of a simulation: `steps` of `dt` [s], every `every`-th kept, each integrated in `substeps` parts.
+
+    The integration variable is the step number, which floating point represents exactly in either precision.
+    """
+
+    dt: float = eqx.field(static=True)
+    steps: int = eqx.field(static=True)
+    every: int = eqx.field(static=True)
+    substeps: int = eqx.field(static=True, default=1)
+
+
+class GridPath(dfx.AbstractBrownianPath):
+    """Brownian motion given by its increments on the unit grid, linear in between (so sub-steps share one path)."""
+
+    increments: Float[Array, "steps channels"]
+    levy_area: ClassVar[Any] = dfx.BrownianIncrement
+
+    @property
+    def t0(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return 0
+
+    @property
+    def t1(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return self.increments.shape[0]
+
+    def evaluate(self, t0, t1=None, left=True, use_levy=False):
+        if t1 is None or use_levy:
+            raise NotImplementedError("GridPath gives increments between two times of one step, without Lévy area")
+        return self.increments[_whole(t0, self.t1 - 1)] * (t1 - t0)
+
+
+class SubcycledHeun(dfx.AbstractStratonovichSolver):
+    """Heun's method, `cycles` steps of size `size` in one solver step: second order in the drift.
+
+    One diffrax step per saved sample keeps saving and reverse-mode checkpoints out of the inner loop.
+    """
+
+    cycles: int = eqx.field(static=True)
+    size: float = eqx.field(static=True)
+    term_structure: ClassVar[Any] = dfx.AbstractTerm
+    interpolation_cls: ClassVar[Any] = dfx.LocalLinearInterpolation
+
+    def order(self, terms):
+        return 2
+
+    def strong_order(self, terms):
+        return 0.5
+
+    def init(self, terms, t0, t1, y0, args):
+        return None
+
+    def func(self, terms, t0, y0, args):
+        return terms.vf(t0, y0, args)
+
+    def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
+        def heun(y, start):
+            stop = start + self.size
+            control = terms.contr(start, stop)
+            slope = terms.vf_prod(start, y, args, control)
+            return y + 0.5 * (slope + terms.vf_prod(stop, y + slope, args, control)), None
+
+        # Step numbers must be whole to find their noise, but diffrax rounds t0, a fraction of the interval; and XLA
+        # rounds a product with `size`: so whole steps and parts of a step are counted in integers.
+        dtype, parts = jnp.result_type(t0), round(1 / self.size)
+        whole, part = jnp.divmod(jnp.arange(self.cycles), parts)
+        starts = jnp.round(t0) + whole.astype(dtype) + part.astype(dtype) / parts
+        y1, _ = jax.lax.scan(heun, y0, starts)
+        return y1, None, {"y0": y0, "y1": y1}, None, dfx.RESULTS.successful
+
+
+def _whole(s: Any, last: int) -> Any:
+    return jnp.clip(jnp.floor(s).astype(int), 0, last)
+
+
+def perturbation_at(task: AbstractTask, path: Realisation, grid: Grid) -> Any:
+    """The perturbation u as a function of the step number: sampled noise (interpolated in sub-steps) and harmonic."""
+    scale, harmonic = task.noise_scale(), _harmonic(task)
+
+    def u(s):
+        rhythm = harmonic(s * grid.dt)
+        if path.values is None:
+            return rhythm
+        k = _whole(s, grid.steps)
+        noise = path.values[k]
+        if grid.substeps > 1:
+            after = path.values[jnp.minimum(k + 1, grid.steps)]
+            noise = noise + (s - k.astype(s.dtype)) * (after - noise)
+        return scale * noise + rhythm
+
+    return u
+
+
+def _harmonic(task: AbstractTask) -> Any:
+    base = task.harmonic_base()
+    return lambda t: base * task.harmonic(t)
+
+
+def solve(task: AbstractTask, path: Realisation, grid: Grid) -> Float[Array, "samples states"]:
+    """States at every `every`-th grid point, the first included; what overflows is not finite, never an exception."""
+    u = perturbation_at(task, path, grid)
+    drift = dfx.ODETerm(lambda s, y, _: grid.dt * task.vector_field(s * grid.dt, y, u(s)))
+    terms: dfx.AbstractTerm = drift
+    if path.increments is not None:
+        scale = task.noise_scale()
+
+        def diffusion(s, y, _):
+            field = lambda du, _: task.vector_field(s * grid.dt, y, u(s) + scale * du)  # noqa: E731
+            return lx.JacobianLinearOperator(field, jnp.zeros_like(scale))
+
+        increments = jnp.broadcast_to(path.increments, (grid.steps, scale.shape[0]))
+        terms = dfx.MultiTerm(drift, dfx.ControlTerm(diffusion, GridPath(increments)))
+    solution = dfx.diffeqsolve(
+        terms,
+        SubcycledHeun(grid.every * grid.substeps, 1 / grid.substeps),
+        t0=0.0,
+        t1=float(grid.steps),
+        dt0=float(grid.every),
+        y0=task.initial_state(),
+        stepsize_controller=dfx.ConstantStepSize(),
+        saveat=dfx.SaveAt(t0=True, steps=1),
+        max_steps=grid.steps // grid.every,
+        adjoint=dfx.DirectAdjoint(),
+        throw=False,
+    )
+    states: Any = solution.ys
+    return states[: grid.steps // grid.every + 1]
+
+
+def observe(
+    task: AbstractTask, path: Realisation, grid: Grid, states: Float[Array, "samples states"]
+) -> Float[Array, " samples"]:
+    """The task's output at the kept grid points."""
+    kept = slice(None, None, grid.every)
+    time = grid.dt * jnp.arange(0, grid.steps + 1, grid.every, dtype=states.dtype)
+    rhythm, rhythm_slope = jax.vmap(lambda t: jax.jvp(_harmonic(task), (t,), (jnp.ones_like(t),)))(time)
+    scale = task.noise_scale()
+    u = rhythm if path.values is None else rhythm + scale * path.values[kept]
+    du = rhythm_slope if path.slopes is None else rhythm_slope + scale * path.slopes[kept]
+    return jax.vmap(task.output)(time, states, u, du)

@@ -1,0 +1,227 @@
+"""The result of a fit: what was found, how sure it is, and what it cannot say."""
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Float
+
+from ._bundled import choices
+from ._preset import task_from_table, task_to_table
+from ._store import write_json
+from ._target import Target
+from ._task import AbstractTask
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+FORMAT = 1
+
+
+class ResultError(ValueError):
+    """A file that is not a fit result; the message names it and the reason."""
+
+
+class Estimate(eqx.Module):
+    """A number with its unit and standard error; `stderr` is None where the data do not determine it."""
+
+    value: float
+    unit: str
+    stderr: float | None = None
+    free: bool = True
+    identifiable: bool = True
+
+    def error_in_words(self, digits: int = 2) -> str:
+        """The standard error, or why there is none."""
+        if self.stderr is not None:
+            return f"{self.stderr:.{digits}g}"
+        return "not determined" if self.free else "fixed"
+
+
+class Start(eqx.Module):
+    """One start of a fit: final cost `½ Σ r²` (None if not finite), whether it settled, steps taken."""
+
+    cost: float | None
+    success: bool
+    steps: int
+
+
+class FitResult(eqx.Module):
+    """What a fit found.
+
+    `success` and `message` (in words); `task`, fitted; `target`; `method`; `parameters` and `derived` (`Estimate`s in
+    natural units); `correlation` of the free parameters; `undetermined`, sentences naming the directions that the data
+    do not determine; `singular_values` of the Jacobian (residuals in standard deviations, parameters in the prior's);
+    `chi2_per_bin` (None without knowledge of the spread); `rms_log_error`; `fitted` proportional power (fresh seeds) on
+    the target's bins, `harmonic_share` of each bin's power, `residual` and `deviation` [standard deviations, log power];
+    the table of `starts`; `stretch`, a few seconds of simulated output; `notices`; `seed`; `settings`; `versions`.
+    """
+
+    success: bool
+    message: str
+    task: AbstractTask
+    target: Target
+    method: str
+    parameters: dict[str, Estimate]
+    derived: dict[str, Estimate]
+    correlation: dict[str, Any]
+    undetermined: tuple[str, ...]
+    singular_values: Float[np.ndarray, " free"]
+    chi2_per_bin: float | None
+    rms_log_error: float | None
+    fitted: Float[np.ndarray, " bins"]
+    harmonic_share: Float[np.ndarray, " bins"]
+    residual: Float[np.ndarray, " bins"]
+    deviation: Float[np.ndarray, " bins"] | None
+    starts: tuple[Start, ...]
+    stretch: tuple[np.ndarray, np.ndarray]
+    notices: tuple[str, ...]
+    seed: int | None
+    settings: dict[str, Any]
+    versions: dict[str, str]
+
+    @property
+    def frequency_hz(self) -> Float[np.ndarray, " bins"]:
+        """Frequencies of the bins [Hz]."""
+        return np.asarray(self.target.frequency)
+
+    @property
+    def free(self) -> tuple[str, ...]:
+        """Names of the fitted parameters."""
+        return tuple(name for name, p in self.parameters.items() if p.free)
+
+    def plot(self) -> "Figure":
+        """The figure of the fit."""
+        from . import plot
+
+        return plot.fit(self)
+
+    def save(self, path: str | Path) -> None:
+        """Write JSON atomically; `load_result` reads it back equal. The file also serves wherever a preset does."""
+        write_json(path, _to_json(self))
+
+    def __str__(self) -> str:
+        verdict = "fitted" if self.success else "NOT FITTED"
+        model = f"{type(self.task).__name__}, {type(self.task.noise).__name__}, {self.method}"
+        lines = [f"{verdict}: {self.target.name} ({self.target.provenance}), {model}", f"  {self.message}"]
+        lines += [f"  note: {notice}" for notice in self.notices]
+        if self.chi2_per_bin is not None:
+            lines.append(f"  chi2 per bin {self.chi2_per_bin:.2f}, rms log error {self.rms_log_error:.3f}")
+        elif self.rms_log_error is not None:
+            lines.append(f"  rms log error {self.rms_log_error:.3f} (no chi2: the target states no spread)")
+        rows = [("parameter", {n: p for n, p in self.parameters.items() if p.free}), ("derived", self.derived)]
+        for title, table in rows:
+            lines.append(f"  {title:<24}{'value':>12}   {'std. error':<14} unit")
+            for name, p in table.items():
+                error = p.error_in_words(3)
+                lines.append(f"  {name:<24}{p.value:>12.5g}   {error:<14} {'' if p.unit == '1' else p.unit}")
+        if self.undetermined:
+            lines.append("  the data leave open (the prior keeps these near their default):")
+            lines += [f"    - {sentence}" for sentence in self.undetermined]
+        return "\n".join(lines)
+
+
+def _estimate(p: Estimate) -> dict[str, Any]:
+    value = p.value if np.isfinite(p.value) else None
+    return {"value": value, "unit": p.unit, "stderr": p.stderr, "free": p.free, "identifiable": p.identifiable}
+
+
+def _numbers(values: Any) -> list[Any]:
+    return [float(v) if np.isfinite(v) else None for v in np.ravel(values)]
+
+
+def _array(values: list[Any]) -> np.ndarray:
+    return np.array([np.nan if v is None else v for v in values], dtype=float)
+
+
+def _to_json(result: FitResult) -> dict[str, Any]:
+    table = {
+        "format": FORMAT,
+        "success": result.success,
+        "message": result.message,
+        "target": result.target.name,
+        "provenance": result.target.provenance,
+        "task": _task_name(result.task),
+        "method": result.method,
+        "parameters": {name: _estimate(p) for name, p in result.parameters.items()},
+        "derived": {name: _estimate(p) for name, p in result.derived.items()},
+        "correlation": result.correlation,
+        "undetermined": list(result.undetermined),
+        "singular_values": _numbers(result.singular_values),
+        "chi2_per_bin": result.chi2_per_bin,
+        "rms_log_error": result.rms_log_error,
+        "spectrum": {
+            "frequency_hz": _numbers(result.frequency_hz),
+            "target": _numbers(result.target.proportional_power),
+            "fitted": _numbers(result.fitted),
+            "harmonic_share": _numbers(result.harmonic_share),
+            "residual": _numbers(result.residual),
+            "deviation": None if result.deviation is None else _numbers(result.deviation),
+        },
+        "starts": [{"cost": s.cost, "success": s.success, "steps": s.steps} for s in result.starts],
+        "stretch": {"time": _numbers(result.stretch[0]), "output": _numbers(result.stretch[1])},
+        "notices": list(result.notices),
+        "seed": result.seed,
+        "settings": result.settings,
+        "versions": result.versions,
+        "target_table": result.target.to_table(),
+        "task_table": task_to_table(result.task),
+    }
+    return table
+
+
+def _task_name(task: AbstractTask) -> str:
+    from ._task import TASKS
+
+    return next((name for name, kind in TASKS.items() if isinstance(task, kind)), type(task).__name__)
+
+
+def load_result(path: str | Path) -> FitResult:
+    """Read a `fit.json`. Raises `ResultError` naming the file and what is wrong with it."""
+    path = Path(path)
+    try:
+        table = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ResultError(f"{path}: cannot be read: {error.strerror}") from None
+    except ValueError as error:
+        raise ResultError(f"{path}: is not JSON: {error}") from None
+    if not isinstance(table, dict) or table.get("format") != FORMAT:
+        raise ResultError(f"{path}: is not a fit result of format {FORMAT}; write it with FitResult.save")
+    try:
+        return _from_json(table)
+    except KeyError as error:
+        raise ResultError(f"{path}: has no entry {error}; {choices(str(error.args[0]), table)}") from None
+
+
+def _from_json(table: dict[str, Any]) -> FitResult:
+    spectrum = table["spectrum"]
+
+    def estimate(p):
+        return Estimate(np.nan if p["value"] is None else p["value"], p["unit"], p["stderr"], p["free"], p["identifiable"])
+
+    return FitResult(
+        success=table["success"],
+        message=table["message"],
+        task=task_from_table(table["task_table"]),
+        target=Target.from_table(table["target_table"]),
+        method=table["method"],
+        parameters={name: estimate(p) for name, p in table["parameters"].items()},
+        derived={name: estimate(p) for name, p in table["derived"].items()},
+        correlation=table["correlation"],
+        undetermined=tuple(table["undetermined"]),
+        singular_values=_array(table["singular_values"]),
+        chi2_per_bin=table["chi2_per_bin"],
+        rms_log_error=table["rms_log_error"],
+        fitted=_array(spectrum["fitted"]),
+        harmonic_share=_array(spectrum["harmonic_share"]),
+        residual=_array(spectrum["residual"]),
+        deviation=None if spectrum["deviation"] is None else _array(spectrum["deviation"]),
+        starts=tuple(Start(s["cost"], s["success"], s["steps"]) for s in table["starts"]),
+        stretch=(_array(table["stretch"]["time"]), _array(table["stretch"]["output"])),
+        notices=tuple(table["notices"]),
+        seed=table["seed"],
+        settings=table["settings"],
+        versions=table["versions"],
+    )

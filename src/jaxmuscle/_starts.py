@@ -1,0 +1,35 @@
+"""Where the starts of a fit begin."""
+
+import numpy as np
+from jaxtyping import Float
+from scipy.special import ndtri
+from scipy.stats import qmc
+
+from ._objective import Coordinates
+from ._target import Target
+
+
+def starting_points(coordinates: Coordinates, target: Target, count: int) -> Float[np.ndarray, "starts free"]:
+    """Starts: harmonic frequencies at the target's local maxima and spread over its band, the rest space-filling.
+
+    The first start has all other parameters at their default, the others at half a prior standard deviation about it.
+    """
+    size = len(coordinates.names)
+    cube = qmc.Halton(size, rng=0).random(count)
+    theta = 0.5 * ndtri(np.clip(cube, 0.02, 0.98))
+    theta[0] = 0.0
+    if "harmonic_frequency" in coordinates.names:
+        column = coordinates.names.index("harmonic_frequency")
+        frequencies = _candidate_frequencies(target, count)
+        theta[:, column] = np.log(frequencies / coordinates.centre[column]) / coordinates.sd[column]
+    return coordinates.from_theta(theta)
+
+
+def _candidate_frequencies(target: Target, count: int) -> Float[np.ndarray, " starts"]:
+    f, p = np.asarray(target.frequency), np.log(np.asarray(target.proportional_power))
+    inner = np.flatnonzero((p[1:-1] > p[:-2]) & (p[1:-1] > p[2:])) + 1
+    rise = p[inner] - 0.5 * (p[inner - 1] + p[inner + 1])
+    peaks = f[inner[np.argsort(-rise)]]
+    spread = np.geomspace(2 * f[0], f[-1], max(count, 2))
+    order = np.argsort([-np.min(np.abs(np.log(s / np.append(peaks, 1e9)))) for s in spread])
+    return np.concatenate([peaks[: max(1, count // 2)], spread[order], peaks[max(1, count // 2) :]])[:count]

@@ -1,0 +1,139 @@
+"""Targets in files: a bundled name or a path to the fields and columns of a TOML or CSV file."""
+
+import contextlib
+import os
+import tomllib
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from ._bundled import TargetError, bundled_text, choices, list_targets
+from ._spectrum import SpectrumSettings
+from ._target_check import CHECKS, Columns, check_columns, is_number, metadata
+from ._target_csv import merge_duplicates, read_csv
+
+# In bins: frequencies rounded to two decimals still count as on the default grid.
+GRID_TOLERANCE = 0.02
+REQUIRED = ("name", "quantity", "provenance", "source", "frequency_hz", "proportional_power")
+METADATA = ("segments", "coefficient_of_variation", "mvc_fraction", "reason", "notices")
+KEYS = (*REQUIRED, "sigma", *METADATA, "settings")
+
+
+class Raw(NamedTuple):
+    """What a file says: its name for messages, its fields other than the columns, the columns, notices."""
+
+    file: str
+    fields: dict[str, Any]
+    columns: Columns
+    notices: list[str]
+
+
+def read_target(name_or_path: str | os.PathLike[str]) -> Raw:
+    """Read a bundled target or a .toml or .csv file; the columns are checked, the other fields not yet.
+
+    **Raises:** `TargetError` naming file and line or key.
+    """
+    file, kind, text = _read(name_or_path)
+    return (_parse_toml if kind == ".toml" else _parse_csv)(text, file)
+
+
+def _read(name_or_path: str | os.PathLike[str]) -> tuple[str, str, str]:
+    """What messages call the target, ".toml" or ".csv", and the text."""
+    if not isinstance(name_or_path, str | os.PathLike):
+        raise TargetError(f"target {name_or_path!r}: give the name of a bundled target or a path")
+    given, names = os.fspath(name_or_path), list_targets()
+    if isinstance(name_or_path, str) and given in names:
+        return given, ".toml", bundled_text(given)
+    path = Path(given)
+    is_path = isinstance(name_or_path, os.PathLike) or path.suffix or len(path.parts) > 1 or os.path.exists(given)
+    if not given or not is_path:
+        raise TargetError(f"no bundled target {given!r}; {choices(given, names)} (`jaxmuscle targets`); or give a path")
+    with contextlib.suppress(RuntimeError):
+        path = path.expanduser()
+    hint = f"; the bundled target is called {path.stem!r}" if path.stem in names else ""
+    try:
+        if path.is_dir():
+            raise TargetError(f"{path}: is a folder; give a .toml or .csv file")
+        data = path.read_bytes()
+    except FileNotFoundError:
+        raise TargetError(f"{path}: no such file{hint}") from None
+    except (OSError, ValueError) as error:
+        if isinstance(error, TargetError):
+            raise
+        raise TargetError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from None
+    kind = path.suffix.lower()
+    if kind not in (".toml", ".csv"):
+        raise TargetError(f"{path}: a target is a .toml or .csv file, not {kind or 'one without ending'}")
+    return str(path), kind, _decoded(data, path)
+
+
+def _decoded(data: bytes, path: Path) -> str:
+    if not data.strip():
+        raise TargetError(f"{path}: is empty")
+    try:
+        text = data.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        text = "\0"
+    if "\0" in text:
+        raise TargetError(f"{path}: is not UTF-8 text (a binary file, or saved with another encoding)")
+    return text
+
+
+def _parse_csv(text: str, file: str) -> Raw:
+    (columns, has_header, comment), notices = read_csv(text, file), []
+    check_columns(columns, file, ordered=has_header)
+    settings, path = SpectrumSettings(), Path(file)
+    if not has_header:
+        merged = merge_duplicates(columns, GRID_TOLERANCE * settings.resolution)
+        averaged = len(columns.places) - len(merged.places)
+        notices.append(
+            "no header: the columns are taken as frequency in Hz and proportional power, sorted by frequency"
+            + (f", {averaged} near-duplicates averaged" if averaged else "")
+        )
+        columns = merged
+    fields = {"name": path.stem, "source": comment or path.name, "settings": settings}
+    return Raw(file, fields, columns, notices)
+
+
+def _parse_toml(text: str, file: str) -> Raw:
+    try:
+        fields: dict[str, Any] = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise TargetError(f"{file}: is not valid TOML: {error}") from None
+    for key in fields:
+        if key not in KEYS:
+            raise TargetError(f"{file}: unknown key {key!r}; {choices(key, KEYS)}")
+    for key in REQUIRED:
+        if key not in fields:
+            raise TargetError(f"{file}: the key {key!r} is missing; needed are {', '.join(REQUIRED)}")
+    try:
+        fields |= {key: metadata(key, value) for key, value in fields.items() if key in CHECKS}
+    except TargetError as error:
+        raise TargetError(f"{file}: {error}") from None
+    keys = [key for key in ("frequency_hz", "proportional_power", "sigma") if key in fields]
+    lists = [_numbers(file, key, fields.pop(key)) for key in keys]
+    for key, values in zip(keys, lists, strict=True):
+        if values.size != lists[0].size:
+            raise TargetError(f"{file}: {key} has {values.size} entries, frequency_hz {lists[0].size}; make them equal")
+    places = tuple(f"entry {i}" for i in range(1, lists[0].size + 1))
+    columns = Columns(lists[0], lists[1], lists[2] if len(lists) > 2 else None, places)
+    check_columns(columns, file, ordered=True)
+    settings = fields.get("settings", {})
+    if not isinstance(settings, dict):
+        raise TargetError(f"{file}: settings must be a table: a line [settings], then one setting per line")
+    try:
+        fields["settings"] = SpectrumSettings.from_dict(settings)
+    except ValueError as error:
+        raise TargetError(f"{file}: [settings]: {error}") from None
+    return Raw(file, fields, columns, [])
+
+
+def _numbers(file: str, key: str, values: Any) -> Float[np.ndarray, " rows"]:
+    if not isinstance(values, list) or not values:
+        raise TargetError(f"{file}: {key} must be a list of numbers")
+    for i, value in enumerate(values, 1):
+        if not is_number(value):
+            raise TargetError(f"{file}, entry {i}: {key} {value!r} is not a number")
+    return np.array([float(value) for value in values])

@@ -1,0 +1,434 @@
+"""The command: what it writes, its exit codes, and one line instead of a traceback for a user's mistake."""
+
+import csv
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+from test_result import assert_equal, failed_result, made_result
+from typer.testing import CliRunner
+
+import jaxmuscle as jm
+from jaxmuscle import _fit
+from jaxmuscle._cache import keep_compiled_programs
+from jaxmuscle._cli import app
+
+GRID = 0.390625 * np.arange(1, 31)
+POWER = 1 / (1 + (GRID / 1.2) ** 2) + 0.01
+
+
+@pytest.fixture(autouse=True)
+def keep_cache(monkeypatch):
+    """Commands switch the compilation cache; the tests keep theirs. Messages are not to be broken into lines."""
+    monkeypatch.setenv("COLUMNS", "1000")
+    before = jax.config.jax_compilation_cache_dir
+    yield
+    jax.config.update("jax_compilation_cache_dir", before)
+
+
+def run(*arguments):
+    result = CliRunner().invoke(app, [str(a) for a in arguments])
+    assert result.exception is None or isinstance(result.exception, SystemExit), repr(result.exception)
+    assert "Traceback" not in result.output
+    return result
+
+
+def csv_file(folder, rows=30, name="spectrum.csv", **changes):
+    """A spectrum on the grid; `changes` replace data lines by number."""
+    lines = [f"{f:.6f},{p:.6f}" for f, p in zip(GRID[:rows], POWER[:rows], strict=True)]
+    for number, text in changes.items():
+        lines[int(number.removeprefix("line"))] = text
+    path = folder / name
+    path.write_text("frequency_hz,proportional_power\n" + "\n".join(lines) + "\n")
+    return path
+
+
+# --- a user's mistakes: exit code 2 and what would be right
+
+FILES = {
+    "missing": (None, "spectrum.csv: no such file"),
+    "empty": ("", "spectrum.csv: is empty"),
+    "header only": ("frequency_hz,proportional_power\n", "holds a header but no data"),
+    "binary": (b"\x89PNG\r\n\x1a\n\xff\x00", "spectrum.csv: "),
+    "text in a number column": ({"line3": "1.5625,much"}, "line 5: proportional_power 'much' is not a number"),
+    "negative power": ({"line3": "1.5625,-0.1"}, "line 5: proportional_power -0.1 must be finite and larger than 0"),
+    "power that is not a number": ({"line3": "1.5625,nan"}, "line 5: proportional_power nan must be finite"),
+    "unsorted": ({"line3": "0.5,0.1"}, "line 5: frequency 0.5 Hz is out of order; sort"),
+    "duplicate": ({"line3": "1.171875,0.1"}, "line 5: frequency 1.17188 Hz appears twice"),
+    "unknown column": ("frequency,power\n1,2\n", "line 1: unknown column 'frequency'; did you mean 'frequency_hz'"),
+}
+
+
+@pytest.mark.parametrize("case", FILES)
+def test_bad_target_files(case, tmp_path):
+    content, message = FILES[case]
+    path = tmp_path / "spectrum.csv"
+    if isinstance(content, dict):
+        csv_file(tmp_path, **content)
+    elif content is not None:
+        path.write_bytes(content if isinstance(content, bytes) else content.encode())
+    result = run("fit", path, "--out", tmp_path / "out")
+    assert result.exit_code == 2
+    assert message in result.stderr and str(path) in result.stderr
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_folder_as_target(tmp_path):
+    result = run("fit", tmp_path, "--out", tmp_path / "out")
+    assert result.exit_code == 2 and str(tmp_path) in result.stderr
+
+
+def test_broken_toml_as_target(tmp_path):
+    path = tmp_path / "target.toml"
+    path.write_text("name = [")
+    result = run("fit", path)
+    assert result.exit_code == 2 and f"{path}: is not valid TOML" in result.stderr
+
+
+OPTIONS = {
+    "unknown target": (["vastus-lateralis-26mv"], "did you mean 'vastus-lateralis-26mvc'"),
+    "unknown free parameter": (["{csv}", "--free", "c_W"], "'c_W': did you mean 'c_w'"),
+    "nothing free": (["{csv}", "--free", ","], "no parameter is free"),
+    "unknown fixed parameter": (["{csv}", "--fix", "k_ww=1"], "'k_ww' of Isometric: did you mean 'k_w'"),
+    "free and fixed": (["{csv}", "--free", "k_w", "--fix", "k_w=1"], "k_w cannot be both free and fixed"),
+    "fix without value": (["{csv}", "--fix", "k_w"], "--fix 'k_w': write NAME=VALUE"),
+    "fix with empty value": (["{csv}", "--fix", "k_w="], "--fix 'k_w=': write NAME=VALUE"),
+    "fix without name": (["{csv}", "--fix", "=3"], "--fix '=3': write NAME=VALUE"),
+    "fix with a word": (["{csv}", "--fix", "k_w=stiff"], "--fix 'k_w=stiff': write NAME=VALUE with a number"),
+    "fix with two values": (["{csv}", "--fix", "k_w=1=2"], "--fix 'k_w=1=2': write NAME=VALUE"),
+    "fix with nan": (["{csv}", "--fix", "k_w=nan"], "k_w = nan N/m^3 is outside"),
+    "fix out of range": (["{csv}", "--fix", "m_w=-1"], "m_w = -1.0 kg is outside"),
+    "fix twice, differently": (["{csv}", "--fix", "k_w=1e5", "--fix", "k_w=2e5"], "--fix 'k_w=2e5': k_w is fixed twice"),
+    "unknown noise": (["{csv}", "--noise", "purple"], "'--noise'"),
+    "unknown task": (["{csv}", "--task", "isotonic"], "'--task'"),
+    "unknown residual": (["{csv}", "--residual", "square"], "'--residual'"),
+    "method of another version": (["{csv}", "--method", "linear"], "method = 'linear'"),
+    "white noise in the output": (["{csv}", "--noise", "white"], "WhiteNoise on K_z cannot be used in Isometric"),
+    # Typer words these; what matters is which option.
+    "no starts": (["{csv}", "--starts", "0"], "--starts"),
+    "no seeds": (["{csv}", "--seeds", "0"], "--seeds"),
+    "no segments": (["{csv}", "--segments", "0"], "--segments"),
+    "unknown quantity": (["{csv}", "--quantity", "forces"], "unknown quantity 'forces'; did you mean 'force'"),
+    "same name twice": (["{csv}", "{csv}"], "two targets have the same name"),
+    "no target": ([], "Missing argument"),
+    "unknown option": (["{csv}", "--start", "3"], "No such option"),
+}
+
+
+@pytest.mark.parametrize("case", OPTIONS)
+def test_bad_options(case, tmp_path):
+    arguments, message = OPTIONS[case]
+    path = csv_file(tmp_path)
+    result = run("fit", *[a.format(csv=path) for a in arguments], "--out", tmp_path / "out")
+    assert result.exit_code == 2
+    assert message in result.stderr
+    assert not list(tmp_path.glob("out/**/fit.json"))
+
+
+def test_fewer_bins_than_free_parameters(tmp_path):
+    result = run("fit", csv_file(tmp_path, rows=5), "--out", tmp_path / "out")
+    assert result.exit_code == 2
+    assert "5 bins cannot determine 8 free parameters (k_w, k_z" in result.stderr and "fix some" in result.stderr
+
+
+def test_out_is_a_file(tmp_path):
+    path = csv_file(tmp_path)
+    result = run("fit", path, "--out", path)
+    assert result.exit_code == 2 and "--out" in result.stderr and "is a file, give a folder" in result.stderr
+    below = run("fit", path, "--out", path / "folder")
+    assert below.exit_code == 2 and str(path) in below.stderr
+
+
+PRESETS = {
+    "unknown": ("zagrodny-slifki", "unknown preset 'zagrodny-slifki'"),
+    "missing file": ("{folder}/missing.toml", "missing.toml: cannot be read: No such file"),
+    "folder": ("{folder}", "cannot be read: Is a directory"),
+    "empty file": ("{folder}/empty.toml", "empty.toml: has no [task_table]"),
+    "broken file": ("{folder}/broken.toml", "broken.toml: is not valid TOML"),
+    "broken fit.json": ("{folder}/fit.json", "fit.json: is not valid JSON"),
+}
+
+
+@pytest.mark.parametrize("case", PRESETS)
+def test_bad_presets(case, tmp_path):
+    (tmp_path / "empty.toml").write_text("")
+    (tmp_path / "broken.toml").write_text("= 3")
+    (tmp_path / "fit.json").write_text("{")
+    given, message = PRESETS[case]
+    result = run("simulate", given.format(folder=tmp_path), "--out", tmp_path / "out")
+    assert result.exit_code == 2
+    assert message in result.stderr
+
+
+def test_the_nearest_preset_is_named(tmp_path):
+    for name in jm.list_presets():
+        result = run("simulate", name[:-1], "--out", tmp_path / "out")
+        assert result.exit_code == 2 and f"did you mean '{name}'" in result.stderr
+
+
+# --- listings
+
+
+def test_listings_and_help_do_not_wait_for_jax():
+    code = """
+import sys
+from typer.testing import CliRunner
+from jaxmuscle._cli import app
+for arguments in (["targets"], ["presets"], ["--help"], ["fit", "--help"], ["simulate", "--help"]):
+    result = CliRunner().invoke(app, arguments)
+    assert result.exit_code == 0, (arguments, result.output)
+    slow = {"jax", "numpy", "scipy", "matplotlib", "xarray"} & set(sys.modules)
+    assert not slow, (arguments, slow)
+"""
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
+
+
+def test_listings_name_everything():
+    assert run("presets").exit_code == 0
+    listed = run("targets").stdout
+    for name in jm.list_targets():
+        assert name in listed
+    for provenance in ("measured", "reconstructed"):
+        assert provenance in listed
+    listed = run("presets").stdout
+    for name in jm.list_presets():
+        assert name in listed
+
+
+def test_help_of_fit_names_every_option():
+    text = re.sub(r"\x1b\[[0-9;]*m", "", run("fit", "--help").stdout)
+    for option in (
+        "task",
+        "method",
+        "noise",
+        "residual",
+        "free",
+        "fix",
+        "starts",
+        "seeds",
+        "seed",
+        "segments",
+        "quantity",
+        "out",
+    ):
+        assert f"--{option}" in text
+
+
+# --- whole runs
+
+
+def read_columns(path):
+    with path.open() as file:
+        rows = list(csv.DictReader(file))
+    return {name: np.array([float(row[name]) for row in rows]) for name in rows[0]}
+
+
+@pytest.fixture(scope="module")
+def fitted(tmp_path_factory):
+    """A small fit from a CSV file, by the command."""
+    folder = tmp_path_factory.mktemp("fit")
+    path = csv_file(folder)
+    fast = ["--starts", 2, "--seeds", 8, "--segments", 12, "--seed", 5]
+    result = run("fit", path, "--free", "c_w, noise_K_w", "--fix", "m_w=0.4", *fast, "--out", folder / "out")
+    return result, folder / "out"
+
+
+def test_a_fit_writes_result_table_and_figure(fitted):
+    outcome, folder = fitted
+    assert outcome.exit_code == 0
+    assert sorted(p.name for p in folder.iterdir()) == ["fit.json", "fit.png", "spectrum.csv"]
+    result = jm.load_result(folder / "fit.json")
+    assert result.success and result.seed == 5 and result.free == ("c_w", "noise_K_w")
+    assert result.parameters["m_w"].value == 0.4 and len(result.starts) == 2
+    assert result.target.segments == (12,)
+    columns = read_columns(folder / "spectrum.csv")
+    np.testing.assert_allclose(columns["frequency_hz"], GRID, rtol=1e-7)
+    np.testing.assert_allclose(columns["target"], POWER / POWER.sum(), rtol=1e-4)  # six decimals in the file
+    np.testing.assert_allclose(columns["fitted"], result.fitted, rtol=1e-7)
+    assert (folder / "fit.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_fit_prints_what_it_found(fitted):
+    outcome, folder = fitted
+    for part in ("c_w", "noise_K_w", "corner_frequency", "chi² per bin", "converged", f"{folder}/fit.json"):
+        assert part in outcome.stdout
+    assert "rescaled to 1" in outcome.stderr
+    # Nothing but the parameters that were fitted and what follows from them.
+    assert "m_w" not in outcome.stdout
+
+
+def test_what_was_fitted_can_be_simulated(fitted, tmp_path):
+    import xarray
+
+    _, folder = fitted
+    outcome = run("simulate", folder / "fit.json", "--seeds", 8, "--seed", 2, "--out", tmp_path)
+    assert outcome.exit_code == 0
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["simulate.png", "spectrum.csv", "trajectories.nc"]
+    task = jm.load_result(folder / "fit.json").task
+    runs = jm.ensemble(task, jax.random.key(2), seeds=8)
+    with xarray.open_dataset(tmp_path / "trajectories.nc", engine="h5netcdf") as data:
+        np.testing.assert_array_equal(data["F_ext"], runs.output)
+        assert json.loads(data.attrs["parameters"])["c_w"]["value"] == task["c_w"]
+    columns = read_columns(tmp_path / "spectrum.csv")
+    np.testing.assert_allclose(columns["power"], runs.spectrum().mean().power, rtol=1e-5)
+    assert np.all(columns["quantile_05"] < columns["quantile_95"])
+
+
+def test_several_targets_have_a_folder_each(tmp_path, monkeypatch):
+    seen = []
+
+    def fake(task, target, **options):
+        seen.append((type(task), options["noise"]))
+        return made_result(target=target) if target.name == "a" else failed_result()
+
+    monkeypatch.setattr(_fit, "fit", fake)
+    paths = [csv_file(tmp_path, name=f"{name}.csv") for name in "ab"]
+    arguments = ("--task", "prescribed-force", "--noise", "ornstein-uhlenbeck", "--out", tmp_path / "out")
+    outcome = run("fit", *paths, *arguments)
+    assert outcome.exit_code == 1  # one of the two failed
+    assert seen == [(jm.PrescribedForce, "ornstein-uhlenbeck")] * 2
+    assert jm.load_result(tmp_path / "out" / "a" / "fit.json").success
+    assert not jm.load_result(tmp_path / "out" / "b" / "fit.json").success
+
+
+@pytest.mark.parametrize(
+    ("result", "code", "word"),
+    [(made_result(), 0, "converged"), (made_result(success=False), 1, "failed"), (failed_result(), 1, "failed")],
+    ids=["converged", "not converged", "exploded"],
+)
+def test_the_exit_code_says_whether_it_converged(result, code, word, tmp_path, monkeypatch):
+    monkeypatch.setattr(_fit, "fit", lambda *_, **__: result)
+    (tmp_path / "fit.png").write_text("of an earlier fit")
+    outcome = run("fit", csv_file(tmp_path), "--out", tmp_path)
+    assert outcome.exit_code == code
+    assert f"{word}: {result.message}" in outcome.stdout
+    assert_equal(jm.load_result(tmp_path / "fit.json"), result)
+    drawn = bool(np.all(np.isfinite(result.fitted)))
+    assert (tmp_path / "fit.png").exists() is drawn
+    assert len(read_columns(tmp_path / "spectrum.csv")["fitted"]) == 30
+
+
+def test_options_reach_the_fit(tmp_path, monkeypatch):
+    seen = {}
+
+    def fake(task, target, **options):
+        seen.update(options, task=task, target=target)
+        return made_result()
+
+    monkeypatch.setattr(_fit, "fit", fake)
+    fixed = ("--fix", "noise_K_z=0", "--fix", "noise_C_z = 0")
+    many = ("--free", " c_w ,k_w,", "--starts", 3, "--seeds", 9, "--seed", 4, "--segments", 7, "--residual", "linear")
+    assert run("fit", csv_file(tmp_path), "--noise", "white", *fixed, *many, "--out", tmp_path).exit_code == 0
+    expected = {"free": ["c_w", "k_w"], "fix": {"noise_K_z": 0.0, "noise_C_z": 0.0}, "noise": "white", "starts": 3,
+                "method": "montecarlo", "residual": "linear", "seeds": 9, "key": 4}  # fmt: skip
+    assert {name: seen[name] for name in expected} == expected
+    assert seen["target"].segments == (7,) and isinstance(seen["task"], jm.Isometric)
+
+
+def test_a_failing_simulation_is_not_a_users_mistake(tmp_path, monkeypatch):
+    from jaxmuscle import _simulate
+
+    def explode(*_, **__):
+        raise jm.SimulationError("3 seed(s) did not stay finite [0, 1, 2]")
+
+    monkeypatch.setattr(_simulate, "ensemble", explode)
+    made_result().save(tmp_path / "fit.json")
+    outcome = run("simulate", tmp_path / "fit.json", "--out", tmp_path / "out")
+    assert outcome.exit_code == 1 and "failed: 3 seed(s) did not stay finite [0, 1, 2]" in outcome.stderr
+
+
+# --- interruption
+
+
+def test_an_interrupted_fit_writes_what_had_been_reached(tmp_path, monkeypatch):
+    def interrupted(*_, **__):
+        raise jm.FitInterrupted(made_result(success=False, message="interrupted after 3 steps"))
+
+    monkeypatch.setattr(_fit, "fit", interrupted)
+    outcome = run("fit", csv_file(tmp_path), "--out", tmp_path / "out")
+    assert outcome.exit_code == 130
+    assert f"what had been reached is in {tmp_path / 'out'}" in outcome.stderr
+    assert not jm.load_result(tmp_path / "out" / "fit.json").success
+    assert (tmp_path / "out" / "spectrum.csv").exists()
+
+
+def test_an_interruption_before_the_first_step_writes_nothing(tmp_path, monkeypatch):
+    def interrupted(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(_fit, "fit", interrupted)
+    outcome = run("fit", csv_file(tmp_path), "--out", tmp_path / "out")
+    assert outcome.exit_code == 130 and "interrupted" in outcome.stderr
+    assert list((tmp_path / "out").iterdir()) == []
+
+
+@pytest.mark.slow
+def test_ctrl_c(tmp_path):
+    """A real signal, once the first steps have been taken."""
+    code = """
+import contextlib
+from jaxmuscle import _cli
+
+@contextlib.contextmanager
+def loud(title):
+    yield lambda text, share: print(text, flush=True)
+
+_cli._progress = loud
+_cli.main()
+"""
+    arguments = ["fit", str(csv_file(tmp_path)), "--free", "c_w,noise_K_w", "--starts", "4", "--seeds", "24"]
+    command = [sys.executable, "-c", code, *arguments, "--out", str(tmp_path / "out")]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        for line in process.stdout:
+            if line.startswith("trying starts"):
+                process.send_signal(signal.SIGINT)
+                break
+        _, errors = process.communicate(timeout=300)
+    assert process.returncode == 130, errors
+    assert "Traceback" not in errors and "what had been reached" in errors
+    result = jm.load_result(tmp_path / "out" / "fit.json")
+    assert not result.success and "interrupted after" in result.message
+    assert np.all(np.isfinite(read_columns(tmp_path / "out" / "spectrum.csv")["fitted"]))
+
+
+# --- compilation cache
+
+
+def test_a_cache_that_cannot_be_written_is_done_without(tmp_path, monkeypatch):
+    (tmp_path / "file").write_text("")
+    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(tmp_path / "file" / "cache"))
+    assert keep_compiled_programs() is None
+    assert jax.config.jax_compilation_cache_dir is None
+    monkeypatch.setattr(_fit, "fit", lambda *_, **__: made_result())
+    assert run("fit", csv_file(tmp_path), "--out", tmp_path / "out").exit_code == 0
+
+
+def test_the_cache_is_where_the_environment_says(tmp_path, monkeypatch):
+    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(tmp_path / "new" / "cache"))
+    assert keep_compiled_programs() == tmp_path / "new" / "cache"
+    assert jax.config.jax_compilation_cache_dir == str(tmp_path / "new" / "cache")
+    assert (tmp_path / "new" / "cache").is_dir()
+
+
+def test_the_cache_is_the_users_without_environment(tmp_path, monkeypatch):
+    import platformdirs
+
+    monkeypatch.delenv("JAX_COMPILATION_CACHE_DIR")
+    monkeypatch.setattr(platformdirs, "user_cache_path", lambda name: tmp_path / name)
+    assert keep_compiled_programs() == tmp_path / "jaxmuscle" / "jax"
+
+
+def test_the_console_script_is_the_command():
+    script = Path(sys.executable).with_name("jaxmuscle")
+    done = subprocess.run([script, "targets"], capture_output=True, text=True, env={**os.environ, "COLUMNS": "200"})
+    assert done.returncode == 0 and "vastus-lateralis-26mvc" in done.stdout
+    wrong = subprocess.run([script, "tragets"], capture_output=True, text=True)
+    assert wrong.returncode == 2 and "tragets" in wrong.stderr

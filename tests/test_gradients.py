@@ -1,0 +1,57 @@
+"""Derivatives of a simulated log spectrum by every parameter: forward = reverse = finite differences."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxmuscle as jm
+
+KEY = jax.random.key(2)
+SETTINGS = jm.SpectrumSettings(first_bin=2, last_bin=13)
+TASKS = {
+    "motion": jm.PrescribedMotion(0.004, 5.0, settings=SETTINGS),
+    "force": jm.PrescribedForce(5.0, 1.0, noise=jm.WhiteNoise(0.05), settings=SETTINGS),
+    "isometric": jm.Isometric(5.0, 0.003, noise=jm.OrnsteinUhlenbeckNoise(0.05), settings=SETTINGS),
+}
+SUBSTEPS = {"isometric": 2}
+WITHOUT_INFLUENCE = {"motion": (), "force": (), "isometric": ("m_z",)}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", TASKS)
+def test_every_parameter_forward_reverse_and_by_differences(x64, name):
+    task = TASKS[name].replace(harmonic_phase=0.4, harmonic_amplitude=0.02)
+    names = task.parameter_names
+    scale = jnp.array([float(task[n]) for n in names])
+    assert jnp.all(scale != 0)
+
+    def log_power(relative):
+        changed = task.replace(**dict(zip(names, scale * relative, strict=True)))
+        run = jm.simulate(changed, KEY, duration=4.0, dt=2e-3, substeps=SUBSTEPS.get(name))
+        return jnp.log(run.spectrum(window=(1.0, 4.0)).power)
+
+    one = jnp.ones_like(scale)
+    forward = np.asarray(jax.jit(jax.jacfwd(log_power))(one))
+    reverse = np.asarray(jax.jit(jax.jacrev(log_power))(one))
+    h = 1e-5  # truncation h² f''' / 6 and rounding 1e-15 / h
+    ahead, behind = (jax.jit(jax.vmap(log_power))(one + s * h * jnp.eye(one.size)) for s in (1, -1))
+    differences = np.asarray(ahead - behind).T / (2 * h)
+
+    assert forward.shape == (12, len(names)) and np.all(np.isfinite(forward))
+    largest = np.abs(forward).max()
+    np.testing.assert_allclose(reverse, forward, rtol=1e-9, atol=1e-10 * largest)
+    np.testing.assert_allclose(forward, differences, atol=1e-5 * largest)
+    silent = [n for n, column in zip(names, forward.T, strict=True) if np.all(column == 0)]
+    assert tuple(silent) == WITHOUT_INFLUENCE[name]
+
+
+def test_a_parameter_by_its_natural_name(x64):
+    task = jm.Isometric()
+
+    def last_force(k_w):
+        return jm.simulate(task.replace(k_w=k_w), KEY, duration=0.8).output[-1]
+
+    slope = jax.grad(last_force)(task["k_w"])
+    h = 1e-4 * task["k_w"]
+    np.testing.assert_allclose(slope, (last_force(task["k_w"] + h) - last_force(task["k_w"] - h)) / (2 * h), rtol=1e-6)

@@ -1,0 +1,243 @@
+"""Metrics against their definitions, written a second time and slowly, and against analytic values."""
+
+import antropy
+import jax
+import jax.numpy as jnp
+import jaxtyping
+import numpy as np
+import pytest
+from scipy.special import erf
+
+from jaxmuscle._metrics import (
+    approximate_entropy,
+    coefficient_of_variation,
+    normalised,
+    peaks,
+    sample_entropy,
+    signal_to_noise,
+    spearman,
+)
+from jaxmuscle._spectrum import Spectrum, SpectrumSettings, spectrum_of
+
+RNG = np.random.default_rng(0)
+RECORDS = {
+    "noise": RNG.standard_normal(200),
+    "walk": 10 + 0.01 * RNG.standard_normal(300).cumsum(),
+    "sine": np.sin(np.arange(250) / 5),
+    "coarse": np.round(2 * RNG.standard_normal(150)),
+}
+
+
+@pytest.fixture
+def user_view():
+    """As a user runs it: without the run-time type check, which would see a wrong argument first."""
+    jaxtyping.config.update("jaxtyping_disable", True)
+    yield
+    jaxtyping.config.update("jaxtyping_disable", False)
+
+
+def matching(x, i, j, m, radius):
+    return all(abs(x[i + k] - x[j + k]) <= radius for k in range(m))
+
+
+def slow_approximate_entropy(x, m, tolerance):
+    def phi(m):
+        n = len(x) - m + 1
+        radius = tolerance * np.std(x)
+        return sum(np.log(sum(matching(x, i, j, m, radius) for j in range(n)) / n) for i in range(n)) / n
+
+    return phi(m) - phi(m + 1)
+
+
+def slow_sample_entropy(x, m, tolerance):
+    n, radius = len(x) - m, tolerance * np.std(x)
+    pairs = [(i, j) for i in range(n) for j in range(n) if i != j]
+    b, a = (sum(matching(x, i, j, length, radius) for i, j in pairs) for length in (m, m + 1))
+    return np.log(b / a)
+
+
+@pytest.mark.parametrize("name", RECORDS)
+@pytest.mark.parametrize("m, tolerance", [(1, 0.3), (2, 0.2), (3, 0.5)])
+def test_entropies_are_their_definitions(name, m, tolerance):
+    x = RECORDS[name]
+    expected = slow_approximate_entropy(x, m, tolerance)
+    assert approximate_entropy(x, m, tolerance) == pytest.approx(expected, abs=1e-12)
+    expected = slow_sample_entropy(x, m, tolerance)
+    assert sample_entropy(x, m, tolerance) == pytest.approx(expected, abs=1e-12)
+
+
+@pytest.mark.parametrize("name", RECORDS)
+def test_entropies_are_those_of_antropy(name):
+    x = RECORDS[name]
+    assert approximate_entropy(x) == pytest.approx(antropy.app_entropy(x), abs=1e-10)
+    assert sample_entropy(x) == pytest.approx(antropy.sample_entropy(x), abs=1e-10)
+
+
+def test_sample_entropy_of_white_noise():
+    """Independent normal samples match with probability erf(r/2), so SampEn = -ln erf(r/2), for r in σ."""
+    values = [sample_entropy(np.random.default_rng(seed).standard_normal(2000)) for seed in range(60)]
+    standard_error = np.std(values, ddof=1) / np.sqrt(len(values))
+    assert standard_error < 0.02
+    assert abs(np.mean(values) + np.log(erf(0.1))) < 4 * standard_error
+
+
+def test_entropy_of_ten_thousand_samples_is_near_that_of_its_parts():
+    x = np.random.default_rng(1).standard_normal(10_000)
+    assert sample_entropy(x) == pytest.approx(-np.log(erf(0.1)), rel=0.05)
+    sine = np.sin(np.arange(10_000) / 50)
+    assert 0 < approximate_entropy(sine) < 0.1 < 2 < approximate_entropy(x)
+
+
+def test_entropy_does_not_depend_on_unit_or_offset():
+    x = RECORDS["walk"]
+    assert approximate_entropy(1000 * x - 3) == pytest.approx(approximate_entropy(x), abs=1e-9)
+    assert sample_entropy(1000 * x - 3) == pytest.approx(sample_entropy(x), abs=1e-9)
+
+
+def test_entropy_without_matches():
+    assert sample_entropy(np.array([0.0, 1.0, 0.0, 2.0]), m=1, tolerance=0.1) == float("inf")
+    assert np.isnan(sample_entropy(2.0 ** np.arange(8), tolerance=1e-6))
+
+
+@pytest.mark.parametrize("entropy", [approximate_entropy, sample_entropy])
+def test_entropy_needs_a_proper_record(user_view, entropy):
+    x = RECORDS["noise"]
+    for signal, message in (
+        (np.ones(50), "not constant"),
+        (x[:3], "m [+] 2 = 4"),
+        (x.reshape(2, -1), "one record"),
+        (np.where(x > 2, np.nan, x), "not finite"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            entropy(signal)
+    with pytest.raises(ValueError, match="m=0"):
+        entropy(x, m=0)
+    for tolerance in (0.0, -0.2, float("nan")):
+        with pytest.raises(ValueError, match="tolerance="):
+            entropy(x, tolerance=tolerance)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_variation_and_signal_to_noise(x64, dtype):
+    force = (-10 + 0.1 * RNG.standard_normal((3, 500))).astype(dtype)
+    mean, deviation = force.astype(float).mean(-1), force.astype(float).std(-1)
+    # float32 samples near 10 hold the deviation of 0.1 to about 1e-5.
+    rtol = 1e-5 if dtype == np.float32 else 1e-12
+    variation, ratio = coefficient_of_variation(force), signal_to_noise(force)
+    assert variation.dtype == ratio.dtype == dtype
+    np.testing.assert_allclose(variation, deviation / abs(mean), rtol=rtol)
+    np.testing.assert_allclose(ratio, mean / deviation, rtol=rtol)
+
+
+@pytest.mark.parametrize("metric", [coefficient_of_variation, signal_to_noise])
+def test_derivatives_agree(x64, metric):
+    signal = jnp.asarray(5 + RNG.standard_normal(20))
+    forward, reverse = jax.jacfwd(metric)(signal), jax.jacrev(metric)(signal)
+    np.testing.assert_allclose(forward, reverse, rtol=1e-12, atol=1e-14)
+    h = 1e-5
+    steps = h * np.eye(20)
+    differences = np.array([(metric(signal + e) - metric(signal - e)) / (2 * h) for e in steps])
+    # Central differences: truncation of order h² = 1e-10, rounding of order 1e-15 / h = 1e-10.
+    np.testing.assert_allclose(forward, differences, atol=1e-9)
+
+
+def test_constant_and_centred_signals(x64):
+    constant = jnp.full(8, 3.0)
+    assert coefficient_of_variation(constant) == 0
+    assert np.all(jax.grad(coefficient_of_variation)(constant) == 0)
+    assert signal_to_noise(constant) == np.inf
+    assert coefficient_of_variation(jnp.asarray([-1.0, 1.0])) == np.inf
+
+
+def test_spearman_without_ties_is_the_textbook_formula():
+    a, b = np.array([0.1, 5.0, 3.0, 100.0, -2.0]), np.array([7.0, 8.0, 30.0, 9.0, 1.0])
+    difference = np.array([2, 4, 3, 5, 1]) - np.array([2, 3, 5, 4, 1])
+    assert spearman(a, b) == pytest.approx(1 - 6 * np.sum(difference**2) / (5 * 24), abs=1e-12)
+    assert spearman(a, np.exp(a / 20)) == pytest.approx(1, abs=1e-12)
+    assert spearman(a, -a) == pytest.approx(-1, abs=1e-12)
+
+
+def test_spearman_needs_two_rows_with_ranks():
+    x = np.arange(5.0)
+    for a, b, message in ((x, x[:4], "equally long"), (x[:2], x[:2], "3 or more"), (x, 0 * x, "b=.*not all equal")):
+        with pytest.raises(ValueError, match=message):
+            spearman(a, b)
+    with pytest.raises(ValueError, match=r"^a=.*finite"):
+        spearman(np.where(x > 3, np.nan, x), x)
+
+
+def test_normalised(x64):
+    force = np.array([[1.0, 2.0, 3.0], [-4.0, 2.0, -1.0]])
+    np.testing.assert_allclose(normalised(force), [[0.5, 1, 1.5], [4, -2, 1]])
+    np.testing.assert_allclose(normalised(force, "maximum"), [[1 / 3, 2 / 3, 1], [-1, 0.5, -0.25]])
+    np.testing.assert_allclose(normalised(force, "mvc", mvc=40.0), force / 40)
+    assert normalised(force.astype(np.float32), "mvc", mvc=40.0).dtype == jnp.float32
+    slope = jax.grad(lambda mvc: jnp.sum(normalised(force, "mvc", mvc=mvc)))(40.0)
+    assert slope == pytest.approx(-np.sum(force) / 40**2)
+
+
+def test_normalised_needs_its_reference(user_view):
+    force = np.arange(1.0, 4.0)
+    with pytest.raises(ValueError, match=r"by='peak'.*mean, maximum, mvc"):
+        normalised(force, "peak")  # pyright: ignore[reportArgumentType]
+    with pytest.raises(ValueError, match=r"mvc=None.*by='mvc'"):
+        normalised(force, "mvc")
+    with pytest.raises(ValueError, match=r"mvc=40.0.*by='mean'"):
+        normalised(force, mvc=40.0)
+    for mvc in (0.0, -1.0, float("nan")):
+        with pytest.raises(ValueError, match=r"mvc=.*above zero"):
+            normalised(force, "mvc", mvc=mvc)
+
+
+def spectrum(power, settings=None):
+    settings = settings or SpectrumSettings(last_bin=len(power))
+    return Spectrum(settings.frequency, np.asarray(power, dtype=float), settings)
+
+
+def test_peaks_of_a_handmade_spectrum(x64):
+    found = peaks(spectrum([10, 4, 2, 3, 1, 6, 1, 2, 1]))  # sum 30
+    assert found.maximum.bin == 1
+    assert found.maximum.frequency == found.maximum.interpolated == 100 / 256
+    assert found.maximum.power == pytest.approx(10 / 30)
+    assert found.maximum.prominence == pytest.approx(9 / 30)
+    assert [peak.bin for peak in found.local_maxima] == [4, 6, 8]
+    np.testing.assert_allclose([30 * peak.prominence for peak in found.local_maxima], [1, 5, 1])
+    found = peaks(spectrum([10, 4, 2, 3, 1, 6, 1, 2, 1]), min_prominence=0.2)
+    assert [peak.bin for peak in found.local_maxima] == [6]
+
+
+def test_an_interior_maximum_is_a_local_maximum(x64):
+    found = peaks(spectrum([2, 3, 1, 5, 1]))
+    assert found.maximum == found.local_maxima[1]
+    assert found.maximum.prominence == pytest.approx(4 / 12)
+
+
+def test_interpolation_is_exact_for_a_gaussian(x64):
+    settings = SpectrumSettings(first_bin=3)
+    found = peaks(spectrum(np.exp(-(((settings.frequency - 4.251) / 0.8) ** 2)), settings))
+    assert found.maximum.bin == 11
+    assert found.maximum.frequency == pytest.approx(11 * 100 / 256)
+    assert found.maximum.interpolated == pytest.approx(4.251, abs=1e-9)
+
+
+@pytest.mark.parametrize("hertz", [4.251, 1.24, 7.0])
+def test_interpolation_finds_a_sine(x64, hertz):
+    """The log of a Hann main lobe is a parabola to within 0.02 bins; the bin itself is up to half a bin away."""
+    settings = SpectrumSettings(filter_cutoff=None)
+    sine = np.sin(2 * np.pi * hertz * np.arange(1500) / 100)
+    peak = peaks(spectrum_of(sine, settings)).maximum
+    assert peak.frequency == pytest.approx(hertz, abs=settings.resolution / 2)
+    assert peak.interpolated == pytest.approx(hertz, abs=0.02 * settings.resolution)
+
+
+def test_peaks_need_one_spectrum(user_view):
+    for power, message in (
+        (np.ones((2, 5)), "mean()"),
+        (np.ones(2), "3 bins"),
+        (np.zeros(5), "not all zero"),
+        ([1.0, np.nan, 1.0], "finite"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            peaks(Spectrum(np.arange(np.shape(power)[-1]), np.asarray(power), SpectrumSettings()))
+    with pytest.raises(ValueError, match="min_prominence=2"):
+        peaks(spectrum([1, 2, 1]), min_prominence=2)

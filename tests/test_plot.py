@@ -1,0 +1,393 @@
+"""Figures: the right data with the right units, in the caller's axes, without a trace in matplotlib's settings."""
+
+import types
+
+import jax
+import jax.numpy as jnp
+import matplotlib
+import matplotlib.pyplot as plt
+import numpy as np
+import pytest
+import scipy.special
+from matplotlib.colors import to_rgba
+
+from jaxmuscle import _plot_fit, plot
+from jaxmuscle._spectrum import Spectrum, SpectrumSettings
+from jaxmuscle._target import Target, load_target
+from jaxmuscle._task import Isometric, PrescribedForce
+from jaxmuscle._trajectory import Trajectory
+
+SETTINGS = SpectrumSettings()
+F = SETTINGS.frequency
+
+
+@pytest.fixture(autouse=True)
+def untouched():
+    """No function changes rcParams or closes the caller's figures."""
+    mine, before = plt.figure(), dict(matplotlib.rcParams)
+    yield
+    assert dict(matplotlib.rcParams) == before
+    assert plt.fignum_exists(mine.number)
+    plt.close("all")
+
+
+def spectra(seeds):
+    power = (1e-3 / (1 + F**2)) * np.random.default_rng(0).chisquare(8, (*seeds, F.size))
+    return Spectrum(F, power, SETTINGS, "N")
+
+
+def trajectories(seeds, task=None):
+    samples = 1500
+    output = 2.0 + 0.01 * np.random.default_rng(1).normal(size=(*seeds, samples))
+    task = Isometric() if task is None else task
+    states = np.zeros((*seeds, samples, len(task.state_names)))
+    return Trajectory(task, states, output, np.arange(seeds[0]) if seeds else np.array(0), 100.0, 1e-3, 1, "instant")
+
+
+def band(ax):
+    """Lower and upper edge of the only filled band of the axes, at its abscissae."""
+    (filled,) = ax.collections
+    points = filled.get_paths()[0].vertices
+    x = np.unique(points[:, 0])
+    return tuple(np.array([f(points[points[:, 0] == v, 1]) for v in x]) for f in (np.min, np.max))
+
+
+def texts(figure):
+    return [text.get_text() for ax in figure.axes for text in ax.texts]
+
+
+def named(container, label):
+    (line,) = (line for line in container.lines if line.get_label() == label)
+    return line
+
+
+def test_spectrum_of_one_seed_is_its_proportional_power():
+    one = spectra(())
+    ax = plot.spectrum(one)
+    (line,) = ax.lines
+    np.testing.assert_array_equal(line.get_xdata(), F)
+    np.testing.assert_allclose(line.get_ydata(), one.power / one.power.sum(), rtol=1e-12)
+    assert (ax.get_xlabel(), ax.get_ylabel()) == ("Frequency (Hz)", "Proportional power (fraction per bin)")
+    assert not ax.collections and ax.get_legend() is None
+
+
+@pytest.mark.parametrize("seeds", [(40,), (4, 10)])
+def test_spectrum_of_seeds_normalises_the_mean_power_and_shows_90_percent_of_them(seeds):
+    several = spectra(seeds)
+    ax = plot.spectrum(several)
+    mean = several.power.reshape(40, -1).mean(0)
+    np.testing.assert_allclose(ax.lines[0].get_ydata(), mean / mean.sum(), rtol=1e-12)
+    each = (several.power / several.power.sum(-1, keepdims=True)).reshape(40, -1)
+    np.testing.assert_allclose(band(ax), np.quantile(each, (0.05, 0.95), axis=0), rtol=1e-12)
+    assert [t.get_text() for t in ax.get_legend().get_texts()] == ["5 to 95 % of seeds", "mean of 40 seeds"]
+
+
+def test_spectrum_in_absolute_units():
+    one = spectra(())
+    ax = plot.spectrum(one, proportional=False)
+    np.testing.assert_array_equal(ax.lines[0].get_ydata(), one.power)
+    assert ax.get_ylabel() == "Power (N²/Hz)"
+    other = Spectrum(F, one.power, SETTINGS, "N m")
+    assert plot.spectrum(other, proportional=False).get_ylabel() == "Power ((N m)²/Hz)"
+
+
+def test_spectrum_on_logarithmic_axes_leaves_out_the_mean():
+    settings = SpectrumSettings(first_bin=0)
+    ax = plot.spectrum(Spectrum(settings.frequency, np.ones(31), settings), log=True)
+    assert (ax.get_xscale(), ax.get_yscale()) == ("log", "log")
+    np.testing.assert_array_equal(ax.lines[0].get_xdata(), F)
+    np.testing.assert_allclose(ax.lines[0].get_ydata(), 1 / 31)
+
+
+def test_seeds_that_are_not_finite_are_left_out_and_named():
+    power = spectra((5,)).power.copy()
+    power[2, 3] = np.nan
+    ax = plot.spectrum(Spectrum(F, power, SETTINGS), proportional=False)
+    np.testing.assert_allclose(ax.lines[0].get_ydata(), np.delete(power, 2, axis=0).mean(0))
+    assert ax.lines[0].get_label() == "mean of 4 seeds, 1 not finite left out"
+    assert plot.spectrum(Spectrum(F, power * np.inf, SETTINGS)).lines[0].get_label() == "not finite"
+
+
+def test_drawing_into_given_axes_takes_the_next_colour_that_colour_blind_readers_can_tell():
+    _, ax = plt.subplots()
+    for i in range(len(plot.PALETTE)):
+        assert plot.spectrum(spectra(()), ax) is ax
+        assert ax.lines[i].get_color() == plot.PALETTE[i]
+    assert len(set(plot.PALETTE)) == len(plot.PALETTE)
+
+
+def test_what_is_drawn_later_is_not_cut_off():
+    flat = Target("flat", np.ones(30))
+    both = plot.spectrum(spectra(()), plot.target(flat))
+    linear = panels(plot.fit(result(target=flat)))[0]
+    for ax, line in ((both, both.lines[1]), (linear, named(linear, "fit"))):
+        assert ax.get_ylim()[0] == 0 and ax.get_ylim()[1] > np.max(line.get_ydata())
+        assert ax.get_xlim()[0] == 0 and ax.get_xlim()[1] > F[-1]
+
+
+def test_target_with_segments_has_the_band_of_its_degrees_of_freedom():
+    aim = load_target("vastus-lateralis-26mvc")
+    ax = plot.target(aim)
+    np.testing.assert_array_equal(ax.lines[0].get_ydata(), aim.proportional_power)
+    half = aim.degrees_of_freedom / 2
+    bias, sd = scipy.special.psi(half) - np.log(half), np.sqrt(scipy.special.polygamma(1, half))
+    edges = [aim.proportional_power * np.exp(-bias + side * sd) for side in (-1, 1)]
+    np.testing.assert_allclose(band(ax), edges, rtol=1e-12)
+    assert (ax.get_xlabel(), ax.get_ylabel()) == ("Frequency (Hz)", "Proportional power (fraction per bin)")
+    assert ax.lines[0].get_label() == "vastus-lateralis-26mvc (measured)"
+
+
+def test_the_band_covers_the_true_spectrum_as_often_as_one_standard_deviation_does():
+    aim = load_target("vastus-lateralis-26mvc")
+    nu, draws = aim.degrees_of_freedom, 4000
+    factor = np.random.default_rng(2).chisquare(nu, draws) / nu
+    low, high = (edge[0] / aim.proportional_power[0] for edge in plot.sampling_band(aim))
+    covered = np.mean((factor * low < 1) & (factor * high > 1))
+    # A normal law has 0.683 in this range, log χ² with 23 degrees of freedom within 0.01 of it.
+    assert covered == pytest.approx(0.683, abs=0.01 + 4 * np.sqrt(0.22 / draws))
+    above, below = np.mean(factor * low > 1), np.mean(factor * high < 1)
+    assert above == pytest.approx(below, abs=0.03)
+
+
+def test_target_with_sigma_has_its_band_and_says_that_it_is_assumed():
+    aim = load_target("slifkin-newell-1999-95mvc")
+    ax = plot.target(aim, log=True)
+    sd = np.sqrt(np.log(1 + (aim.sigma / aim.proportional_power) ** 2))
+    np.testing.assert_allclose(
+        band(ax), [aim.proportional_power * np.exp(-sd), aim.proportional_power * np.exp(sd)], rtol=1e-12
+    )
+    labels = [t.get_text() for t in ax.get_legend().get_texts()]
+    assert labels == ["± 1 SD (assumed)", "slifkin-newell-1999-95mvc (reconstructed)"]
+
+
+def test_target_of_unknown_spread_has_no_band():
+    aim = Target("a" * 60, np.ones(30))
+    ax = plot.target(aim)
+    assert plot.sampling_band(aim) is None and not ax.collections
+    assert len(ax.lines[0].get_label()) < 60
+
+
+def test_a_name_is_no_mathematics_and_never_hidden():
+    ax = plot.target(Target(r"_$\no math$", np.ones(30)))
+    ax.figure.canvas.draw()
+    assert [t.get_text() for t in ax.get_legend().get_texts()] == [r"\$\no math\$ (user)"]
+
+
+def test_trajectory_of_one_seed():
+    run = trajectories(())
+    ax = plot.trajectory(run)
+    (line,) = ax.lines
+    np.testing.assert_array_equal(line.get_xdata(), run.time)
+    np.testing.assert_array_equal(line.get_ydata(), run.output)
+    assert (ax.get_xlabel(), ax.get_ylabel()) == ("Time (s)", r"Force $F_\mathrm{ext}$ (N)")
+
+
+def test_trajectory_of_an_ensemble_in_a_window():
+    runs = trajectories((20,))
+    ax = plot.trajectory(runs, window=(5.0, 10.0), lines=2)
+    inside = runs.output[:, 500:1000]
+    np.testing.assert_allclose(ax.lines[0].get_ydata(), inside.mean(0), rtol=1e-12)
+    np.testing.assert_array_equal(ax.lines[0].get_xdata(), runs.time[500:1000])
+    np.testing.assert_array_equal([line.get_ydata() for line in ax.lines[1:]], inside[:2])
+    np.testing.assert_allclose(band(ax), np.quantile(inside, (0.05, 0.95), axis=0), rtol=1e-12)
+    with pytest.raises(ValueError, match="window"):
+        plot.trajectory(runs, window=(5.0, 30.0))
+
+
+def test_trajectory_of_a_displacement():
+    ax = plot.trajectory(trajectories((), PrescribedForce()))
+    assert ax.get_ylabel() == r"Displacement $x_\mathrm{z}$ (m)"
+
+
+def test_simulation_shows_run_window_and_spectra():
+    runs = trajectories((3,))
+    figure = plot.simulation(runs)
+    whole, window, linear, logarithmic = figure.axes
+    assert whole.lines[0].get_xdata().size == 1500 and window.lines[0].get_xdata()[0] == 5.0
+    mean = np.asarray(runs.spectrum().mean().proportional)
+    for ax in (linear, logarithmic):
+        np.testing.assert_allclose(ax.lines[0].get_ydata(), mean, rtol=1e-5)  # float32
+    figure.canvas.draw()
+
+
+def test_methods_draw_the_same(x64):
+    del x64
+    assert plot.spectrum(spectra(())).get_ylabel() == spectra(()).plot().get_ylabel()
+    assert trajectories((2,)).plot().get_xlabel() == "Time (s)"
+    assert load_target("hamilton-2004").plot().lines[0].get_ydata().size == 30
+
+
+def test_arrays_of_jax_are_drawn():
+    with jax.enable_x64(False):
+        one = spectra((3,))
+        ax = plot.spectrum(Spectrum(jnp.asarray(F), jnp.asarray(one.power), SETTINGS))
+    assert ax.lines[0].get_ydata().size == F.size
+
+
+def estimate(value, unit, stderr=None, free=True, identifiable=None):
+    known = stderr is not None if identifiable is None else identifiable
+    return types.SimpleNamespace(value=value, unit=unit, stderr=stderr, free=free, identifiable=known)
+
+
+def result(**changes):
+    """What a fit returns, as far as the figure reads it."""
+    aim = changes.pop("target", load_target("vastus-lateralis-26mvc"))
+    f = aim.frequency
+    share = np.where(np.abs(f - 3.9) < 0.5, 0.5, 0.0)
+    fitted = 1 / (1 + f**2) / (1 - share)
+    fitted /= fitted.sum()
+    residual = np.resize([0.5, -1.5, 2.5, -0.5], f.size)
+    fields = {
+        "success": True,
+        "message": "one more step would lower the cost by less than 0.1 %",
+        "task": Isometric().replace(harmonic_frequency=3.9),
+        "target": aim,
+        "method": "linear",
+        "parameters": {
+            "k_w": estimate(4.2e5, "N/m^3", 1.3e4),
+            "c_w": estimate(57.0, "N s^3/m^3"),
+            "harmonic_frequency": estimate(3.9, "Hz", 0.047),
+            "m_w": estimate(0.5, "kg", free=False),
+        },
+        "derived": {"corner_frequency": estimate(1.23, "Hz", 0.16)},
+        "chi2_per_bin": 1.18,
+        "rms_log_error": 0.31,
+        "frequency_hz": f,
+        "fitted": fitted,
+        "harmonic_share": share,
+        "residual": residual,
+        "deviation": np.full(f.size, 0.3),
+        "undetermined": ("stiffness and damping can be scaled together",),
+        "stretch": (10 + np.arange(500) / 100, 5 + 0.01 * np.sin(np.arange(500))),
+        "starts": ((), ()),
+        "seed": 7,
+    }
+    return types.SimpleNamespace(**(fields | changes))
+
+
+def failed():
+    nothing = np.full(30, np.nan)
+    return result(
+        success=False, message="no start has a finite spectrum: lower the noise", derived={}, chi2_per_bin=None,
+        rms_log_error=None, fitted=nothing, harmonic_share=nothing, residual=nothing, deviation=None,
+        undetermined=(), stretch=(np.zeros(0), np.zeros(0)), seed=None,
+    )  # fmt: skip
+
+
+def panels(figure):
+    """Linear and logarithmic spectrum, residuals, output: the axes between header and tables."""
+    return figure.axes[1:5]
+
+
+def test_fit_draws_the_fitted_spectrum_twice_with_target_and_harmonic():
+    found = result()
+    linear, logarithmic, _, _ = panels(plot.fit(found))
+    for ax, scale in ((linear, "linear"), (logarithmic, "log")):
+        assert (ax.get_xscale(), ax.get_yscale()) == (scale, scale)
+        np.testing.assert_array_equal(named(ax, "target").get_ydata(), found.target.proportional_power)
+        np.testing.assert_array_equal(named(ax, "fit").get_ydata(), found.fitted)
+        held = 100 * np.sum(found.fitted * found.harmonic_share)
+        assert named(ax, f"harmonic: 3.90 Hz, {held:.2g} % of power").get_xdata() == [3.9]
+        assert (ax.get_xlabel(), ax.get_ylabel()) == ("Frequency (Hz)", "Proportional power (fraction per bin)")
+
+
+def test_fit_draws_residuals_in_standard_deviations_and_marks_the_large_ones():
+    found = result()
+    ax = panels(plot.fit(found))[2]
+    bars = ax.containers[0].patches
+    np.testing.assert_array_equal([bar.get_height() for bar in bars], found.residual)
+    np.testing.assert_allclose([bar.get_x() + bar.get_width() / 2 for bar in bars], found.frequency_hz)
+    outside = [bar.get_facecolor() == to_rgba(plot.VERMILLION) for bar in bars]
+    assert outside == list(np.abs(found.residual) > 2)
+    spans = {(p.get_y(), p.get_y() + p.get_height()) for p in ax.patches if p not in bars}
+    assert spans == {(-1.0, 1.0), (-2.0, 2.0)}
+    assert ax.get_ylabel() == "Residual (SD)"
+
+
+def test_fit_draws_the_simulated_stretch():
+    found = result()
+    ax = panels(plot.fit(found))[3]
+    np.testing.assert_array_equal(ax.lines[0].get_xydata().T, found.stretch)
+    assert (ax.get_xlabel(), ax.get_ylabel()) == ("Time (s)", r"Force $F_\mathrm{ext}$ (N)")
+
+
+def test_fit_tells_verdict_parameters_and_what_is_not_determined():
+    said = texts(plot.fit(result()))
+    for text in (
+        "vastus-lateralis-26mvc", "Converged: one more step would lower the cost by less than 0.1 %",
+        "Isometric (BandLimitedNoise)  ·  linear  ·  χ² per bin 1.18  ·  rms log error 0.31  ·  2 starts, seed 7",
+        "k_w", "4.20", "± 0.13", "10⁵ N/m³", "c_w", "57.0", "not determined", "N s³/m³", "3.900", "± 0.047", "Hz",
+        "corner_frequency", "1.23", "± 0.16", "•  stiffness and damping can be scaled together",
+    ):  # fmt: skip
+        assert text in said
+    assert any(text.startswith("Measured force: Isometric knee-extension") for text in said)
+    assert "m_w" not in said
+
+
+def test_fit_of_a_reconstruction_says_so():
+    aim = load_target("slifkin-newell-1999-35mvc")
+    figure = plot.fit(result(target=aim))
+    assert any(text.startswith("RECONSTRUCTED, not measured: the text gives only") for text in texts(figure))
+    assert "target, reconstructed" in [line.get_label() for line in panels(figure)[0].lines]
+
+
+def test_a_failed_fit_still_shows_the_target_and_the_reason():
+    figure = plot.fit(failed())
+    figure.canvas.draw()
+    said = texts(figure)
+    assert "Did not converge: no start has a finite spectrum: lower the noise" in said
+    assert {"no finite fit", "no finite simulation", "none"} <= set(said)
+    assert "Isometric (BandLimitedNoise)  ·  linear  ·  2 starts" in said
+    assert not any(line.get_label() == "fit" for line in panels(figure)[0].lines)
+
+
+def test_a_fit_without_known_spread_draws_logarithms_without_bands():
+    aim = Target("few bins", [0.5, 0.3, 0.2], bins=[2, 3, 4])
+    figure = plot.fit(result(target=aim, chi2_per_bin=None, deviation=None, undetermined=()))
+    figure.canvas.draw()
+    ax = panels(figure)[2]
+    assert ax.get_ylabel() == "Residual (ln units)" and len(ax.patches) == 3
+    assert any("no χ² (spread unknown)" in text for text in texts(figure))
+    assert "What the data do not determine" not in texts(figure)
+
+
+@pytest.mark.parametrize(("frequency", "share"), [(25.0, 1e-5), (3.9, 0.0)])
+def test_a_harmonic_outside_the_bins_or_without_power_is_not_marked_there(frequency, share):
+    task = Isometric().replace(harmonic_frequency=frequency)
+    ax = panels(plot.fit(result(task=task, harmonic_share=np.full(30, share))))[0]
+    marks = [line for line in ax.lines if str(line.get_label()).startswith("harmonic")]
+    assert [line.get_label() for line in marks] == ["harmonic: 25.00 Hz, <0.1 % of power"] * (share > 0)
+    assert all(line.get_xdata().size == 0 for line in marks)
+    assert ax.get_xlim()[1] < 13
+
+
+def test_everything_written_lies_in_the_figure_and_cells_do_not_touch():
+    long = {f"a_rather_long_name_of_{i}_parameter": estimate(-1.234e-5, "N s^3/m^3") for i in range(15)}
+    long[r"$\no math$"] = estimate(1.0, "1")
+    aim = Target("a name " * 20, np.ones(30), source="a sentence about the source, " * 12, segments=12)
+    said = "a sentence that names a direction with many parameters, " * 5
+    figure = plot.fit(result(target=aim, parameters=long, derived=long, message=said, undetermined=(said, said)))
+    figure.canvas.draw()
+    width, height = figure.canvas.get_width_height()
+    for ax in (figure.axes[0], *figure.axes[5:]):
+        boxes = [text.get_window_extent() for text in ax.texts]
+        assert all(box.x0 >= 0 and box.x1 <= width and box.y0 >= -1 and box.y1 <= height + 1 for box in boxes)
+        assert not any(a.overlaps(b) for i, a in enumerate(boxes) for b in boxes[:i] if abs(a.y0 - b.y0) < 3)
+
+
+@pytest.mark.parametrize(
+    ("shown", "expected"),
+    [
+        (estimate(4.2512, "Hz", 0.0473), ("4.251", "± 0.047", "Hz")),
+        (estimate(423456.0, "N/m^3", 13000.0), ("4.23", "± 0.13", "10⁵ N/m³")),
+        (estimate(0.0031, "1", 0.0004), ("3.10", "± 0.40", "10⁻³")),
+        (estimate(0.12, "1", 3.0), ("0.1", "± 3.0", "1")),
+        (estimate(0.0, "1/Hz", identifiable=True), ("0.00", "–", "1/Hz")),
+        (estimate(5e5, "N/m^3"), ("5.00", "not determined", "10⁵ N/m³")),
+        (estimate(168.0, "N/m", np.nan), ("168", "–", "N/m")),
+        (estimate(np.nan, "N"), ("not finite", "", "N")),
+        (estimate(9.996, "N", 0.5), ("10.00", "± 0.50", "N")),
+    ],
+)
+def test_numbers_are_printed_to_two_digits_of_their_error(shown, expected):
+    assert _plot_fit.quantity(shown) == expected

@@ -1,0 +1,71 @@
+"""The programs of the design document run as written."""
+
+import subprocess
+import sys
+
+import jax
+import numpy as np
+import pytest
+
+import jaxmuscle as jm
+
+
+@pytest.mark.slow
+def test_fit_and_what_it_predicts(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    program = """
+import jax, jaxmuscle as jm
+target = jm.load_target("vastus-lateralis-26mvc")
+result = jm.fit(jm.task_for(target), target)
+print(result); result.plot(); result.save("fit.json")
+runs = jm.ensemble(result.task, jax.random.key(0), seeds=1000)
+runs.spectrum().plot(); runs.to_xarray()
+assert jm.load_result("fit.json").message == result.message
+assert result.success and result.chi2_per_bin <= 1.3
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "vastus-lateralis-26mvc" in done.stdout
+    assert (tmp_path / "fit.json").exists()
+
+
+def test_the_papers_tasks():
+    task1 = jm.load_preset("zagrodny-slifkin")
+    ax = jm.simulate(task1, jax.random.key(1)).plot()
+    task2 = task1.as_task(jm.PrescribedForce)
+    assert "P" in ax.get_ylabel()
+    assert task2.muscle is task1.muscle and task2.noise is task1.noise and task2.harmonic is task1.harmonic
+
+
+def test_a_users_own_muscle_has_noise_spectra_and_gradients():
+    from jaxmuscle import AbstractMuscle
+
+    class Linear(AbstractMuscle):
+        m_w: float = 0.5
+        m_z: float = 0.5
+        stiffness: float = 300.0
+        damping: float = 40.0
+
+        def base(self):
+            return jax.numpy.stack([jax.numpy.asarray(v) * 1.0 for v in (self.stiffness, 200.0, self.damping, 5.0)])
+
+        def active_force(self, x_w, v_w, u):
+            return (self.stiffness + u[0]) * x_w + (self.damping + u[2]) * v_w
+
+        def passive_force(self, x_w, v_w, x_z, v_z, u):
+            return (200.0 + u[1]) * (x_z - x_w) + (5.0 + u[3]) * (v_z - v_w)
+
+        def contraction_velocity(self, x_w, x_z, v_z, force, u):
+            return v_z - (force - (200.0 + u[1]) * (x_z - x_w)) / (5.0 + u[3])
+
+    for kind in (jm.Isometric, jm.PrescribedForce, jm.PrescribedMotion):
+        task = kind(muscle=Linear())
+        assert task["stiffness"] == 300.0
+        power = jm.ensemble(task, jax.random.key(0), seeds=8).spectrum().mean().proportional
+        assert np.all(np.isfinite(power))
+
+    def floor(stiffness):
+        moved = jm.simulate(jm.Isometric(muscle=Linear()).replace(stiffness=stiffness), jax.random.key(0))
+        return moved.spectrum().power[10]
+
+    assert np.isfinite(jax.grad(floor)(300.0))

@@ -1,0 +1,399 @@
+"""Fit results and presets: what is saved is read back equal, files are whole or not there, errors name the remedy."""
+
+import dataclasses
+import json
+import os
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import tomli_w
+
+import jaxmuscle as jm
+from jaxmuscle._preset import PresetError, task_from_table, task_to_table
+from jaxmuscle._result import FORMAT, ResultError, Start
+from jaxmuscle._store import replacing, write_json, write_text
+
+POWER = 1 / (1 + np.arange(1, 31) ** 2)
+TARGET = jm.Target("made", POWER, segments=[6, 7], coefficient_of_variation=0.02, notices=["a notice"])
+
+
+def made_result(**changes: Any) -> jm.FitResult:
+    """A result with a value in every field, as a fit would give; nothing is simulated."""
+    task = jm.Isometric().replace(c_w=50.0 / 3, harmonic_phase=-0.1)
+    parameters = {
+        name: jm.Estimate(float(value), "N", 0.1 / 3 if name == "c_w" else None, name in ("c_w", "k_w"), name != "k_w")
+        for name, value in task.parameters.items()
+    }
+    rng = np.random.default_rng(0)
+    fields: dict[str, Any] = {
+        "success": True,
+        "message": "one more step would lower the cost by less than 0.1 %",
+        "task": task,
+        "target": TARGET,
+        "method": "montecarlo",
+        "parameters": parameters,
+        "derived": {"corner_frequency": jm.Estimate(1 / 3, "Hz", 0.01), "K_w0": jm.Estimate(200.0, "N/m", None, False)},
+        "correlation": {"parameters": ["k_w", "c_w"], "matrix": [[1.0, -0.5], [-0.5, 1.0]]},
+        "undetermined": ("k_w by itself",),
+        "singular_values": np.array([12.0, 1 / 3]),
+        "chi2_per_bin": 0.9,
+        "rms_log_error": 0.2,
+        "fitted": np.asarray(TARGET.proportional_power) * rng.uniform(0.9, 1.1, 30),
+        "harmonic_share": rng.uniform(0, 1, 30),
+        "residual": rng.standard_normal(30),
+        "deviation": rng.uniform(0.1, 0.3, 30),
+        "starts": (Start(1.5, True, 12), Start(None, False, 3)),
+        "stretch": (np.arange(10.0, 15.0, 0.01), rng.standard_normal(500)),
+        "notices": ("a notice",),
+        "seed": 3,
+        "settings": {"free": ["k_w", "c_w"], "starts": 2, "bounds": {"k_w": [1.0, 2e6]}, "mean_force": None},
+        "versions": {"jaxmuscle": "0.1", "jax": "0.8"},
+    } | changes
+    return jm.FitResult(**fields)
+
+
+def failed_result():
+    """What a fit gives whose every start explodes."""
+    nothing = np.full(30, np.nan)
+    return made_result(
+        success=False, message="no start has a finite spectrum", derived={"mean": jm.Estimate(np.nan, "N")},
+        correlation={}, undetermined=(), singular_values=np.full(2, np.nan), chi2_per_bin=None, rms_log_error=None,
+        fitted=nothing, harmonic_share=nothing, residual=nothing, deviation=None,
+        stretch=(np.zeros(0), np.zeros(0)), seed=None, starts=(Start(None, False, 0),),
+    )  # fmt: skip
+
+
+def assert_equal(a, b):
+    """Field by field, NaN equal to NaN; numbers to the last digit."""
+    assert type(a) is type(b)
+    if isinstance(a, eqx.Module):
+        for field in dataclasses.fields(a):
+            assert_equal(getattr(a, field.name), getattr(b, field.name))
+    elif isinstance(a, dict):
+        assert list(a) == list(b)
+        for key in a:
+            assert_equal(a[key], b[key])
+    elif isinstance(a, tuple | list):
+        assert len(a) == len(b)
+        for x, y in zip(a, b, strict=True):
+            assert_equal(x, y)
+    elif isinstance(a, np.ndarray):
+        np.testing.assert_array_equal(a, b)
+        assert a.dtype == b.dtype
+    else:
+        assert a == b or (a != a and b != b)
+
+
+# --- fit.json
+
+
+@pytest.mark.parametrize("result", [made_result(), failed_result()], ids=["fitted", "failed"])
+def test_a_saved_result_is_read_back_equal(result, tmp_path):
+    path = tmp_path / "new folder" / "fit.json"
+    result.save(path)
+    assert_equal(jm.load_result(path), result)
+
+
+def test_the_file_has_the_entries_of_the_design(tmp_path):
+    path = tmp_path / "fit.json"
+    made_result().save(path)
+    table = json.loads(path.read_text())
+    assert table["task"] == "isometric" and table["target"] == "made" and table["provenance"] == "user"
+    for key in ("success", "message", "method", "chi2_per_bin", "rms_log_error", "seed", "settings", "versions"):
+        assert table[key] == getattr(made_result(), key)
+    c_w = {"value": 50 / 3, "unit": "N", "stderr": 0.1 / 3, "free": True, "identifiable": True}
+    assert table["parameters"]["c_w"] == c_w
+    assert table["parameters"]["k_w"]["stderr"] is None and not table["parameters"]["k_w"]["identifiable"]
+    assert set(table["spectrum"]) >= {"frequency_hz", "target", "fitted"}
+    assert table["starts"] == [
+        {"cost": 1.5, "success": True, "steps": 12},
+        {"cost": None, "success": False, "steps": 3},
+    ]
+
+
+def test_a_failed_result_is_valid_json(tmp_path):
+    path = tmp_path / "fit.json"
+    failed_result().save(path)
+
+    def refuse(word):
+        raise AssertionError(f"{word} is not JSON")
+
+    table = json.loads(path.read_text(), parse_constant=refuse)
+    assert table["spectrum"]["fitted"] == [None] * 30
+    assert table["success"] is False
+
+
+def test_a_fit_json_is_a_preset(tmp_path):
+    result = made_result()
+    result.save(tmp_path / "fit.json")
+    assert_equal(jm.load_preset(tmp_path / "fit.json"), result.task)
+
+
+def test_text_shows_what_is_known_and_what_is_not():
+    text = str(made_result())
+    assert text.startswith("fitted: made (user), Isometric, BandLimitedNoise, montecarlo")
+    for part in (
+        "c_w",
+        "0.0333",
+        "not determined",
+        "corner_frequency",
+        "k_w by itself",
+        "note: a notice",
+        "chi2 per bin 0.90",
+    ):
+        assert part in text
+    assert "NOT FITTED" in str(failed_result()) and "no start has a finite spectrum" in str(failed_result())
+    assert "no chi2" in str(made_result(chi2_per_bin=None))
+
+
+def test_free_names_are_those_of_the_parameters():
+    assert set(made_result().free) == {"c_w", "k_w"}
+
+
+def fail(*arguments, **keywords):
+    raise OSError(28, "No space left on device")
+
+
+@pytest.mark.parametrize("call", [(os, "replace"), (json, "dumps")], ids=["rename", "write"])
+@pytest.mark.parametrize("exists", [False, True])
+def test_a_result_is_never_half_written(call, exists, tmp_path, monkeypatch):
+    path = tmp_path / "fit.json"
+    if exists:
+        path.write_text("before")
+    monkeypatch.setattr(*call, fail)
+    with pytest.raises(OSError, match="No space left"):
+        made_result().save(path)
+    assert [p.name for p in tmp_path.iterdir()] == (["fit.json"] if exists else [])
+    assert not exists or path.read_text() == "before"
+
+
+def test_an_interrupted_writer_leaves_nothing(tmp_path):
+    path = tmp_path / "figure.png"
+    path.write_text("before")
+    with pytest.raises(KeyboardInterrupt), replacing(path) as temporary:
+        temporary.write_text("half")
+        raise KeyboardInterrupt
+    assert [p.name for p in tmp_path.iterdir()] == ["figure.png"] and path.read_text() == "before"
+
+
+def test_written_files_have_the_rights_of_the_user(tmp_path):
+    before = os.umask(0o027)
+    try:
+        write_text(tmp_path / "a.txt", "text")
+    finally:
+        os.umask(before)
+    assert (tmp_path / "a.txt").stat().st_mode & 0o777 == 0o640
+    assert (tmp_path / "a.txt").read_text() == "text"
+
+
+def test_json_refuses_what_it_has_no_word_for(tmp_path):
+    with pytest.raises(ValueError, match="not JSON compliant"):
+        write_json(tmp_path / "a.json", {"x": float("nan")})
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (None, "fit.json: cannot be read: No such file"),
+        ("{", "fit.json: is not JSON"),
+        ("", "fit.json: is not JSON"),
+        (b"\xff\xfe\x00", "fit.json: is not JSON"),
+        ("[1, 2]", f"is not a fit result of format {FORMAT}; write it with FitResult.save"),
+        ("{}", f"is not a fit result of format {FORMAT}"),
+        ('{"format": 99}', "is not a fit result of format"),
+        (f'{{"format": {FORMAT}, "message": "m"}}', "has no entry 'spectrum'"),
+    ],
+)
+def test_what_is_not_a_result(text, message, tmp_path):
+    path = tmp_path / "fit.json"
+    if text is not None:
+        path.write_bytes(text if isinstance(text, bytes) else text.encode())
+    with pytest.raises(ResultError, match=message):
+        jm.load_result(path)
+
+
+@pytest.mark.parametrize("entry", ["success", "parameters", "starts", "versions", "task_table", "target_table"])
+def test_a_missing_entry_is_named(entry, tmp_path):
+    path = tmp_path / "fit.json"
+    made_result().save(path)
+    table = json.loads(path.read_text())
+    del table[entry]
+    path.write_text(json.dumps(table))
+    with pytest.raises(ResultError, match=f"fit.json: has no entry '{entry}'"):
+        jm.load_result(path)
+
+
+# --- presets
+
+TASKS = (jm.Isometric, jm.PrescribedForce, jm.PrescribedMotion)
+NOISES = {
+    "white": jm.WhiteNoise({"K_w": 0.1 / 3, "C_w": 1e-4}, rate=200.0),
+    "band-limited": jm.BandLimitedNoise(0.1 / 3, cutoff=40.0, shared=True),
+    "ornstein-uhlenbeck": jm.OrnsteinUhlenbeckNoise([1.0, 2.0, 0.0, 0.0], 0.07, relative=False),
+}
+ENVELOPES = {
+    "constant": jm.Constant(1.0),
+    "step": jm.SmoothStep(0.5, start=6.0, initial=1.0),
+    "ramp": jm.RampHold(0.5, 6.0, 4.0, 0.5, 1.0),
+    "decay": jm.Decay(1.0, 0.2, 7.0, 2.0),
+    "sampled": jm.Sampled.through(np.linspace(0, 15, 7), np.array([1.0, 2, 1, 2, 1, 2, 1])),
+}
+
+
+@pytest.mark.parametrize("envelope", ENVELOPES)
+@pytest.mark.parametrize("noise", NOISES)
+@pytest.mark.parametrize("kind", TASKS)
+def test_every_task_survives_saving(kind, noise, envelope, tmp_path):
+    parts: dict[str, Any] = {
+        "harmonic": jm.Harmonic(0.02 / 3, 7.1, 0.2, ENVELOPES[envelope]),
+        "settings": jm.SpectrumSettings(detrend="linear", filter_cutoff=None, sampling="average"),
+        "muscle": jm.Muscle(m_w=0.3),
+        "noise": NOISES[noise],
+    }
+    if kind is jm.PrescribedMotion and noise != "band-limited":
+        with pytest.raises(ValueError, match="cannot be used in PrescribedMotion"):
+            kind(**parts)
+        parts["noise"] = eqx.tree_at(lambda n: n.amplitude, NOISES[noise], np.zeros(4))
+    task = kind(**parts)
+    jm.save_preset(tmp_path / "task.toml", task, description='with "quotes" and σ')
+    assert_equal(jm.load_preset(tmp_path / "task.toml"), task)
+
+
+def test_laws_initial_state_and_inputs_survive_saving(tmp_path):
+    task = jm.PrescribedForce(
+        P_w=jm.RampHold(4.0),
+        F_ext=jm.Sampled.through(np.linspace(0, 15, 7), np.arange(7.0)),
+        initial=(1 / 3, 0.0, 0.0, -0.1),
+        muscle=jm.Muscle(argument="elongation"),
+    )
+    jm.save_preset(tmp_path / "task.toml", task)
+    assert_equal(jm.load_preset(tmp_path / "task.toml"), task)
+
+
+def test_arrays_of_jax_are_saved_as_numbers(tmp_path, x64):
+    task = jm.Isometric().replace(k_w=jnp.asarray(1e6 / 3), noise_K_w=jnp.asarray(0.2))
+    jm.save_preset(tmp_path / "task.toml", task)
+    loaded = jm.load_preset(tmp_path / "task.toml")
+    assert type(loaded["k_w"]) is float and loaded["k_w"] == 1e6 / 3
+    assert isinstance(loaded.noise.amplitude, np.ndarray) and loaded["noise_K_w"] == 0.2
+
+
+def test_a_preset_holds_description_and_fit(tmp_path):
+    import tomllib
+
+    jm.save_preset(tmp_path / "a.toml", jm.Isometric(), description="what", fit={"target": "t", "seed": 1})
+    table = tomllib.loads((tmp_path / "a.toml").read_text())
+    assert table["description"] == "what" and table["fit"] == {"target": "t", "seed": 1}
+
+
+class Own(jm.AbstractLaw):
+    k: float = 1.0
+    smoothness = 9
+
+    def __call__(self, x):
+        return self.k * x
+
+    def base(self):
+        return self.k
+
+
+class BandLimitedNoise(eqx.Module):
+    """A class of another package that has the name of one of jaxmuscle's."""
+
+    amplitude: float = 0.1
+
+
+class OwnTask(jm.PrescribedForce):
+    """A task of the user."""
+
+
+def test_a_class_of_the_user_cannot_be_saved(tmp_path):
+    path = tmp_path / "a.toml"
+    own_law = eqx.tree_at(lambda t: t.muscle.stiffness_w, jm.Isometric(), Own())
+    same_name = eqx.tree_at(lambda t: t.noise, jm.Isometric(), BandLimitedNoise())
+    for task, name in ((own_law, "Own"), (same_name, "BandLimitedNoise"), (OwnTask(), "OwnTask")):
+        with pytest.raises(PresetError, match=f"{name} is not one of jaxmuscle's own classes.*keep the code"):
+            task_to_table(task)
+    with pytest.raises(PresetError):
+        jm.save_preset(path, own_law)
+    assert not path.exists()
+
+
+def test_bundled_presets_load():
+    names = jm.list_presets()
+    assert names == tuple(sorted(names))
+    for name in names:
+        task = jm.load_preset(name)
+        assert_equal(task_from_table(task_to_table(task)), task)
+
+
+def preset_text(**changes):
+    table = task_to_table(jm.Isometric())
+    return tomli_w.dumps({"task_table": table | changes})
+
+
+WRONG = {
+    "unknown.toml": (None, "unknown.toml: cannot be read: No such file"),
+    "broken.toml": ("[task_table", "broken.toml: is not valid TOML"),
+    "broken.json": ("{", "broken.json: is not valid JSON"),
+    "binary.toml": (b"\xff\xfe\x00", "binary.toml: is not valid TOML"),
+    "list.json": ("[]", "list.json: is not a preset"),
+    "empty.toml": ("", r"empty.toml: has no \[task_table\]"),
+    "target.toml": ('name = "t"', r"has no \[task_table\]: is it a preset"),
+    "task.toml": (preset_text(task="isometrics"), "task.toml: task = 'isometrics': did you mean 'isometric'"),
+    "key.toml": (preset_text(muscles=1), "key.toml: unknown key task.muscles: did you mean 'muscle'"),
+    "kind.toml": (preset_text(noise={"type": "WhiteNoises"}), "task.noise.type = 'WhiteNoises': did you mean 'WhiteNoise'"),
+    "value.toml": (preset_text(noise={"type": "BandLimitedNoise", "rate": -1.0}), "task.noise: .*rate = -1.0 Hz"),
+    "entry.toml": (preset_text(harmonic={"type": "Harmonic", "amplitudes": 1}), "task.harmonic.amplitudes: did you mean"),
+    "setting.toml": (preset_text(settings={"overlap": 1.5}), "setting.toml: overlap=1.5: give a fraction"),
+    "initial.toml": (preset_text(initial=[1.0]), "initial has 1 entries"),
+}
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_wrong_presets(name, tmp_path):
+    text, message = WRONG[name]
+    if text is not None:
+        (tmp_path / name).write_bytes(text if isinstance(text, bytes) else text.encode())
+    with pytest.raises(PresetError, match=message):
+        jm.load_preset(tmp_path / name)
+
+
+NOT_TABLES = {
+    "a number for a table": {"muscle": 1.0},
+    "another table": {"muscle": {"type": "Constant", "level": 1.0}},
+    "a table for a number": {"x_z": {"type": "Constant", "level": 1.0}},
+    "a text for a signal": {"P_w": "far"},
+    "a number for yes or no": {"noise": {"type": "BandLimitedNoise", "shared": 1}},
+    "a number for the settings": {"settings": 3},
+    "a text for a number": {"x_z": "far"},
+    "a text in a list": {"noise": {"type": "BandLimitedNoise", "amplitude": ["a", 1, 1, 1]}},
+    "a ragged list": {"noise": {"type": "BandLimitedNoise", "amplitude": [[1], 1, 1, 1]}},
+}
+
+
+@pytest.mark.parametrize("case", NOT_TABLES)
+def test_values_of_the_wrong_kind(case, tmp_path):
+    path = tmp_path / "a.toml"
+    path.write_text(preset_text(**NOT_TABLES[case]))
+    with pytest.raises(PresetError, match=r"a\.toml: "):
+        jm.load_preset(path)
+
+
+def test_a_table_that_is_no_table(tmp_path):
+    path = tmp_path / "a.toml"
+    path.write_text("task_table = 3")
+    with pytest.raises(PresetError, match=r"a\.toml: "):
+        jm.load_preset(path)
+
+
+def test_an_unknown_preset_names_the_nearest(monkeypatch):
+    from jaxmuscle import _preset
+
+    monkeypatch.setattr(_preset, "list_presets", lambda: ("zagrodny-hamilton", "zagrodny-slifkin"))
+    with pytest.raises(PresetError, match=r"'zagrodny-slifki': did you mean 'zagrodny-slifkin'.*or give a path"):
+        jm.load_preset("zagrodny-slifki")

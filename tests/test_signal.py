@@ -1,0 +1,161 @@
+"""Input signals: values, smoothness across their joints, and splines against SciPy's."""
+
+import jax
+import jax.numpy as jnp
+import jaxtyping
+import numpy as np
+import pytest
+import references
+import scipy.interpolate
+
+import jaxmuscle as jm
+from jaxmuscle._signal import derivatives
+
+TIMES = np.linspace(0.0, 6.0, 25)
+CASES = {
+    "constant": (jm.Constant(2.0), 6, []),
+    "step": (jm.SmoothStep(2.0, 0.7, 1.3, -1.0), 3, [0.7, 2.0]),
+    "ramp": (jm.RampHold(2.0, 0.5, 2.0, 0.3, -1.0), 3, [0.5, 0.8, 2.2, 2.5]),
+    "decay": (jm.Decay(2.0, 0.5, 1.0, 0.8), 1, [1.0]),
+    "sampled": (jm.Sampled.through(TIMES, np.sin(3 * TIMES)), 4, list(TIMES[3:-3:4])),
+}
+
+
+def jump(signal, joint, order, h=1e-9):
+    """Difference of a derivative just right and left of a joint, and its size near the joint."""
+    left, right, near = (float(derivatives(signal, joint + s, order)[order]) for s in (-h, h, 0.05))
+    return abs(right - left), abs(near) + abs(left) + abs(right)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_as_many_derivatives_are_continuous_as_claimed_and_no_more(x64, name):
+    signal, smooth, joints = CASES[name]
+    assert smooth == min(signal.smoothness, 6)
+    for joint in joints:
+        for order in range(smooth + 1):
+            step, size = jump(signal, joint, order)
+            assert step < 1e-4 * max(size, 1.0), (joint, order)  # a continuous slope changes by h times the next one
+    broken = [jump(signal, joint, smooth + 1) for joint in joints]
+    assert not joints or max(step / size for step, size in broken) > 0.1
+
+
+@pytest.mark.parametrize("precision", ["float32", "float64"])
+@pytest.mark.parametrize("signal", [jm.RampHold(1.0), jm.RampHold(2.0, 0.3, 1.7, 0.3), jm.SmoothStep(), jm.Decay()])
+def test_the_slope_is_not_lost_at_a_joint(signal, precision):
+    """On a grid that hits the joints, compiled, as in a simulation; there, pieces were once counted twice or not."""
+    with jax.enable_x64(precision == "float64"):
+        times = np.arange(0.0, 6.0, 0.1)
+        slope = jax.jit(jax.vmap(lambda t: derivatives(signal, t, 1)[1]))
+        here, before, after = (np.asarray(slope(jnp.asarray(times + s))) for s in (0.0, -1e-4, 1e-4))
+        # The slope moves by 1e-4 s times a curvature below 10 / s².
+        np.testing.assert_allclose(here, 0.5 * (before + after), atol=1e-3)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_derivatives_are_those_of_finite_differences(x64, name):
+    signal, smooth, _ = CASES[name]
+    h = 1e-3
+    for t in (0.9, 1.2, 2.3, 4.6):  # in smooth pieces
+        around = np.array([float(signal(t + k * h)) for k in range(-3, 4)])
+        exact = [float(d) for d in derivatives(signal, t, min(smooth, 3))]
+        # Central differences: error h² f'''/6 and h² f''''/12; f'''' below 400 in every case.
+        np.testing.assert_allclose(exact[0], around[3], rtol=1e-14)
+        np.testing.assert_allclose(exact[1], (around[4] - around[2]) / (2 * h), atol=1e-4)
+        if smooth >= 2:
+            np.testing.assert_allclose(exact[2], (around[4] - 2 * around[3] + around[2]) / h**2, atol=1e-3)
+        if smooth >= 3:
+            third = (around[5] - 2 * around[4] + 2 * around[2] - around[1]) / (2 * h**3)
+            np.testing.assert_allclose(exact[3], third, atol=2e-2)
+
+
+def test_a_step_is_the_incomplete_beta_function(x64):
+    t = np.linspace(0, 3, 50)
+    signal = jm.SmoothStep(2.5, 0.5, 1.0)
+    np.testing.assert_allclose(signal(t), references.smooth_step(t, 2.5), atol=1e-12)
+
+
+def test_ends_are_reached_and_held_exactly():
+    for dtype in (np.float32, np.float64):
+        with jax.enable_x64(dtype == np.float64):
+            eps = float(np.finfo(dtype).eps)
+            for signal in (jm.SmoothStep(0.01, 0.5, 1.0, 0.002), jm.RampHold(0.01, 0.5, 2.0, 0.2, 0.002)):
+                before, after = (np.asarray(signal(jnp.asarray(t))) for t in ([0.0, 0.25, 0.5], [2.5, 3.0, 15.0]))
+                np.testing.assert_array_equal(before, np.asarray(0.002, dtype))
+                # Rounding of the times, 15 s at most, over a ramp of 1.8 s.
+                np.testing.assert_allclose(after, 0.01, rtol=40 * eps)
+
+
+def test_the_ramp_is_straight_between_its_corners(x64):
+    signal = jm.RampHold(3.0, 0.5, 2.0, 0.2, 1.0)
+    t = np.linspace(0.71, 2.29, 20)
+    # The rounded ramp runs through the middle (1.5 s, 2.0) with slope (level - initial) / (ramp - corner).
+    np.testing.assert_allclose(signal(t), 2.0 + (t - 1.5) * 2.0 / 1.8, rtol=1e-12)
+
+
+def test_decay_is_its_formula(x64):
+    signal = jm.Decay(2.0, 0.5, 1.0, 0.8)
+    p = 1.7 / 0.8
+    np.testing.assert_allclose(signal(2.7), 0.5 + 1.5 * (2 * np.exp(-p) - np.exp(-2 * p)), rtol=1e-13)
+    np.testing.assert_allclose([signal(0.3), signal(1.0), signal(100.0)], [2.0, 2.0, 0.5], rtol=1e-13)
+
+
+def test_samples_give_scipys_spline(x64):
+    rng = np.random.default_rng(0)
+    times = np.cumsum(rng.uniform(0.05, 0.2, 30))
+    values = rng.normal(size=30)
+    signal = jm.Sampled.through(times, values)
+    spline = scipy.interpolate.make_interp_spline(times, values, k=5)
+    t = rng.uniform(times[0], times[-1], 200)
+    np.testing.assert_allclose(signal(t[0]), spline(t[0]), rtol=1e-9)
+    np.testing.assert_allclose(jax.vmap(signal)(t), spline(t), rtol=1e-8, atol=1e-10)
+    for order in (1, 2, 3):
+        ours = jax.vmap(lambda s, n=order: derivatives(signal, s, n)[n])(t)
+        np.testing.assert_allclose(ours, spline(t, nu=order), rtol=1e-7, atol=1e-6 * 10**order)
+    np.testing.assert_allclose(jax.vmap(signal)(times), values, atol=1e-10)
+    held = [signal(times[0] - 1.0), signal(times[-1] + 1.0)]
+    np.testing.assert_allclose(held, [values[0], values[-1]], atol=1e-9)
+
+
+def test_a_spline_follows_a_smooth_function_to_sixth_order(x64):
+    middle = np.linspace(1.0, 2.0, 40)
+    errors = []
+    for points in (31, 61):
+        times = np.linspace(0.0, 3.0, points)
+        signal = jm.Sampled.through(times, np.exp(np.sin(3 * times)))
+        errors.append(np.abs(jax.vmap(signal)(middle) - np.exp(np.sin(3 * middle))).max())
+    # Degree five: order 6; between 5.5 and 7 since two grids fit a slope with an accidental part.
+    assert 5.5 < np.log2(errors[0] / errors[1]) < 7.0
+
+
+def test_level_scales_a_sampled_signal():
+    task = jm.PrescribedForce(jm.Sampled.through(TIMES, np.sin(TIMES)))
+    doubled = task.replace(P_w=2.0)
+    assert isinstance(doubled, jm.PrescribedForce)
+    np.testing.assert_allclose(doubled.P_w(1.0), 2 * np.sin(1.0), rtol=1e-3)
+
+
+@pytest.fixture
+def user_view():
+    """As a user runs it: without the run-time type check, which would see a wrong argument first."""
+    jaxtyping.config.update("jaxtyping_disable", True)
+    yield
+    jaxtyping.config.update("jaxtyping_disable", False)
+
+
+def test_impossible_signals_are_refused(user_view):
+    with pytest.raises(ValueError, match=r"rise = 0.0 s: a step without rise time .* give rise > 0"):
+        jm.SmoothStep(rise=0.0)
+    with pytest.raises(ValueError, match=r"corner = 0.0 s must be positive"):
+        jm.RampHold(corner=0.0)
+    with pytest.raises(ValueError, match=r"corner = 1.1 s must be at most half the ramp 2.0 s"):
+        jm.RampHold(ramp=2.0, corner=1.1)
+    with pytest.raises(ValueError, match=r"time_constant = 0.0 s must be positive"):
+        jm.Decay(time_constant=0.0)
+    for times, values in (
+        (np.arange(5.0), np.arange(5.0)),
+        (np.arange(8.0), np.arange(7.0)),
+        (np.array([0, 1, 1, 2, 3, 4, 5.0]), np.zeros(7)),
+        (np.arange(7.0), np.array([0, 1, np.nan, 0, 0, 0, 0])),
+    ):
+        with pytest.raises(ValueError, match="times"):
+            jm.Sampled.through(times, values)

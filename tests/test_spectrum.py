@@ -1,0 +1,301 @@
+"""The spectral estimate against scipy, analytic values, its own spread and its derivatives."""
+
+import itertools
+import json
+from typing import Any
+
+import hypothesis.extra.numpy as hnp
+import hypothesis.strategies as st
+import jax
+import jax.numpy as jnp
+import jaxtyping
+import numpy as np
+import pytest
+import scipy.signal
+import scipy.stats
+from hypothesis import given, settings
+
+from jaxmuscle._spectrum import Spectrum, SpectrumSettings, lowpass, periodogram, spectrum_of, welch
+
+ROUNDING = 1e-10  # float64: what the design promises; the transforms themselves are within 1e-13
+SINGLE = 1e-4  # float32, relative to the range of the fluctuations
+FORCE = 10.0 + 0.01 * np.random.default_rng(0).standard_normal((2, 1500)).cumsum(-1)  # a mean, a drift, 15 s
+
+GRID = [
+    SpectrumSettings(window=window, overlap=overlap, detrend=detrend, length=length, last_bin=30)
+    for window, overlap, detrend, length in itertools.product(
+        ("hann", "hamming", "boxcar"), (0.0, 0.5, 0.75), ("constant", "linear", "none"), (255, 256)
+    )
+]
+FILTERS = [
+    SpectrumSettings(rate=rate, filter_order=order, filter_cutoff=cutoff, filter_direction=direction)
+    for (rate, order, cutoff), direction in itertools.product(
+        ((100.0, 9, 30.0), (100.0, 1, 5.0), (120.0, 4, 10.0), (100.0, 2, 0.5)), ("forward", "both")
+    )
+]
+
+
+def scipy_lowpass(signal, settings):
+    apply = {"forward": scipy.signal.sosfilt, "both": scipy.signal.sosfiltfilt}[settings.filter_direction]
+    order, cutoff = settings.filter_order, settings.filter_cutoff
+    return apply(scipy.signal.butter(order, cutoff, fs=settings.rate, output="sos"), signal)
+
+
+def scipy_welch(signal, settings):
+    detrend: Any = False if settings.detrend == "none" else settings.detrend
+    frequency, power = scipy.signal.welch(
+        signal,
+        fs=settings.rate,
+        window=settings.window,
+        nperseg=settings.length,
+        noverlap=int(settings.overlap * settings.length),
+        detrend=detrend,
+    )
+    bins = slice(settings.first_bin, settings.last_bin + 1)
+    return frequency[bins], power[..., bins]
+
+
+@pytest.fixture
+def user_view():
+    """As a user runs it: without the run-time type check, which would see a wrong argument first."""
+    jaxtyping.config.update("jaxtyping_disable", True)
+    yield
+    jaxtyping.config.update("jaxtyping_disable", False)
+
+
+@pytest.mark.parametrize("settings", GRID, ids=lambda s: f"{s.window}-{s.overlap}-{s.detrend}-{s.length}")
+def test_welch_is_scipy(x64, settings):
+    frequency, power = scipy_welch(FORCE, settings)
+    np.testing.assert_allclose(settings.frequency, frequency, rtol=1e-14)
+    # Where the mean stays in, its rounding is what the smaller bins are made of.
+    floor = ROUNDING * np.max(power) if settings.detrend == "none" else 0.0
+    np.testing.assert_allclose(welch(FORCE, settings), power, rtol=ROUNDING, atol=floor)
+
+
+@pytest.mark.parametrize("settings", FILTERS, ids=lambda s: f"{s.filter_order}-{s.filter_direction}")
+def test_lowpass_is_scipy(x64, settings):
+    filtered = lowpass(FORCE, settings)
+    np.testing.assert_allclose(filtered, scipy_lowpass(FORCE, settings), rtol=0, atol=ROUNDING)
+
+
+@pytest.mark.parametrize("settings", FILTERS, ids=lambda s: f"{s.filter_order}-{s.filter_direction}")
+@pytest.mark.parametrize("size", [1.0, 0.01])
+def test_lowpass_keeps_small_fluctuations_in_single_precision(settings, size):
+    signal = (10.0 + size * (FORCE - 10.0)).astype(np.float32)
+    filtered = lowpass(signal, settings)
+    assert filtered.dtype == jnp.float32
+    # The result is a float32 near 10 N: no filter can be closer than a few spacings of such numbers.
+    bound = max(SINGLE * np.ptp(signal - 10), 3 * float(np.spacing(np.float32(10))))
+    expected = scipy_lowpass(signal.astype(float), settings)
+    np.testing.assert_allclose(np.asarray(filtered, float), expected, rtol=0, atol=bound)
+
+
+def test_single_precision_spectrum():
+    chosen = SpectrumSettings()
+    signal = FORCE.astype(np.float32)
+    spectrum = spectrum_of(signal, chosen, (5.0, 15.0))
+    assert spectrum.power.dtype == spectrum.frequency.dtype == jnp.float32
+    expected = scipy_welch(scipy_lowpass(signal.astype(float), chosen)[..., 500:], chosen)[1]
+    error = np.abs(np.asarray(spectrum.power, float) - expected)
+    assert np.all(error < SINGLE * np.max(expected, -1, keepdims=True))
+
+
+def test_the_window_is_cut_after_the_filter(x64):
+    chosen = SpectrumSettings()
+    expected = scipy_welch(scipy_lowpass(FORCE, chosen)[..., 500:1200], chosen)[1]
+    spectrum = spectrum_of(FORCE, chosen, (5.0, 12.0), unit="mm")
+    np.testing.assert_allclose(spectrum.power, expected, rtol=ROUNDING)
+    assert (spectrum.unit, spectrum.settings) == ("mm", chosen)
+
+
+def test_without_cutoff_nothing_is_filtered(x64):
+    chosen = SpectrumSettings(filter_cutoff=None)
+    np.testing.assert_array_equal(spectrum_of(FORCE, chosen).power, welch(FORCE, chosen))
+
+
+@pytest.mark.parametrize("window", ["hann", "boxcar"])
+@pytest.mark.parametrize("samples", [999, 1000])
+def test_periodogram_is_scipy(x64, window, samples):
+    chosen = SpectrumSettings(window=window, detrend="linear")
+    frequency, power = periodogram(FORCE[:, :samples], chosen)
+    expected = scipy.signal.periodogram(FORCE[:, :samples], 100.0, window=window, detrend="linear")
+    np.testing.assert_allclose(frequency, expected[0], rtol=1e-14)
+    # Bin 0 is zero but for rounding.
+    np.testing.assert_allclose(power[:, 1:], expected[1][:, 1:], rtol=1e-8, atol=1e-14)
+
+
+lengths = st.sampled_from((33, 48, 80))  # few shapes, few compilations
+records = hnp.arrays(np.float64, lengths, elements=st.floats(-100, 100, width=32))
+
+
+@settings(max_examples=40)
+@given(records, st.sampled_from([16, 17]))
+def test_power_adds_up_to_the_variance(record, length):
+    with jax.enable_x64(True):
+        chosen = SpectrumSettings(length=length, first_bin=0, last_bin=8, window="boxcar", overlap=0.0, filter_cutoff=None)
+        whole = record[: record.size // length * length].reshape(-1, length)
+        total = float(jnp.sum(welch(record, chosen))) * chosen.resolution
+        np.testing.assert_allclose(total, np.mean(np.var(whole, axis=1)), rtol=1e-9, atol=1e-9)
+        frequency, power = periodogram(record, chosen)
+        total = float(jnp.sum(power)) * float(frequency[1])
+        np.testing.assert_allclose(total, np.var(record), rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("direction", ["forward", "both"])
+def test_derivatives_agree(x64, direction):
+    chosen = SpectrumSettings(length=64, last_bin=20, filter_direction=direction)
+    signal, along = jnp.asarray(FORCE[0, :300]), jnp.asarray(np.random.default_rng(1).standard_normal(300))
+
+    @jax.jit
+    def path(size):
+        return jnp.log(spectrum_of(signal + size * along, chosen).proportional)
+
+    forward, reverse = jax.jacfwd(path)(0.01), jax.jacrev(path)(0.01)
+    np.testing.assert_allclose(forward, reverse, rtol=1e-9, atol=1e-9)
+    h = 1e-6
+    differences = (path(0.01 + h) - path(0.01 - h)) / (2 * h)
+    # Central differences: truncation h² f'''/6 below 1e-5 (f varies over 0.01), rounding 1e-13 / h.
+    np.testing.assert_allclose(forward, differences, rtol=1e-5, atol=1e-5 * np.max(np.abs(forward)))
+
+
+def test_jit_and_vmap_change_nothing(x64):
+    chosen = SpectrumSettings()
+    power = spectrum_of(FORCE, chosen).power
+
+    def one(x):
+        return spectrum_of(x, chosen).power
+
+    # Another order of summation: rounding of the largest bin.
+    for other in (jax.jit(one)(FORCE), jax.vmap(one)(FORCE), jnp.stack([one(x) for x in FORCE])):
+        np.testing.assert_allclose(other, power, rtol=ROUNDING)
+    jitted = jax.jit(welch)(FORCE, chosen)  # settings are static by themselves
+    np.testing.assert_allclose(jitted, welch(FORCE, chosen), rtol=ROUNDING)
+
+
+def test_whole_numbers_are_samples_too(x64):
+    counts = np.arange(300) % 7
+    np.testing.assert_array_equal(welch(counts, SpectrumSettings()), welch(counts.astype(float), SpectrumSettings()))
+
+
+def test_degrees_of_freedom_of_the_design():
+    for k in (1, 2, 6, 40):
+        expected = 2 * k / (1 + 2 * (1 - 1 / k) / 36)
+        assert SpectrumSettings().degrees_of_freedom(k) == pytest.approx(expected, rel=1e-12)
+    assert SpectrumSettings(overlap=0.0).degrees_of_freedom(7) == 14
+
+
+@pytest.mark.parametrize("window, overlap", [("hann", 0.5), ("hann", 0.75), ("hamming", 0.5), ("boxcar", 0.5)])
+def test_degrees_of_freedom_are_the_spread_of_white_noise(x64, window, overlap):
+    chosen = SpectrumSettings(length=32, first_bin=3, last_bin=12, window=window, overlap=overlap, detrend="none")
+    samples = 112
+    noise = np.random.default_rng(2).standard_normal((20_000, samples))
+    power = np.asarray(welch(noise, chosen))[:, ::3]  # bins three apart are independent
+    assert np.mean(power) == pytest.approx(2 / chosen.rate, rel=4 / np.sqrt(power.size))
+    nu = chosen.degrees_of_freedom(chosen.segments(samples))
+    relative_variance = np.mean(np.var(power, axis=0) / np.mean(power, axis=0) ** 2)
+    # A variance estimated from n values of kurtosis 3 + 12/ν has the relative standard error √((2 + 12/ν)/n).
+    standard_error = np.sqrt((2 + 12 / nu) / power.size)
+    assert relative_variance == pytest.approx(2 / nu, rel=4 * standard_error)
+    assert standard_error < 0.01  # fine enough to miss ν = 2K, which ignores the overlap
+
+
+@pytest.mark.parametrize("samples, overlap", [(255, 0.5), (256, 0.5), (1000, 0.5), (1000, 0.29), (1000, 0.0)])
+def test_segments_are_counted_as_scipy_counts(samples, overlap):
+    chosen = SpectrumSettings(length=256, overlap=overlap)
+    expected = 0
+    if samples >= 256:
+        transform = scipy.signal.spectrogram(np.zeros(samples), nperseg=256, noverlap=int(overlap * 256))
+        expected = transform[2].shape[-1]
+    assert chosen.segments(samples) == expected
+
+
+def test_overlap_is_not_lost_to_rounding():
+    assert SpectrumSettings(length=100, overlap=0.29).step == 71
+    assert SpectrumSettings(length=255, overlap=0.5).step == 128  # scipy: nperseg // 2 shared
+
+
+def test_pwelch_puts_the_mean_into_the_first_bin(x64):
+    noise = 0.1 * np.random.default_rng(3).standard_normal(1000)
+    matlab = Spectrum(SpectrumSettings().frequency, welch(10 + noise, SpectrumSettings.pwelch()), SpectrumSettings())
+    assert matlab.proportional[0] > 0.999
+    # w = 0.54 - 0.46 cos has |W_1| = 0.23 n and Σ w² = 0.3974 n: P_1 = 2 (10 N · 0.23 n)² / (rate · 0.3974 n).
+    leaked = 2 * (10 * 0.23 * 256) ** 2 / (100 * 0.3974 * 256)
+    # The noise interferes with the leak: its amplitude is √(2 · 0.1² / (100 Hz · leaked)) of the leak.
+    assert matlab.power[0] == pytest.approx(leaked, rel=6 * np.sqrt(2 * 0.1**2 / (100 * leaked)))
+    detrended = spectrum_of(10 + noise, SpectrumSettings(filter_cutoff=None))
+    assert detrended.proportional[0] < 0.2
+
+
+def test_average_before_normalising(x64):
+    power = np.array([[1.0, 3.0], [30.0, 10.0]])
+    spectrum = Spectrum(np.array([1.0, 2.0]), power, SpectrumSettings())
+    np.testing.assert_allclose(spectrum.proportional, [[0.25, 0.75], [0.75, 0.25]])
+    np.testing.assert_allclose(spectrum.mean().power, [15.5, 6.5])
+    np.testing.assert_allclose(spectrum.mean().mean().proportional, [15.5 / 22, 6.5 / 22])
+
+
+WRONG = {
+    "rate": [0.0, -1.0, float("nan"), float("inf"), "100"],
+    "length": [7, 256.0, np.float64(256)],
+    "first_bin": [-1, 31],
+    "last_bin": [0, 129, 30.5],
+    "overlap": [1.0, -0.1, float("nan")],
+    "window": ["hanning"],
+    "detrend": ["mean", False],
+    "filter_order": [0, 2.5],
+    "filter_cutoff": [0.0, 50.0, float("nan"), "30"],
+    "filter_direction": ["backward"],
+    "sampling": ["mean"],
+}
+
+
+@pytest.mark.parametrize("name, value", [(name, value) for name, values in WRONG.items() for value in values])
+def test_wrong_settings_are_named(user_view, name, value):
+    with pytest.raises(ValueError, match=f"^{name}=.*(give|choose)") as error:
+        SpectrumSettings(**{name: value})
+    assert str(value) in str(error.value)
+
+
+@pytest.mark.parametrize(
+    "chosen",
+    [
+        SpectrumSettings(),
+        SpectrumSettings.pwelch(),
+        SpectrumSettings(rate=np.float32(120), length=np.int64(128), first_bin=0, filter_cutoff=None),
+    ],
+)
+def test_settings_survive_a_file(chosen):
+    table = json.loads(json.dumps(chosen.to_dict()))
+    assert None not in table.values()  # TOML could not hold it
+    assert SpectrumSettings.from_dict(table) == chosen
+    assert hash(SpectrumSettings.from_dict(table)) == hash(chosen)
+
+
+def test_replace():
+    assert SpectrumSettings(filter_cutoff=None).replace(length=128) == SpectrumSettings(length=128, filter_cutoff=None)
+    with pytest.raises(ValueError, match=r"lenght=64.*'length'"):
+        SpectrumSettings().replace(lenght=64)
+    with pytest.raises(ValueError, match=r"last_bin=30.*8"):
+        SpectrumSettings().replace(length=16)
+
+
+@pytest.mark.parametrize("window", [(5.0, 16.0), (-1.0, 5.0), (6.0, 6.0), (0.0, 2.0)])
+def test_a_window_that_does_not_fit(window):
+    name = "signal length=200" if window == (0.0, 2.0) else "window="
+    with pytest.raises(ValueError, match=name):
+        spectrum_of(FORCE, SpectrumSettings(), window)
+
+
+def test_signals_that_are_too_short(user_view):
+    with pytest.raises(ValueError, match=r"signal length=255: one segment needs 256"):
+        welch(np.zeros(255), SpectrumSettings())
+    with pytest.raises(ValueError, match=r"signal length=30: .*'both' needs more than 30"):
+        lowpass(np.zeros(30), SpectrumSettings(filter_direction="both"))
+    with pytest.raises(ValueError, match="padlen"):  # the same limit as scipy's
+        scipy_lowpass(np.zeros(30), SpectrumSettings(filter_direction="both"))
+    assert lowpass(np.zeros(31), SpectrumSettings(filter_direction="both")).shape == (31,)
+    for signal in (np.zeros(0), np.array(1.0), np.ones(300, complex)):
+        with pytest.raises(ValueError, match=r"signal=.*real samples"):
+            lowpass(signal, SpectrumSettings())
+    with pytest.raises(ValueError, match="segments=0"):
+        SpectrumSettings().degrees_of_freedom(0)
