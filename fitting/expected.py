@@ -5,8 +5,9 @@ import json
 import sys
 from pathlib import Path
 
-import jaxmuscle as jm
 import numpy as np
+
+import jaxmuscle as jm
 
 SCRIPTS = {
     "vastus-lateralis-26mvc": "vastus_lateralis_26mvc",

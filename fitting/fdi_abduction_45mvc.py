@@ -1,8 +1,7 @@
 """Index-finger abduction force at 45 % MVC, measured: mean of two people, 4 Welch segments in all."""
 
-from common import arguments, load, report
-
 import jaxmuscle as jm
+from common import arguments, load, report
 
 NAME = "fdi-abduction-45mvc"
 

@@ -1,8 +1,7 @@
 """Hamilton, Jones & Wolpert (2004): reconstructed from the text, or your own digitised figure."""
 
-from common import arguments, load, report
-
 import jaxmuscle as jm
+from common import arguments, load, report
 
 NAME = "hamilton-2004"
 

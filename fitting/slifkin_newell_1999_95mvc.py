@@ -1,8 +1,7 @@
 """Slifkin & Newell (1999), 95 % MVC: reconstructed from the text, or your own digitised figure."""
 
-from common import arguments, load, report
-
 import jaxmuscle as jm
+from common import arguments, load, report
 
 NAME = "slifkin-newell-1999-95mvc"
 

@@ -1,8 +1,7 @@
 """Knee-extension force at 26 % MVC, measured: one person, 12 Welch segments."""
 
-from common import arguments, load, report
-
 import jaxmuscle as jm
+from common import arguments, load, report
 
 NAME = "vastus-lateralis-26mvc"
 

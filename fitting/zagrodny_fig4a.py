@@ -10,9 +10,9 @@ from pathlib import Path
 
 import jax
 import numpy as np
-from common import load, report
 
 import jaxmuscle as jm
+from common import load, report
 from jaxmuscle import save_preset
 
 NAME = "zagrodny-fig4a"
