@@ -218,7 +218,7 @@ class _Setup:
         every = whole(1 / (settings.rate * self.dt), f"dt = {self.dt} s does not divide the sampling interval "
                       f"{1 / settings.rate} s")  # fmt: skip
         self.task.noise.check_step(self.dt)
-        grid = Grid(self.dt, every * round(DURATION * settings.rate), every, 1)
+        grid = Grid(self.dt, every * round(DURATION * settings.rate), every, 1, reverse=False)
         normals = draw(task.noise, jax.random.fold_in(self.key, 0), jnp.arange(seeds), grid.steps)
         colour = any(name in ("noise_cutoff", "noise_correlation_time") for name in self.coordinates.names)
         chosen = self.target.bins - settings.first_bin
@@ -243,7 +243,7 @@ class _Setup:
         grid = problem.model.grid
         if needed <= grid.substeps:
             return problem
-        grid = Grid(grid.dt, grid.steps, grid.every, needed)
+        grid = Grid(grid.dt, grid.steps, grid.every, needed, reverse=False)
         return eqx.tree_at(lambda p: p.model.grid, problem, grid, is_leaf=lambda x: isinstance(x, Grid))
 
 

@@ -6,7 +6,6 @@ import diffrax as dfx
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import lineax as lx
 from jaxtyping import Array, Float
 
 from ._noise import Realisation
@@ -16,13 +15,15 @@ from ._task import AbstractTask
 class Grid(eqx.Module):
     """Time steps of a simulation: `steps` of `dt` [s], every `every`-th kept, each integrated in `substeps` parts.
 
-    The integration variable is the step number, which floating point represents exactly in either precision.
+    The integration variable is the step number, which floating point represents exactly in either precision. `reverse`
+    asks for a loop that reverse-mode differentiation can go through; the other is faster and has the forward mode only.
     """
 
     dt: float = eqx.field(static=True)
     steps: int = eqx.field(static=True)
     every: int = eqx.field(static=True)
     substeps: int = eqx.field(static=True, default=1)
+    reverse: bool = eqx.field(static=True, default=True)
 
 
 class GridPath(dfx.AbstractBrownianPath):
@@ -84,6 +85,35 @@ class SubcycledHeun(dfx.AbstractStratonovichSolver):
         return y1, None, {"y0": y0, "y1": y1}, None, dfx.RESULTS.successful
 
 
+class GridTerm(dfx.AbstractTerm):
+    """Drift and diffusion times increment, `f dt + (∂f/∂u) scale ΔW`, from one linearisation of the vector field.
+
+    What `MultiTerm(ODETerm, ControlTerm)` gives with two evaluations. Without a path it is the drift alone.
+    """
+
+    task: AbstractTask
+    u: Any
+    scale: Float[Array, "4"]
+    path: GridPath | None
+    dt: float = eqx.field(static=True)
+
+    def vf(self, t, y, args):
+        return self.dt * self.task.vector_field(t * self.dt, y, self.u(t))
+
+    def contr(self, t0, t1, **kwargs):
+        return jnp.zeros(()) if self.path is None else self.path.evaluate(t0, t1)
+
+    def prod(self, vf, control):
+        raise NotImplementedError("GridTerm offers vf_prod only")
+
+    def vf_prod(self, t, y, args, control):
+        if self.path is None:
+            return self.vf(t, y, args)
+        field = lambda u: self.task.vector_field(t * self.dt, y, u)  # noqa: E731
+        drift, diffusion = jax.jvp(field, (self.u(t),), (self.scale * control,))
+        return self.dt * drift + diffusion
+
+
 def _whole(s: Any, last: int) -> Any:
     return jnp.clip(jnp.floor(s).astype(int), 0, last)
 
@@ -113,20 +143,11 @@ def _harmonic(task: AbstractTask) -> Any:
 
 def solve(task: AbstractTask, path: Realisation, grid: Grid) -> Float[Array, "samples states"]:
     """States at every `every`-th grid point, the first included; what overflows is not finite, never an exception."""
-    u = perturbation_at(task, path, grid)
-    drift = dfx.ODETerm(lambda s, y, _: grid.dt * task.vector_field(s * grid.dt, y, u(s)))
-    terms: dfx.AbstractTerm = drift
+    brownian = None
     if path.increments is not None:
-        scale = task.noise_scale()
-
-        def diffusion(s, y, _):
-            field = lambda du, _: task.vector_field(s * grid.dt, y, u(s) + scale * du)  # noqa: E731
-            return lx.JacobianLinearOperator(field, jnp.zeros_like(scale))
-
-        increments = jnp.broadcast_to(path.increments, (grid.steps, scale.shape[0]))
-        terms = dfx.MultiTerm(drift, dfx.ControlTerm(diffusion, GridPath(increments)))
+        brownian = GridPath(jnp.broadcast_to(path.increments, (grid.steps, 4)))
     solution = dfx.diffeqsolve(
-        terms,
+        GridTerm(task, perturbation_at(task, path, grid), task.noise_scale(), brownian, grid.dt),
         SubcycledHeun(grid.every * grid.substeps, 1 / grid.substeps),
         t0=0.0,
         t1=float(grid.steps),
@@ -135,7 +156,7 @@ def solve(task: AbstractTask, path: Realisation, grid: Grid) -> Float[Array, "sa
         stepsize_controller=dfx.ConstantStepSize(),
         saveat=dfx.SaveAt(t0=True, steps=1),
         max_steps=grid.steps // grid.every,
-        adjoint=dfx.DirectAdjoint(),
+        adjoint=dfx.DirectAdjoint() if grid.reverse else dfx.ForwardMode(),
         throw=False,
     )
     states: Any = solution.ys

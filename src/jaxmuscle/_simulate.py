@@ -129,7 +129,7 @@ def _plan(
         task.noise.check_step(dt)
     if substeps is None:
         substeps = stable_substeps(task, dt, duration) if _all_concrete(task) else 1
-    return Grid(dt, samples * every, every, substeps), sampling, rate
+    return Grid(dt, samples * every, every, substeps, reverse=not _all_concrete(task)), sampling, rate
 
 
 def whole(value: float, message: str) -> int:
@@ -164,7 +164,7 @@ def respond(
     if sampling == "instant":
         states = solve(task, path, grid)
         return states, observe(task, path, grid, states)
-    fine = Grid(grid.dt, grid.steps, 1, grid.substeps)
+    fine = Grid(grid.dt, grid.steps, 1, grid.substeps, grid.reverse)
     states = solve(task, path, fine)
     output = observe(task, path, fine, states)
     mean = jnp.mean(0.5 * (output[1:] + output[:-1]).reshape(-1, grid.every), axis=1)
