@@ -186,18 +186,13 @@ def _progress(title: str) -> Iterator[Any]:
 
 
 def _write_fit(result: "FitResult", folder: Path) -> None:
-    import numpy as np
-
     from ._store import write_text
 
     result.save(folder / "fit.json")
     columns = {"frequency_hz": result.frequency_hz, "target": result.target.proportional_power, "fitted": result.fitted,
                "harmonic_share": result.harmonic_share, "residual_sd": result.residual}  # fmt: skip
     write_text(folder / "spectrum.csv", _csv(columns))
-    if np.all(np.isfinite(result.fitted)):
-        _save_figure(result.plot(), folder / "fit.png")
-    else:
-        (folder / "fit.png").unlink(missing_ok=True)
+    _save_figure(result.plot(), folder / "fit.png")
 
 
 def _csv(columns: dict[str, Any]) -> str:
@@ -236,6 +231,9 @@ def _show_fit(result: "FitResult", folder: Path) -> None:
         out.print("Not determined by the data (kept near the default by the prior):", highlight=False)
         for sentence in result.undetermined:
             out.print(f"  - {_plain(sentence)}", highlight=False)
+    for notice in result.notices:
+        if notice not in result.target.notices:
+            out.print(f"[yellow]notice:[/] {_plain(notice)}", highlight=False)
     word = "[green]converged[/]" if result.success else "[bold red]failed[/]"
     out.print(f"{word}: {_plain(result.message)}", highlight=False)
     out.print(f"Written: {folder}/fit.json, fit.png, spectrum.csv", highlight=False)

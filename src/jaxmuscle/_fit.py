@@ -20,7 +20,7 @@ from ._path import Grid
 from ._report import report_fit
 from ._result import FitResult
 from ._simulate import DURATION, MAX_RATE_STEP, draw, whole
-from ._starts import starting_points
+from ._starts import contenders, starting_points
 from ._target import Target
 from ._task import AbstractTask, Isometric, PrescribedForce
 from ._trajectory import WINDOW
@@ -34,6 +34,8 @@ NOISES: dict[str, type[AbstractNoise]] = {
 }
 DT = 2.5e-3
 FIRST_STEPS = 12
+MOST_RIVALS = 3
+RIVAL_MARGIN = 6.0
 MOST_SUBSTEPS = 16
 
 
@@ -226,10 +228,8 @@ class _Setup:
         statistics = bin_statistics(self.target, line_share)
         sigma = residual_sigma(self.residual, self.target, statistics)
         power = jnp.asarray(self.target.proportional_power)
-        prior = jnp.asarray(self.prior)
-        return Problem(
-            task, self.coordinates, model, power, statistics, jnp.asarray(sigma), prior, self.extra, self.residual
-        )
+        prior, extra = jnp.asarray(self.prior), jax.tree.map(jnp.asarray, self.extra)
+        return Problem(task, self.coordinates, model, power, statistics, jnp.asarray(sigma), prior, extra, self.residual)
 
     def finer(self, problem: Problem, points: np.ndarray) -> Problem:
         """The problem with as many sub-steps as the stiffest of the points asks for; never fewer than it has."""
@@ -255,7 +255,7 @@ def _rate(task: AbstractTask, coordinates: Coordinates, theta: np.ndarray) -> fl
 
 
 def _search(setup: _Setup, starts: int, max_steps: int, check_seeds: int, settings: dict, seed: int | None) -> FitResult:
-    """Many starts on few seeds, then the best of them on all; whatever was reached when interrupted."""
+    """Many starts on few seeds, then the best few minima on all; whatever was reached when interrupted."""
     points = starting_points(setup.coordinates, setup.target, starts)
     reached: list[Descent] = []
     problem, interrupted = None, False
@@ -271,11 +271,12 @@ def _search(setup: _Setup, starts: int, max_steps: int, check_seeds: int, settin
     try:
         problem = setup.problem(max(8, setup.seeds // 3))
         setup.tell("compiling", 0.0)
-        first = descend(problem, points, FIRST_STEPS, prepare=setup.finer, report=report(0, 0.05, 0.6, FIRST_STEPS))
-        best = first.s[first.best]
-        share = np.nan_to_num(np.asarray(_share(problem, jnp.asarray(best))))
-        problem = setup.finer(setup.problem(setup.seeds, share), best[None])
-        descend(problem, best[None], max_steps, prepare=setup.finer, report=report(1, 0.6, 0.9, 15))
+        first = descend(problem, points, FIRST_STEPS, prepare=setup.finer, report=report(0, 0.05, 0.5, FIRST_STEPS))
+        chosen = contenders(setup.coordinates, setup.target, first, RIVAL_MARGIN)[:MOST_RIVALS]
+        points = first.s[chosen]
+        share = np.nan_to_num(np.asarray(_share(problem, jnp.asarray(points[0]))))
+        problem = setup.finer(setup.problem(setup.seeds, share), points)
+        descend(problem, points, max_steps, prepare=setup.finer, report=report(1, 0.5, 0.9, 15))
     except KeyboardInterrupt:
         interrupted = True
     if problem is None or not reached:

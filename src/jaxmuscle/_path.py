@@ -86,7 +86,7 @@ class SubcycledHeun(dfx.AbstractStratonovichSolver):
 
 
 class GridTerm(dfx.AbstractTerm):
-    """Drift and diffusion times increment, `f dt + (∂f/∂u) scale ΔW`, from one linearisation of the vector field.
+    """Drift and diffusion times increment, `f Δt + (∂f/∂u) scale ΔW`, from one linearisation of the vector field.
 
     What `MultiTerm(ODETerm, ControlTerm)` gives with two evaluations. Without a path it is the drift alone.
     """
@@ -101,17 +101,18 @@ class GridTerm(dfx.AbstractTerm):
         return self.dt * self.task.vector_field(t * self.dt, y, self.u(t))
 
     def contr(self, t0, t1, **kwargs):
-        return jnp.zeros(()) if self.path is None else self.path.evaluate(t0, t1)
+        return t1 - t0, None if self.path is None else self.path.evaluate(t0, t1)
 
     def prod(self, vf, control):
         raise NotImplementedError("GridTerm offers vf_prod only")
 
     def vf_prod(self, t, y, args, control):
-        if self.path is None:
-            return self.vf(t, y, args)
+        steps, increment = control
+        if increment is None:
+            return steps * self.vf(t, y, args)
         field = lambda u: self.task.vector_field(t * self.dt, y, u)  # noqa: E731
-        drift, diffusion = jax.jvp(field, (self.u(t),), (self.scale * control,))
-        return self.dt * drift + diffusion
+        drift, diffusion = jax.jvp(field, (self.u(t),), (self.scale * increment,))
+        return steps * self.dt * drift + diffusion
 
 
 def _whole(s: Any, last: int) -> Any:

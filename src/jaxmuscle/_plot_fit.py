@@ -63,7 +63,11 @@ def _header(result: Any) -> list[_Line]:
     else:
         lines += _wrapped(f"{_ORIGIN[aim.provenance]} {aim.quantity}: {aim.source}", most=2, color=GREY)
     lines += _wrapped("  ·  ".join(facts))
-    return lines + _wrapped(f"{verdict}: {result.message}", color=colour)
+    lines += _wrapped(f"{verdict}: {result.message}", color=colour)
+    for notice in result.notices:
+        if not (aim.provenance == "reconstructed" and aim.reason in notice):
+            lines += _wrapped(f"Note: {notice}", most=3)
+    return lines
 
 
 def _notes(result: Any) -> list[_Line]:

@@ -13,6 +13,7 @@ from ._operating import slowest_rate
 from ._parameter import PARAMETERS, as_arrays, as_numbers
 from ._result import Estimate, FitResult, Start
 from ._simulate import SimulationError, ensemble
+from ._starts import contenders, harmonic_frequencies
 from ._trajectory import WINDOW, versions
 from ._uncertainty import (
     BinStatistics,
@@ -32,6 +33,7 @@ if TYPE_CHECKING:
 
 STRETCH = 5.0
 REDUCED = 0.1
+AMBIGUOUS = 1.92
 UNITS = {
     "corner_frequency": "Hz",
     "harmonic_frequency": "Hz",
@@ -152,12 +154,17 @@ def report_fit(
     residual = standardised(np.asarray(setup.target.proportional_power), fitted, statistics)
     log_error = np.log(setup.target.proportional_power / fitted)
     start = round((runs.time[-1] - STRETCH) * runs.rate)
+    rivals = rival_frequencies(setup, final)
+    parameters = _parameters(setup, task, covariance, known)
+    found = _derived(setup, values, found_slopes, _jackknife(each), covariance, seen, setup.prior)
+    if rivals:
+        parameters, found = _without_error("harmonic_frequency", parameters), _without_error("harmonic_frequency", found)
     return FitResult(
         success=success,
         message=message,
         task=task,
-        parameters=_parameters(setup, task, covariance, known),
-        derived=_derived(setup, values, found_slopes, _jackknife(each), covariance, seen, setup.prior),
+        parameters=parameters,
+        derived=found,
         correlation=_correlation(setup.coordinates.names, covariance),
         undetermined=undetermined_directions(setup.coordinates.names, known),
         singular_values=known.singular_values,
@@ -168,7 +175,7 @@ def report_fit(
         residual=residual,
         deviation=statistics.sd if statistics.known else None,
         stretch=(runs.time[start:], np.asarray(runs.output[0])[start:]),
-        notices=_notices(setup.target, statistics),
+        notices=_notices(setup.target, statistics, rivals),
         **common,
     )
 
@@ -227,7 +234,7 @@ def _residual_covariance(setup: "_Setup", problem: "Problem", share: np.ndarray)
     p = np.asarray(target.proportional_power)
     spread = _spread_map(problem, p)
     total = spread @ (measured + simulated) @ spread.T
-    rows: list[float] = [1.0 + 0.25 * float(p @ simulated @ p) / extra[1] ** 2 if i == 0 else 1.0
+    rows: list[float] = [1.0 + 0.25 * float(p @ simulated @ p) / float(extra[1]) ** 2 if i == 0 else 1.0
             for i, extra in enumerate(problem.extra) if extra is not None]  # fmt: skip
     return np.block([[total, np.zeros((len(total), len(rows)))], [np.zeros((len(rows), len(total))), np.diag(rows)]])
 
@@ -296,8 +303,30 @@ def _correlation(names: tuple[str, ...], covariance: np.ndarray) -> dict[str, An
     return {"parameters": list(names), "matrix": matrix.tolist()}
 
 
-def _notices(target: Any, statistics: BinStatistics) -> tuple[str, ...]:
+def rival_frequencies(setup: "_Setup", final: Descent) -> list[float]:
+    """Harmonic frequencies of other minima that fit almost as well as the best one, best first [Hz].
+
+    Almost as well: a cost `½ Σ r²` within 1.92 of the lowest, half the 95 % quantile of χ² with one degree of freedom, so
+    that a likelihood interval for the frequency would contain them.
+    """
+    chosen = contenders(setup.coordinates, setup.target, final, AMBIGUOUS)
+    if len(chosen) < 2:
+        return []
+    frequency = harmonic_frequencies(setup.coordinates, final)
+    return [float(frequency[i]) for i in chosen[1:]]
+
+
+def _without_error(name: str, table: dict[str, Estimate]) -> dict[str, Estimate]:
+    old = table[name]
+    return table | {name: Estimate(old.value, old.unit, None, old.free, False)}
+
+
+def _notices(target: Any, statistics: BinStatistics, rivals: list[float]) -> tuple[str, ...]:
     notices = list(target.notices)
     if not statistics.known:
         notices.append("the target states neither segments nor sigma: every bin counts alike and there is no chi2")
+    if rivals:
+        others = " and ".join(f"{f:.2f} Hz" for f in rivals)
+        notices.append(f"harmonic_frequency is ambiguous: {others} fits almost as well (log-likelihood within {AMBIGUOUS}); "
+                       "the other numbers hold for the frequency shown")  # fmt: skip
     return tuple(notices)

@@ -1,10 +1,12 @@
-"""Where the starts of a fit begin."""
+"""Where the starts of a fit begin, and which different minima they ended in."""
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 from scipy.special import ndtri
 from scipy.stats import qmc
 
+from ._descend import Descent
 from ._objective import Coordinates
 from ._target import Target
 
@@ -23,6 +25,31 @@ def starting_points(coordinates: Coordinates, target: Target, count: int) -> Flo
         frequencies = _candidate_frequencies(target, count)
         theta[:, column] = np.log(frequencies / coordinates.centre[column]) / coordinates.sd[column]
     return coordinates.from_theta(theta)
+
+
+def contenders(coordinates: Coordinates, target: Target, descent: Descent, margin: float) -> list[int]:
+    """The best start, then those whose cost is at most `margin` above it at another harmonic frequency, best first.
+
+    Frequencies differ when no nearer than one bin: a Welch peak is two bins wide, so these are different minima.
+    """
+    costs = np.where(np.isfinite(descent.cost), descent.cost, np.inf)
+    chosen = [descent.best]
+    if "harmonic_frequency" not in coordinates.names:
+        return chosen
+    frequency = harmonic_frequencies(coordinates, descent)
+    width = target.settings.rate / target.settings.length
+    for i in np.argsort(costs, kind="stable"):
+        near = np.min(np.abs(frequency[i] - frequency[chosen])) < width
+        if costs[i] <= costs[descent.best] + margin and not near:
+            chosen.append(int(i))
+    return chosen
+
+
+def harmonic_frequencies(coordinates: Coordinates, descent: Descent) -> Float[np.ndarray, " starts"]:
+    """Harmonic frequency that each start reached [Hz]."""
+    theta = np.asarray(coordinates.theta(jnp.asarray(descent.s)))
+    column = coordinates.names.index("harmonic_frequency")
+    return coordinates.centre[column] * np.exp(coordinates.sd[column] * theta[:, column])
 
 
 def _candidate_frequencies(target: Target, count: int) -> Float[np.ndarray, " starts"]:
