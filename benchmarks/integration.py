@@ -17,7 +17,7 @@ from jaxmuscle._path import Grid, solve
 from jaxmuscle._simulate import draw
 
 SEEDS, DT, EVERY, STEPS = 64, 1e-3, 10, 15_000
-GRID = Grid(DT, STEPS, EVERY)
+GRID = Grid(DT, STEPS, EVERY, reverse=False)
 EPSILONS = 200  # rounding of 15 000 steps, most of which the damping forgets
 OURS, SCAN, LAST = "jaxmuscle", "vmapped lax.scan", "lax.scan, seed axis last"
 

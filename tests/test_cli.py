@@ -310,8 +310,7 @@ def test_the_exit_code_says_whether_it_converged(result, code, word, tmp_path, m
     assert outcome.exit_code == code
     assert f"{word}: {result.message}" in outcome.stdout
     assert_equal(jm.load_result(tmp_path / "fit.json"), result)
-    drawn = bool(np.all(np.isfinite(result.fitted)))
-    assert (tmp_path / "fit.png").exists() is drawn
+    assert (tmp_path / "fit.png").read_bytes().startswith(b"\x89PNG")
     assert len(read_columns(tmp_path / "spectrum.csv")["fitted"]) == 30
 
 

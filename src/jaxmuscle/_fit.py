@@ -12,6 +12,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from ._bundled import choices
 from ._descend import Descent, descend
+from ._law import Scalar
 from ._noise import AbstractNoise, BandLimitedNoise, OrnsteinUhlenbeckNoise, WhiteNoise
 from ._objective import Coordinates, Moments, MonteCarlo, at
 from ._operating import fastest_rate
@@ -83,7 +84,7 @@ class Problem(eqx.Module):
     statistics: BinStatistics
     sigma: Float[Array, " bins"]
     prior: Float[Array, " free"]
-    extra: tuple[tuple[float, float] | None, tuple[float, float] | None]
+    extra: tuple[tuple[Scalar, Scalar] | None, tuple[Scalar, Scalar] | None]
     residual: str = eqx.field(static=True)
 
     def moments(self, theta: Float[Array, " free"]) -> Moments:

@@ -52,7 +52,7 @@ class Coordinates(eqx.Module):
         sd = np.array([sds[name] for name in values])
         return cls(tuple(values), centre, sd, positive, *_both_or_none(np.array(low), np.array(high)))
 
-    def theta(self, s: Float[Array, " free"]) -> Float[Array, " free"]:
+    def theta(self, s: Float[Array, "*batch free"]) -> Float[Array, "*batch free"]:
         """Coordinates in standard deviations of the prior."""
         bounded = jnp.isfinite(self.low)
         low, high = jnp.where(bounded, self.low, 0.0), jnp.where(bounded, self.high, 1.0)
