@@ -14,11 +14,12 @@ from hypothesis import strategies as st
 
 import jaxmuscle as jm
 from jaxmuscle import _fit
-from jaxmuscle._descend import _residuals, descend
+from jaxmuscle._descend import Descent, _residuals, descend
 from jaxmuscle._objective import Coordinates, Moments, MonteCarlo, welch_operator
 from jaxmuscle._parameter import DEFAULT_FREE, PARAMETERS, as_arrays
-from jaxmuscle._report import _linearised, derived
+from jaxmuscle._report import AMBIGUOUS, _linearised, derived, rival_frequencies
 from jaxmuscle._simulate import draw
+from jaxmuscle._starts import contenders
 from jaxmuscle._trajectory import WINDOW
 from jaxmuscle._uncertainty import identifiability, undetermined_directions
 
@@ -612,6 +613,42 @@ def test_what_a_fit_says_about_itself():
     residual = result.residual
     assert result.chi2_per_bin == pytest.approx(np.sum(residual**2) / 29)
     np.testing.assert_allclose(result.fitted.sum(), 1.0)
+
+
+def ended(coordinates, frequencies, costs):
+    """Starts that ended at these harmonic frequencies with these costs."""
+    values = np.array([[f] for f in frequencies])
+    s = coordinates.from_theta(np.log(values / coordinates.centre) / coordinates.sd)
+    return Descent(s, np.array(costs), np.ones(len(costs), int), np.ones(len(costs), bool))
+
+
+def test_other_minima_in_frequency_are_polished_too(x64):
+    coordinates = Coordinates.of({"harmonic_frequency": 4.25}, {}, {"harmonic_frequency": 1.0})
+    found = ended(coordinates, [3.9, 4.1, 6.6, 6.7, 8.0, 10.0], [5.0, 5.1, 6.0, 5.9, np.nan, 30.0])
+    assert contenders(coordinates, VASTUS, found, 6.0) == [0, 3]  # 4.1 and 6.6 Hz are nearer than a bin to a better one
+    assert contenders(coordinates, VASTUS, found, 0.5) == [0]
+    others = Coordinates.of({"c_w": 400.0}, {}, {"c_w": 1.0})
+    assert contenders(others, VASTUS, ended(others, [400.0, 500.0], [2.0, 1.0]), 9.0) == [1]
+
+
+def test_a_frequency_that_the_spectrum_leaves_open_is_called_ambiguous(x64):
+    setup = setup_of(jm.Isometric(), VASTUS, ("harmonic_frequency",))
+    close = ended(setup.coordinates, [3.9, 6.6], [5.0, 5.0 + 0.9 * AMBIGUOUS])
+    clear = ended(setup.coordinates, [3.9, 6.6], [5.0, 5.0 + 1.1 * AMBIGUOUS])
+    assert rival_frequencies(setup, clear) == []
+    assert rival_frequencies(setup, close) == pytest.approx([6.6])
+
+
+def test_two_equal_lines_make_the_frequency_ambiguous():
+    """A target with the same hump at 4.3 and 8.6 Hz: whichever one the harmonic takes, the other fits as well."""
+    f = jm.SpectrumSettings().frequency
+    power = 1 / (1 + (f / 1.2) ** 2) + 0.02
+    target = jm.Target("twins", power * (1 + 0.9 * (np.isin(np.arange(1, 31), (11, 22)))), segments=4)
+    free = ("c_w", "noise_K_w", "harmonic_amplitude", "harmonic_frequency")
+    found = jm.fit(jm.Isometric(), target, free=free, starts=6, seeds=16, check_seeds=16)
+    assert any("harmonic_frequency is ambiguous" in notice for notice in found.notices)
+    for table in (found.parameters, found.derived):
+        assert table["harmonic_frequency"].stderr is None and not table["harmonic_frequency"].identifiable
 
 
 def test_mean_force_and_no_spread():

@@ -260,6 +260,7 @@ def result(**changes):
         "undetermined": ("stiffness and damping can be scaled together",),
         "stretch": (10 + np.arange(500) / 100, 5 + 0.01 * np.sin(np.arange(500))),
         "starts": ((), ()),
+        "notices": (),
         "seed": 7,
     }
     return types.SimpleNamespace(**(fields | changes))
@@ -322,6 +323,11 @@ def test_fit_tells_verdict_parameters_and_what_is_not_determined():
         assert text in said
     assert any(text.startswith("Measured force: Isometric knee-extension") for text in said)
     assert "m_w" not in said
+
+
+def test_fit_shows_the_notices():
+    told = "harmonic_frequency is ambiguous: 6.62 Hz fits almost as well"
+    assert any(told in text.get_text() for text in plot.fit(result(notices=(told,))).axes[0].texts)
 
 
 def test_fit_of_a_reconstruction_says_so():
