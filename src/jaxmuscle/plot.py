@@ -55,9 +55,14 @@ def styled(draw: Callable[P, R]) -> Callable[P, R]:
 
     @functools.wraps(draw)
     def inside(*args: P.args, **kwargs: P.kwargs) -> R:
-        matplotlib.get_backend()  # chosen now: a notebook's backend configures itself, and the context would undo that
-        with matplotlib.rc_context(cast(Any, STYLE)):
+        # Not rc_context: it also restores what a notebook's backend sets about itself while the first figure is made.
+        params = cast(Any, matplotlib.rcParams)
+        before = {name: params[name] for name in STYLE}
+        params.update(STYLE)
+        try:
             return draw(*args, **kwargs)
+        finally:
+            params.update(before)
 
     return inside
 
