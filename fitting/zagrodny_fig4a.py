@@ -1,8 +1,7 @@
 """The paper's Figure 4a: Task 1 with the paper's noise and harmonic frequency, reconstructed from the text.
 
 This is the fit behind the preset `zagrodny-slifkin`; `--preset FILE` writes it (four significant digits). The masses,
-reference displacements and the starting values are those of design.md, section 12, which shows that such parameters
-exist; noise amplitudes and harmonic frequency are the paper's and stay fixed.
+reference displacements and the starting values come from an earlier search by hand; noise amplitudes and harmonic frequency are the paper's and stay fixed.
 """
 
 import argparse
@@ -26,7 +25,7 @@ PAPER_NOISE = {"K_w": 0.0016, "K_z": 0.0016, "C_w": 1e-4, "C_z": 1e-4}
 def fit(target: jm.Target, seed: int = 0) -> jm.FitResult:
     """Stiffness, damping and harmonic amplitude free."""
     task = jm.PrescribedMotion(noise=jm.BandLimitedNoise(PAPER_NOISE), settings=target.settings).replace(**START)
-    return jm.fit(task, target, free=FREE, starts=4, key=seed)
+    return jm.fit(task, target, free=FREE, key=seed)
 
 
 def rounded(task: jm.AbstractTask) -> jm.AbstractTask:

@@ -109,7 +109,7 @@ OPTIONS = {
     "unknown noise": (["{csv}", "--noise", "purple"], "'--noise'"),
     "unknown task": (["{csv}", "--task", "isotonic"], "'--task'"),
     "unknown residual": (["{csv}", "--residual", "square"], "'--residual'"),
-    "method of another version": (["{csv}", "--method", "linear"], "method = 'linear'"),
+    "unknown method": (["{csv}", "--method", "linaer"], "'--method'"),
     "white noise in the output": (["{csv}", "--noise", "white"], "WhiteNoise on K_z cannot be used in Isometric"),
     # Typer words these; what matters is which option.
     "no starts": (["{csv}", "--starts", "0"], "--starts"),
@@ -277,7 +277,9 @@ def test_what_was_fitted_can_be_simulated(fitted, tmp_path):
         np.testing.assert_array_equal(data["F_ext"], runs.output)
         assert json.loads(data.attrs["parameters"])["c_w"]["value"] == task["c_w"]
     columns = read_columns(tmp_path / "spectrum.csv")
-    np.testing.assert_allclose(columns["power"], runs.spectrum().mean().power, rtol=1e-5)
+    estimate = runs.mean_spectrum()
+    np.testing.assert_allclose(columns["power"], estimate.power, rtol=1e-5)
+    np.testing.assert_allclose(columns["power_stderr"], estimate.stderr, rtol=1e-5)
     assert np.all(columns["quantile_05"] < columns["quantile_95"])
 
 
@@ -326,7 +328,7 @@ def test_options_reach_the_fit(tmp_path, monkeypatch):
     many = ("--free", " c_w ,k_w,", "--starts", 3, "--seeds", 9, "--seed", 4, "--segments", 7, "--residual", "linear")
     assert run("fit", csv_file(tmp_path), "--noise", "white", *fixed, *many, "--out", tmp_path).exit_code == 0
     expected = {"free": ["c_w", "k_w"], "fix": {"noise_K_z": 0.0, "noise_C_z": 0.0}, "noise": "white", "starts": 3,
-                "method": "montecarlo", "residual": "linear", "seeds": 9, "key": 4}  # fmt: skip
+                "method": "linear", "residual": "linear", "seeds": 9, "key": 4}  # fmt: skip
     assert {name: seen[name] for name in expected} == expected
     assert seen["target"].segments == (7,) and isinstance(seen["task"], jm.Isometric)
 

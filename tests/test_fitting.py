@@ -76,7 +76,8 @@ def test_a_digitised_csv_takes_the_place_of_the_bundled_target(scripts, tmp_path
 
 @pytest.mark.slow
 @pytest.mark.parametrize("path", sorted((ROOT / "notebooks").glob("*.ipynb")), ids=lambda p: p.stem)
-def test_notebooks_run(path, tmp_path):
+def test_notebooks_run(path, tmp_path, monkeypatch):
+    monkeypatch.delenv("MPLBACKEND", raising=False)  # the kernel's own, as a reader has it
     notebook = nbformat.read(path, as_version=4)
     lines = sum(len(cell.source.splitlines()) for cell in notebook.cells if cell.cell_type == "code")
     assert lines <= 60
@@ -84,7 +85,8 @@ def test_notebooks_run(path, tmp_path):
     (tmp_path / "out" / "notebooks").mkdir(parents=True)
     client = NotebookClient(notebook, timeout=900, resources={"metadata": {"path": str(tmp_path / "notebooks")}})
     client.execute()
-    assert any("image/png" in o.get("data", {}) for c in notebook.cells for o in c.get("outputs", []))
+    images = sum("image/png" in o.get("data", {}) for c in notebook.cells for o in c.get("outputs", []))
+    assert images >= 2
 
 
 @pytest.fixture(scope="module")

@@ -261,6 +261,9 @@ def result(**changes):
         "stretch": (10 + np.arange(500) / 100, 5 + 0.01 * np.sin(np.arange(500))),
         "starts": ((), ()),
         "notices": (),
+        "remarks": ("simulation and linear response differ by at most 0.2 % of a bin",),
+        "profile": (np.linspace(0.4, 11.7, 64), 10 - 9 * np.exp(-((np.linspace(0.4, 11.7, 64) - 3.9) ** 2))),
+        "harmonic_p_value": 0.08,
         "seed": 7,
     }
     return types.SimpleNamespace(**(fields | changes))
@@ -271,7 +274,7 @@ def failed():
     return result(
         success=False, message="no start has a finite spectrum: lower the noise", derived={}, chi2_per_bin=None,
         rms_log_error=None, fitted=nothing, harmonic_share=nothing, residual=nothing, deviation=None,
-        undetermined=(), stretch=(np.zeros(0), np.zeros(0)), seed=None,
+        undetermined=(), stretch=(np.zeros(0), np.zeros(0)), seed=None, remarks=(), profile=None, harmonic_p_value=None,
     )  # fmt: skip
 
 
@@ -323,6 +326,14 @@ def test_fit_tells_verdict_parameters_and_what_is_not_determined():
         assert text in said
     assert any(text.startswith("Measured force: Isometric knee-extension") for text in said)
     assert "m_w" not in said
+
+
+def test_fit_draws_the_profile_over_the_frequency():
+    found = result()
+    ax = plot.fit(found).axes[-1]
+    np.testing.assert_array_equal(ax.lines[0].get_xdata(), found.profile[0])
+    np.testing.assert_array_equal(ax.lines[0].get_ydata(), found.profile[1])
+    assert "harmonic p = 0.08" in ax.get_title("left") and ax.get_ylabel() == "Δχ²"
 
 
 def test_fit_shows_the_notices():

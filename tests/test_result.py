@@ -47,6 +47,9 @@ def made_result(**changes: Any) -> jm.FitResult:
         "deviation": rng.uniform(0.1, 0.3, 30),
         "starts": (Start(1.5, True, 12), Start(None, False, 3)),
         "stretch": (np.arange(10.0, 15.0, 0.01), rng.standard_normal(500)),
+        "profile": (np.linspace(0.4, 11.7, 64), rng.uniform(0, 9, 64)),
+        "harmonic_p_value": 0.08,
+        "check": {"seeds": 64, "largest_deviation": 0.002, "largest_deviation_se": 2.1, "largest_deviation_sd": 0.01},
         "notices": ("a notice",),
         "seed": 3,
         "settings": {"free": ["k_w", "c_w"], "starts": 2, "bounds": {"k_w": [1.0, 2e6]}, "mean_force": None},
@@ -62,7 +65,8 @@ def failed_result():
         success=False, message="no start has a finite spectrum", derived={"mean": jm.Estimate(np.nan, "N")},
         correlation={}, undetermined=(), singular_values=np.full(2, np.nan), chi2_per_bin=None, rms_log_error=None,
         fitted=nothing, harmonic_share=nothing, residual=nothing, deviation=None,
-        stretch=(np.zeros(0), np.zeros(0)), seed=None, starts=(Start(None, False, 0),),
+        stretch=(np.zeros(0), np.zeros(0)), profile=None, harmonic_p_value=None, check={}, seed=None,
+        starts=(Start(None, False, 0),),
     )  # fmt: skip
 
 

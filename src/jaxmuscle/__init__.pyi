@@ -4,6 +4,8 @@ from . import plot as plot
 from .__about__ import __version__ as __version__
 from ._bundled import list_presets as list_presets
 from ._bundled import list_targets as list_targets
+from ._estimate import SpectrumEstimate as SpectrumEstimate
+from ._expected import expected_spectrum as expected_spectrum
 from ._fit import FitInterrupted as FitInterrupted
 from ._fit import fit as fit
 from ._fit import task_for as task_for
@@ -11,6 +13,7 @@ from ._harmonic import Harmonic as Harmonic
 from ._law import AbstractLaw as AbstractLaw
 from ._law import QuadraticDamping as QuadraticDamping
 from ._law import QuadraticStiffness as QuadraticStiffness
+from ._linear import settled as settled
 from ._metrics import approximate_entropy as approximate_entropy
 from ._metrics import coefficient_of_variation as coefficient_of_variation
 from ._metrics import normalised as normalised
@@ -24,6 +27,7 @@ from ._noise import AbstractNoise as AbstractNoise
 from ._noise import BandLimitedNoise as BandLimitedNoise
 from ._noise import OrnsteinUhlenbeckNoise as OrnsteinUhlenbeckNoise
 from ._noise import WhiteNoise as WhiteNoise
+from ._operating import OperatingPointError as OperatingPointError
 from ._operating import equilibrium as equilibrium
 from ._parameter import PARAMETERS as PARAMETERS
 from ._parameter import Parameter as Parameter
@@ -32,6 +36,8 @@ from ._preset import save_preset as save_preset
 from ._result import Estimate as Estimate
 from ._result import FitResult as FitResult
 from ._result import load_result as load_result
+from ._sensitivity import Sensitivity as Sensitivity
+from ._sensitivity import sensitivity as sensitivity
 from ._signal import AbstractSignal as AbstractSignal
 from ._signal import Constant as Constant
 from ._signal import Decay as Decay

@@ -45,6 +45,11 @@ class NoiseName(StrEnum):
     ornstein_uhlenbeck = "ornstein-uhlenbeck"
 
 
+class MethodName(StrEnum):
+    linear = "linear"
+    montecarlo = "montecarlo"
+
+
 class ResidualName(StrEnum):
     log = "log"
     linear = "linear"
@@ -85,15 +90,21 @@ def fit(
         list[str], typer.Argument(help="Bundled target (see `jaxmuscle targets`) or path of a .toml or .csv.")
     ],
     task: Annotated[TaskName | None, typer.Option(help="Default: follows from what the target measured.")] = None,
-    method: Annotated[str, typer.Option(help="How the spectrum is computed: montecarlo.")] = "montecarlo",
+    method: Annotated[
+        MethodName, typer.Option(help="Spectrum in linear response, then corrected; or simulated.")
+    ] = MethodName.linear,
     noise: Annotated[NoiseName, typer.Option(help="Colour of the noise.")] = NoiseName.band_limited,
     residual: Annotated[ResidualName, typer.Option(help="What is compared.")] = ResidualName.log,
     free: Annotated[str | None, typer.Option(metavar="NAMES", help="Comma-separated; replaces the default set.")] = None,
     fix: Annotated[
         list[str] | None, typer.Option(metavar="NAME=VALUE", help="Set a parameter and keep it; repeatable.")
     ] = None,
-    starts: Annotated[int, typer.Option(min=1, help="Starting points.")] = 8,
-    seeds: Annotated[int, typer.Option(min=1, help="Noise paths in the fit.")] = 48,
+    starts: Annotated[
+        int | None, typer.Option(min=1, help="Starting points; 100, or 8 where there is no linear response.")
+    ] = None,
+    seeds: Annotated[
+        int | None, typer.Option(min=1, help="Noise paths; 32, or 48 where there is no linear response.")
+    ] = None,
     seed: Annotated[int, typer.Option(help="Seed of all random numbers.")] = 0,
     segments: Annotated[int | None, typer.Option(min=1, help="Welch segments behind the target.")] = None,
     quantity: Annotated[str | None, typer.Option(help="force, torque or displacement.")] = None,
@@ -122,7 +133,7 @@ def fit(
         folders = [output] if len(targets) == 1 else [output / t.name for t in targets]
         if len(set(folders)) < len(folders):
             raise ValueError("two targets have the same name and would share a folder: rename one")
-        options = {"free": names, "fix": fixed, "noise": str(noise), "method": method, "residual": str(residual),
+        options = {"free": names, "fix": fixed, "noise": str(noise), "method": str(method), "residual": str(residual),
                    "starts": starts, "seeds": seeds, "key": seed}  # fmt: skip
         converged = [_fit_one(t, task, folder, options) for t, folder in zip(targets, folders, strict=True)]
     raise typer.Exit(CONVERGED if all(converged) else NOT_CONVERGED)
@@ -227,6 +238,8 @@ def _show_fit(result: "FitResult", folder: Path) -> None:
     out.print(table)
     if result.chi2_per_bin is not None:
         out.print(f"chi² per bin {result.chi2_per_bin:.2f}, rms log error {result.rms_log_error:.2f}", highlight=False)
+    for sentence in result.remarks:
+        out.print(_plain(sentence[0].upper() + sentence[1:]), highlight=False)
     if result.undetermined:
         out.print("Not determined by the data (kept near the default by the prior):", highlight=False)
         for sentence in result.undetermined:
@@ -281,12 +294,13 @@ def _simulate(model: "AbstractTask", seeds: int, seed: int, folder: Path) -> Non
 
     runs = ensemble(model, jax.random.key(seed), seeds=seeds, progress=err.is_terminal)
     spectra = runs.spectrum()
-    mean = spectra.mean()
+    estimate = runs.mean_spectrum()
+    mean = estimate.spectrum
     dataset = runs.to_xarray().assign_attrs(seed=seed)
     with replacing(folder / "trajectories.nc") as temporary:
         dataset.to_netcdf(temporary, engine="h5netcdf")
     low, high = np.quantile(np.asarray(spectra.proportional), [0.05, 0.95], axis=0)
-    columns = {"frequency_hz": np.asarray(mean.frequency), "power": np.asarray(mean.power),
+    columns = {"frequency_hz": np.asarray(mean.frequency), "power": np.asarray(mean.power), "power_stderr": estimate.stderr,
                "proportional_power": np.asarray(mean.proportional), "quantile_05": low, "quantile_95": high}  # fmt: skip
     write_text(folder / "spectrum.csv", _csv(columns))
     _save_figure(plot.simulation(runs), folder / "simulate.png")

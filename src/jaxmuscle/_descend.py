@@ -12,6 +12,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 SMALL = 1e-3
 REFUSALS = 6
+BATCH = 32
 
 
 class Descent(NamedTuple):
@@ -106,3 +107,30 @@ def descend(
         if np.all((small >= 2) | (refused >= REFUSALS) | ~np.isfinite(cost)):
             break
     return result
+
+
+def in_batches(
+    problem: Any, starts: Float[np.ndarray, "starts free"], max_steps: int, report: Callable[[Descent], None]
+) -> Descent:
+    """`descend` for any number of starts, `BATCH` at a time, so that one compiled step serves every number."""
+    count, size = starts.shape
+    done = Descent(starts.copy(), np.full(count, np.inf), np.zeros(count, dtype=int), np.zeros(count, dtype=bool))
+    for begin in range(0, count, BATCH):
+        here = starts[begin : begin + BATCH]
+        padded = np.concatenate([here, np.broadcast_to(here[-1], (BATCH - len(here), size))])
+        now = done
+
+        def show(part, begin=begin, so_far=done):
+            nonlocal now
+            now = Descent(*(_put(old, new[: count - begin], begin) for old, new in zip(so_far, part, strict=True)))
+            report(now)
+
+        descend(problem, padded, max_steps, prepare=lambda problem, points: problem, report=show)
+        done = now
+    return done
+
+
+def _put(old: np.ndarray, new: np.ndarray, begin: int) -> np.ndarray:
+    whole = old.copy()
+    whole[begin : begin + len(new)] = new
+    return whole

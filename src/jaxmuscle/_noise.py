@@ -27,6 +27,15 @@ class Realisation(eqx.Module):
     increments: Float[Array, "*seeds steps channels"] | None = None
 
 
+class ShapingFilter(eqx.Module):
+    """A unit noise as a filtered white noise w of density 1: `q' = F q + G w`, `N = H q + L w`."""
+
+    F: Float[Array, "states states"]
+    G: Float[Array, " states"]
+    H: Float[Array, " states"]
+    L: Float[Array, ""]
+
+
 class AbstractNoise(eqx.Module):
     """Noise on the coefficients K_w, K_z, C_w, C_z, one independent channel each (`shared`: one for all).
 
@@ -50,6 +59,10 @@ class AbstractNoise(eqx.Module):
     @abc.abstractmethod
     def realise(self, normals: Float[Array, "..."], dt: Scalar) -> Realisation:
         """The unit path that the normals stand for, exact in distribution on the grid of step dt [s]."""
+
+    @abc.abstractmethod
+    def shaping_filter(self) -> ShapingFilter:
+        """The linear filter whose output the unit-amplitude noise is, for the linear response."""
 
     @abc.abstractmethod
     def check_step(self, dt: float) -> None:
@@ -132,6 +145,10 @@ class WhiteNoise(AbstractNoise):
     def realise(self, normals: Float[Array, "..."], dt: Scalar) -> Realisation:
         return Realisation(increments=normals * jnp.sqrt(dt / self.rate))
 
+    def shaping_filter(self) -> ShapingFilter:
+        nothing = jnp.zeros(0)
+        return ShapingFilter(jnp.zeros((0, 0)), nothing, nothing, 1 / jnp.sqrt(jnp.asarray(self.rate)))
+
     def check_step(self, dt: float) -> None:
         pass
 
@@ -185,6 +202,12 @@ class BandLimitedNoise(AbstractNoise):
         values, slopes = jnp.concatenate([normals[:1, 0], n]), jnp.concatenate([normals[:1, 1], slope])
         return Realisation(values=std * values, slopes=std * omega * slopes)
 
+    def shaping_filter(self) -> ShapingFilter:
+        # States (N, N'/ω), so that both have the same scale.
+        omega = 2 * jnp.pi * jnp.asarray(self.cutoff)
+        F = omega * jnp.array([[0.0, 1.0], [-1.0, -np.sqrt(2)]])
+        return ShapingFilter(F, jnp.stack([0 * omega, omega]) / jnp.sqrt(self.rate), jnp.array([1.0, 0.0]), jnp.zeros(()))
+
     def check_step(self, dt: float) -> None:
         require(
             self.cutoff * dt <= 0.25,
@@ -236,6 +259,10 @@ class OrnsteinUhlenbeckNoise(AbstractNoise):
 
         _, later = jax.lax.scan(advance, normals[0], normals[1:])
         return Realisation(values=jnp.concatenate([normals[:1], later]))
+
+    def shaping_filter(self) -> ShapingFilter:
+        rate = 1 / jnp.asarray(self.correlation_time)
+        return ShapingFilter(-rate[None, None], jnp.sqrt(2 * rate)[None], jnp.ones(1), jnp.zeros(()))
 
     def check_step(self, dt: float) -> None:
         require(

@@ -1,6 +1,6 @@
 """What a Monte Carlo fit compares: mean Welch powers over fixed noise paths, as a function of free coordinates."""
 
-from typing import Any, NamedTuple
+from typing import Any, TypeVar
 
 import equinox as eqx
 import jax
@@ -8,13 +8,19 @@ import jax.numpy as jnp
 import numpy as np
 import scipy.signal
 from jaxtyping import Array, Float
+from scipy.special import expit
 
+from ._expected import Moments, expected_moments, response
+from ._law import Scalar
+from ._linear import LinearTask, settled
 from ._noise import Realisation
 from ._parameter import PARAMETERS, Parameter, set_parameters
 from ._path import Grid
 from ._simulate import respond
 from ._spectrum import SpectrumSettings
 from ._task import AbstractTask
+
+Numbers = TypeVar("Numbers", bound=Float[Array | np.ndarray, "*batch free"])
 
 
 class Coordinates(eqx.Module):
@@ -52,11 +58,16 @@ class Coordinates(eqx.Module):
         sd = np.array([sds[name] for name in values])
         return cls(tuple(values), centre, sd, positive, *_both_or_none(np.array(low), np.array(high)))
 
-    def theta(self, s: Float[Array, "*batch free"]) -> Float[Array, "*batch free"]:
+    def theta(self, s: Numbers) -> Numbers:
         """Coordinates in standard deviations of the prior."""
-        bounded = jnp.isfinite(self.low)
-        low, high = jnp.where(bounded, self.low, 0.0), jnp.where(bounded, self.high, 1.0)
-        return jnp.where(bounded, low + (high - low) * jax.nn.sigmoid(s), s)
+        xp, sigmoid = self._library(s)
+        bounded = xp.isfinite(self.low)
+        low, high = xp.where(bounded, self.low, 0.0), xp.where(bounded, self.high, 1.0)
+        return xp.where(bounded, low + (high - low) * sigmoid(s), s)
+
+    def _library(self, given: Any) -> tuple[Any, Any]:
+        """NumPy for numbers, which needs no compilation, else JAX; with its sigmoid."""
+        return (np, expit) if isinstance(given, np.ndarray) and isinstance(self.low, np.ndarray) else (jnp, jax.nn.sigmoid)
 
     def from_theta(self, theta: Float[np.ndarray, "*batch free"]) -> Float[np.ndarray, "*batch free"]:
         """The reverse of `theta`, clipped into the bounds."""
@@ -65,15 +76,11 @@ class Coordinates(eqx.Module):
         share = np.clip((theta - low) / (high - low), 1e-3, 1 - 1e-3)
         return np.where(bounded, np.log(share / (1 - share)), theta)
 
-    def values(self, theta: Float[Array, " free"]) -> dict[str, Float[Array, ""]]:
+    def values(self, theta: Float[Array | np.ndarray, " free"]) -> dict[str, Scalar]:
         """Natural values of the parameters at θ."""
-        centre = jnp.asarray(self.centre)
-        step = jnp.asarray(self.sd) * theta
-        natural = jnp.where(
-            jnp.asarray(self.positive),
-            centre * jnp.exp(jnp.where(jnp.asarray(self.positive), step, 0.0)),
-            centre + step,
-        )
+        xp, _ = self._library(theta)
+        step = self.sd * theta
+        natural = xp.where(self.positive, self.centre * xp.exp(xp.where(self.positive, step, 0.0)), self.centre + step)
         return dict(zip(self.names, natural, strict=True))
 
     def slope(self, values: Float[np.ndarray, " free"]) -> Float[np.ndarray, " free"]:
@@ -127,31 +134,27 @@ def welch_operator(
     return np.concatenate(parts)
 
 
-class Moments(NamedTuple):
-    """Mean over seeds of what is compared: Welch power per bin, that of the harmonic alone, mean and variance."""
+class Linear(eqx.Module):
+    """The expected spectrum of a task in linear response, times a `correction` (of a nonlinear simulation, say)."""
 
-    power: Float[Array, " bins"]
-    line: Float[Array, " bins"]
-    mean: Float[Array, ""]
-    variance: Float[Array, ""]
+    chosen: np.ndarray
+    correction: Moments
+    window: tuple[float, float] = eqx.field(static=True)
 
-    @property
-    def proportional(self) -> Float[Array, " bins"]:
-        """Proportional power on the compared bins."""
-        return self.power / jnp.sum(self.power)
-
-    @property
-    def variation(self) -> Float[Array, ""]:
-        """Coefficient of variation."""
-        return jnp.sqrt(self.variance) / jnp.abs(self.mean)
+    def moments(self, task: AbstractTask) -> Moments:
+        """Expected moments of the task's output."""
+        found = expected_moments(task, task.settings, self.window)[0]  # compiled apart, so that it is traced once
+        found = found._replace(power=found.power[self.chosen], line=found.line[self.chosen])
+        return jax.tree.map(jnp.multiply, found, self.correction)
 
 
 class MonteCarlo(eqx.Module):
     """Mean spectrum of a task over fixed noise paths (common random numbers).
 
-    `noise` holds normals, or unit paths when no free parameter changes them; its first entry is zero, which gives the
-    harmonic's own response. That is taken off every seed before the spectrum and its power added after: the cross term
-    between line and noise has expectation zero, yet for fixed paths it makes the cost ripple with the frequency.
+    `noise` holds normals, or unit paths when no free parameter changes them. With `control` the task starts settled and
+    the linearised task runs on the same paths as control variate. Without it the first entry of `noise` is zero, which
+    gives the harmonic's own response; that is taken off every seed before the spectrum and its power added after: the
+    cross term between line and noise has expectation zero, yet for fixed paths it makes the cost ripple with the frequency.
     """
 
     noise: Any
@@ -159,30 +162,48 @@ class MonteCarlo(eqx.Module):
     chosen: np.ndarray
     grid: Grid
     window: tuple[float, float] = eqx.field(static=True)
+    control: bool = eqx.field(static=True)
 
     @classmethod
     def of(cls, task: AbstractTask, normals: Any, grid: Grid, chosen: np.ndarray, window: tuple[float, float], *,
-           colour_free: bool) -> "MonteCarlo":  # fmt: skip
+           colour_free: bool, control: bool) -> "MonteCarlo":  # fmt: skip
         """Prepare for the task's settings; `chosen` are the positions of the compared bins among the settings' bins."""
-        normals = jnp.concatenate([jnp.zeros_like(normals[:1]), normals])
+        if not control:
+            normals = jnp.concatenate([jnp.zeros_like(normals[:1]), normals])
         noise = normals if colour_free else jax.jit(jax.vmap(lambda z: task.noise.realise(z, grid.dt)))(normals)
         operator = welch_operator(task.settings, grid.steps // grid.every + 1, window)
-        return cls(noise, jnp.asarray(operator), chosen, grid, window)
+        return cls(noise, jnp.asarray(operator), chosen, grid, window, control)
+
+    @property
+    def seeds(self) -> int:
+        """How many noise paths there are."""
+        return jax.tree.leaves(self.noise)[0].shape[0] - (not self.control)
 
     def moments(self, task: AbstractTask) -> Moments:
         """Moments of the task's output."""
         settings = task.settings
-
-        def one(entry):
-            path = entry if isinstance(entry, Realisation) else task.noise.realise(entry, self.grid.dt)
-            return respond(task, path, self.grid, settings.sampling)[1]
-
-        outputs = jax.vmap(one)(self.noise)
-        quiet, noisy = outputs[:1], outputs[1:] - outputs[:1]
         start, stop = (round(edge * settings.rate) for edge in self.window)
+
+        def outputs(task):
+            def one(entry):
+                path = entry if isinstance(entry, Realisation) else task.noise.realise(entry, self.grid.dt)
+                return respond(task, path, self.grid, settings.sampling)[1]
+
+            return jax.vmap(one)(self.noise)
+
+        task = settled(task) if self.control else task
+        seen = outputs(task)
+        mean = jnp.mean(seen[int(not self.control) :, start:stop])
+        if self.control:
+            exact, system = response(task, settings, self.window)
+            beside = outputs(LinearTask.of(task, system))
+            power = exact.power[self.chosen] + jnp.mean(self._power(seen, settings) - self._power(beside, settings), 0)
+            spread = jnp.var(seen[:, start:stop], axis=1) - jnp.var(beside[:, start:stop], axis=1)
+            return Moments(power, exact.line[self.chosen], mean, exact.variance + jnp.mean(spread))
+        quiet, noisy = seen[:1], seen[1:] - seen[:1]
         line, random = jnp.mean(self._power(quiet, settings), 0), jnp.mean(self._power(noisy, settings), 0)
         variance = jnp.var(quiet[0, start:stop]) + jnp.mean(jnp.var(noisy[:, start:stop], axis=1))
-        return Moments(line + random, line, jnp.mean(outputs[1:, start:stop]), variance)
+        return Moments(line + random, line, mean, variance)
 
     def _power(self, outputs: Float[Array, "seeds samples"], settings: SpectrumSettings) -> Float[Array, "seeds bins"]:
         bins = settings.last_bin - settings.first_bin + 1

@@ -11,6 +11,7 @@ from ._parameter import as_arrays
 from ._task import AbstractTask
 
 HOLD = 15.0
+GUESS = 1e-3
 
 
 class OperatingPointError(ValueError):
@@ -23,17 +24,22 @@ def equilibrium(task: AbstractTask, time: float = HOLD) -> Float[Array, " states
     Not finite where there is none: `operating_point` turns that into an error.
     """
     task = as_arrays(task)
-    still = jnp.zeros(4)
     dtype = jnp.result_type(float)
     tolerance = 1e-12 if dtype == jnp.float64 else 1e-6
-    solution = optx.root_find(
-        lambda y, _: task.vector_field(jnp.asarray(time, dtype), y, still),
-        optx.Newton(rtol=tolerance, atol=tolerance),
-        task.initial_state(),
-        max_steps=200,
-        throw=False,
-    )
-    return jnp.where(solution.result == optx.RESULTS.successful, solution.value, jnp.nan)
+
+    def at_rest(y):
+        return task.vector_field(jnp.asarray(time, dtype), y, jnp.zeros(4))
+
+    def newton(function, y):
+        method = optx.Newton(rtol=tolerance, atol=tolerance)
+        solution = optx.root_find(lambda y, _: function(y), method, y, max_steps=200, throw=False)
+        return jnp.where(solution.result == optx.RESULTS.successful, solution.value, jnp.nan)
+
+    # optimistix's own implicit derivative checks its linear solve by a host callback, which JAX's compilation cache
+    # cannot keep: the same derivative without it.
+    # Off the origin, where the literal equation (2) has no stiffness and Newton's method no direction.
+    start = task.initial_state() + GUESS
+    return jax.lax.custom_root(at_rest, start, newton, lambda g, y: jnp.linalg.solve(jax.jacfwd(g)(y), y))
 
 
 def jacobian(task: AbstractTask, y: Float[Array, " states"], time: float = HOLD) -> Float[Array, "states states"]:

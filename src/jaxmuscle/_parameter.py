@@ -205,9 +205,15 @@ def _path(task: Any, name: str) -> tuple:
 
 
 def as_arrays(tree: Any, dtype: Any = None) -> Any:
-    """Every number of a tree as a JAX array of the caller's floating dtype, so that jit traces it."""
+    """Every number of a tree as an array of the caller's floating dtype, so that jit traces it."""
     dtype = jax.numpy.result_type(float) if dtype is None else dtype
-    return jax.tree.map(lambda leaf: jax.numpy.asarray(leaf, dtype=dtype) if _is_scalar(leaf) else leaf, tree)
+
+    def array(leaf):
+        # NumPy's arrays reach a jitted function ten times faster than JAX's own are made.
+        make = jax.numpy.asarray if isinstance(leaf, jax.Array) else np.asarray
+        return make(leaf, dtype=dtype) if _is_scalar(leaf) else leaf
+
+    return jax.tree.map(array, tree)
 
 
 def as_numbers(tree: Any) -> Any:

@@ -17,6 +17,7 @@ WIDTH, LINE, FONT = 7.5, 0.165, 7.5  # inches, inches, points
 TABLE = (0.525, 0.54, 0.815)  # where values end, errors begin, units begin
 WRAP = 116  # characters of FONT on a line of WIDTH
 
+ALLOWED = 3.84  # 95 % quantile of χ² with one degree of freedom
 DARK_GREEN = "#00664A"  # the palette's green is too light for small letters
 _ORIGIN = {"measured": "Measured", "digitised": "Digitised", "user": "User's"}
 _Line = tuple[str, dict[str, Any]]
@@ -28,8 +29,15 @@ def figure(result: Any) -> Figure:
     header, notes = _header(result), _notes(result)
     free = {name: estimate for name, estimate in result.parameters.items() if estimate.free}
     rows = 1 + max(len(free), len(result.derived), 1)
-    heights = [LINE * (len(header) + 0.7), 2.35, 1.75, LINE * (rows + 1), LINE * len(notes)]
-    heights = heights if notes else heights[:-1]
+    profile = result.profile is not None
+    heights = [
+        LINE * (len(header) + 0.7),
+        2.35,
+        1.75,
+        *[1.35] * profile,
+        LINE * (rows + 1),
+        *[LINE * len(notes)] * bool(notes),
+    ]
     fig = plt.figure(figsize=(WIDTH, sum(heights) + 1.25), layout="constrained")
     fig.set_layout_engine("constrained", w_pad=0.08, h_pad=0.05)
     grid = fig.add_gridspec(len(heights), 2, height_ratios=heights)
@@ -38,10 +46,12 @@ def figure(result: Any) -> Figure:
     _spectra(fig.add_subplot(grid[1, 1]), result, log=True)
     _residuals(fig.add_subplot(grid[2, 0]), result)
     _stretch(fig.add_subplot(grid[2, 1]), result)
-    _table(fig.add_subplot(grid[3, 0]), "Fitted parameters", free, rows)
-    _table(fig.add_subplot(grid[3, 1]), "Derived quantities", result.derived, rows)
+    _table(fig.add_subplot(grid[3 + profile, 0]), "Fitted parameters", free, rows)
+    _table(fig.add_subplot(grid[3 + profile, 1]), "Derived quantities", result.derived, rows)
     if notes:
-        _lines(fig.add_subplot(grid[4, :]), notes)
+        _lines(fig.add_subplot(grid[4 + profile, :]), notes)
+    if profile:
+        _profile(fig.add_subplot(grid[3, :]), result)
     return fig
 
 
@@ -71,10 +81,13 @@ def _header(result: Any) -> list[_Line]:
 
 
 def _notes(result: Any) -> list[_Line]:
-    """What the data do not determine, one bullet for each direction."""
+    """What was checked, and what the data do not determine, one bullet for each direction."""
+    lines: list[_Line] = []
+    for sentence in result.remarks:
+        lines += _wrapped(sentence[0].upper() + sentence[1:])
     if not result.undetermined:
-        return []
-    lines = [("What the data do not determine", {"weight": "bold"})]
+        return lines
+    lines += [("What the data do not determine", {"weight": "bold"})]
     for sentence in result.undetermined:
         lines += _wrapped(sentence, first="•  ", rest="    ")
     return lines
@@ -178,6 +191,20 @@ def _stretch(ax: Axes, result: Any) -> None:
         return
     ax.plot(time, output, color=BLUE, lw=0.9)
     ax.set_xlim(time[0], 2 * time[-1] - time[-2])
+
+
+def _profile(ax: Axes, result: Any) -> None:
+    """Which other frequencies of the harmonic the spectrum allows."""
+    frequency, rise = map(np.asarray, result.profile)
+    ax.axhspan(0, ALLOWED, color="0.9", lw=0, zorder=0)
+    ax.plot(frequency, rise, color=BLUE, marker=".", ms=3)
+    ax.axvline(float(result.task["harmonic_frequency"]), color=ORANGE, lw=0.8, ls=(0, (4, 2)), zorder=0)
+    title = "Profile: rise of χ² with the harmonic held at a frequency (grey: 95 % interval)"
+    if result.harmonic_p_value is not None:
+        title += f"; harmonic p = {result.harmonic_p_value:.2g}"
+    ax.set_title(title)
+    top = float(np.max(rise, where=np.isfinite(rise), initial=2 * ALLOWED))
+    ax.set(xlabel="Frequency (Hz)", ylabel="Δχ²", xlim=(0, frequency[-1] + frequency[0]), ylim=(0, 1.05 * top))
 
 
 def _say(ax: Axes, message: str) -> None:

@@ -1,22 +1,41 @@
 """From where a fit ended to its result: success in words, fresh spectrum, standard errors, what is undetermined."""
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ._check import (
+    Stage,
+    best_theta,
+    controlled_moments,
+    linear_check,
+    notices_of,
+    polish_check,
+    rival_frequencies,
+    unsettled,
+)
+from ._derived import (
+    correlation_table,
+    derived_numbers,
+    derived_table,
+    jackknife,
+    linearised_at,
+    parameter_table,
+    unit_of,
+    without_error,
+)
 from ._descend import SMALL, Descent
-from ._objective import Moments, at
-from ._operating import slowest_rate
-from ._parameter import PARAMETERS, as_arrays, as_numbers
+from ._harmonic_test import harmonic_test
+from ._linear import settled
+from ._objective import MonteCarlo
+from ._parameter import as_arrays, as_numbers
+from ._problem import Problem, Setup
 from ._result import Estimate, FitResult, Start
 from ._simulate import SimulationError, ensemble
-from ._starts import contenders, harmonic_frequencies
 from ._trajectory import WINDOW, versions
 from ._uncertainty import (
-    BinStatistics,
     Identifiability,
     bin_correlation,
     bin_statistics,
@@ -28,85 +47,13 @@ from ._uncertainty import (
     undetermined_directions,
 )
 
-if TYPE_CHECKING:
-    from ._fit import Problem, _Setup
-
 STRETCH = 5.0
-REDUCED = 0.1
-AMBIGUOUS = 1.92
-UNITS = {
-    "corner_frequency": "Hz",
-    "harmonic_frequency": "Hz",
-    "K_w0": "N/m",
-    "K_z0": "N/m",
-    "C_w0": "N s/m",
-    "C_z0": "N s/m",
-}
-
-
-@eqx.filter_jit
-def _linearised(problem: Any, theta: Any) -> tuple[Any, ...]:
-    """Moments, data residuals and derived quantities at θ, with their Jacobians."""
-
-    def everything(theta):
-        moments = problem.moments(theta)
-        values = (
-            moments,
-            problem.data_residuals(moments),
-            derived(at(problem.task, problem.coordinates, theta), moments),
-        )
-        return values, values
-
-    slopes, values = jax.jacfwd(everything, has_aux=True)(theta)
-    return values, slopes
-
-
-def derived(task: Any, moments: Moments) -> dict[str, Any]:
-    """What the data can determine.
-
-    `corner_frequency` |λ_slow|/2π of the operating point; `harmonic_share` of the compared power; `harmonic_frequency`;
-    `high_frequency_floor`, mean proportional power per bin over the highest third of the bins; the base coefficients;
-    `coefficient_of_variation` and `mean` of the output.
-    """
-    base, seen = task.muscle.base(), observed(moments)
-    return {
-        "corner_frequency": slowest_rate(task) / (2 * jnp.pi),
-        "harmonic_share": seen["harmonic_share"],
-        "harmonic_frequency": task.harmonic.frequency * jnp.ones(()),
-        "high_frequency_floor": seen["high_frequency_floor"],
-        "K_w0": base[0],
-        "K_z0": base[1],
-        "C_w0": base[2],
-        "C_z0": base[3],
-        "coefficient_of_variation": seen["coefficient_of_variation"],
-        "mean": seen["mean"],
-    }
-
-
-def observed(moments: Moments) -> dict[str, Any]:
-    """Those derived quantities that follow from simulated moments."""
-    upper = moments.power.shape[0] // 3
-    return {
-        "harmonic_share": jnp.sum(moments.line) / jnp.sum(moments.power),
-        "high_frequency_floor": jnp.mean(moments.proportional[-upper:]),
-        "coefficient_of_variation": moments.variation,
-        "mean": moments.mean,
-    }
-
-
-def _jackknife(each: Moments) -> dict[str, float]:
-    """Standard errors of the observed quantities from the moments of every seed."""
-    count = len(each.mean)
-    if count < 2:
-        return {}
-    without = jax.tree.map(lambda x: (x.sum(0) - x) / (count - 1), each)
-    return {name: float(np.std(v) * np.sqrt(count - 1)) for name, v in jax.vmap(observed)(without).items()}
+CHECK_CHUNK = 32
 
 
 def report_fit(
-    setup: "_Setup",
-    problem: "Problem",
-    reached: list[Descent],
+    setup: Setup,
+    stages: list[Stage],
     check_seeds: int,
     settings: dict[str, Any],
     seed: int | None,
@@ -114,34 +61,36 @@ def report_fit(
     *,
     interrupted: bool,
 ) -> FitResult:
-    """The result of a fit that ended at the best point of the last descent."""
-    final = reached[-1]
+    """The result of a fit that ended at the best point of the last stage."""
+    _, problem, final = stages[-1]
+    first = stages[0].descent
     starts = tuple(
         Start(float(c) if np.isfinite(c) else None, bool(ok), int(n))
-        for c, ok, n in zip(reached[0].cost, reached[0].settled, reached[0].steps, strict=True)
+        for c, ok, n in zip(first.cost, first.settled, first.steps, strict=True)
     )
-    common = {"target": setup.target, "method": "montecarlo", "starts": starts, "seed": seed,
+    common = {"target": setup.target, "method": setup.method, "starts": starts, "seed": seed,
               "settings": settings, "versions": versions()}  # fmt: skip
-    cost = final.cost[final.best]
-    if not np.isfinite(cost):
+    if not np.isfinite(final.cost[final.best]):
         reason = "no start has a finite spectrum: the model explodes there; lower the noise or damping of the task"
         return _failed(setup, common, reason)
-    theta = np.asarray(setup.coordinates.theta(jnp.asarray(final.s[final.best])))
-    (moments, residuals, _), (_, jacobian, found_slopes) = _linearised(problem, jnp.asarray(theta))
+    theta = best_theta(setup, final)
+    (moments, residuals, _), (_, jacobian, found_slopes) = linearised_at(problem, jnp.asarray(theta))
     residuals, jacobian = np.asarray(residuals), np.asarray(jacobian)
-    task = as_numbers(setup.task.replace(**{n: float(v) for n, v in setup.coordinates.values(jnp.asarray(theta)).items()}))
+    task = as_numbers(setup.task.replace(**{n: float(v) for n, v in setup.coordinates.values(theta).items()}))
+    simulated = as_numbers(settled(as_arrays(task))) if setup.control else task
     try:
-        runs = ensemble(task, jax.random.fold_in(setup.key, 1), seeds=check_seeds)
+        runs = ensemble(simulated, jax.random.fold_in(setup.key, 1), seeds=check_seeds, chunk=CHECK_CHUNK)
     except (SimulationError, ValueError) as error:
         return _failed(setup, common, f"the fitted task cannot be simulated: {error}")
+    each, expected = controlled_moments(runs, setup.target.settings, WINDOW)
     chosen = setup.target.bins - setup.target.settings.first_bin
-    powers = np.asarray(runs.spectrum().power)[:, chosen]
-    power = powers.mean(axis=0)
+    power_of_each = np.asarray(each.power)[:, chosen]
+    each = each._replace(power=power_of_each)
+    power = power_of_each.mean(axis=0)
     line = np.minimum(np.asarray(moments.line), power)
     share = np.asarray(moments.line / moments.power)
-    held = np.asarray(runs.between(WINDOW))
-    each = Moments(*map(jnp.asarray, (powers, np.tile(line, (len(powers), 1)), held.mean(axis=1), held.var(axis=1))))
-    values = derived(as_arrays(task), jax.tree.map(lambda x: x.mean(axis=0), each))
+    each = each._replace(line=np.tile(line, (len(power_of_each), 1)))
+    values = derived_numbers(as_arrays(task), jax.tree.map(lambda x: np.asarray(x).mean(axis=0), each))
     scatter = _residual_covariance(setup, problem, share)
     seen = jacobian / np.sqrt(np.maximum(np.diag(scatter), 1.0))[:, None]
     known = identifiability(seen)
@@ -154,18 +103,21 @@ def report_fit(
     residual = standardised(np.asarray(setup.target.proportional_power), fitted, statistics)
     log_error = np.log(setup.target.proportional_power / fitted)
     start = round((runs.time[-1] - STRETCH) * runs.rate)
-    rivals = rival_frequencies(setup, final)
-    parameters = _parameters(setup, task, covariance, known)
-    found = _derived(setup, values, found_slopes, _jackknife(each), covariance, seen, setup.prior)
+    rivals = rival_frequencies(setup, first if setup.method == "linear" else final)
+    parameters = parameter_table(setup, task, covariance, known)
+    found = derived_table(setup, values, found_slopes, jackknife(each), covariance, seen, setup.prior)
     if rivals:
-        parameters, found = _without_error("harmonic_frequency", parameters), _without_error("harmonic_frequency", found)
+        parameters, found = without_error("harmonic_frequency", parameters), without_error("harmonic_frequency", found)
+    check = {} if expected is None else linear_check(power_of_each, np.asarray(expected.power)[chosen], statistics)
+    check |= polish_check(setup, stages, found)
+    line_test = None if interrupted else harmonic_test(setup, final)
     return FitResult(
         success=success,
         message=message,
         task=task,
         parameters=parameters,
         derived=found,
-        correlation=_correlation(setup.coordinates.names, covariance),
+        correlation=correlation_table(setup.coordinates.names, covariance),
         undetermined=undetermined_directions(setup.coordinates.names, known),
         singular_values=known.singular_values,
         chi2_per_bin=float(np.sum(residual**2) / (len(residual) - 1)) if statistics.known else None,
@@ -175,21 +127,24 @@ def report_fit(
         residual=residual,
         deviation=statistics.sd if statistics.known else None,
         stretch=(runs.time[start:], np.asarray(runs.output[0])[start:]),
-        notices=_notices(setup.target, statistics, rivals),
+        profile=None if line_test is None else (line_test.frequency, line_test.rise),
+        harmonic_p_value=None if line_test is None else line_test.p_value,
+        check=check,
+        notices=notices_of(setup.target, statistics, rivals, check, unsettled(setup, task)),
         **common,
     )
 
 
-def _failed(setup: "_Setup", common: dict[str, Any], reason: str) -> FitResult:
+def _failed(setup: Setup, common: dict[str, Any], reason: str) -> FitResult:
     nothing = np.full(len(setup.target.bins), np.nan)
     free = setup.coordinates.names
-    parameters = {name: Estimate(float(value), _unit(name), None, name in free, name not in free)
+    parameters = {name: Estimate(float(value), unit_of(name), None, name in free, name not in free)
                   for name, value in setup.task.parameters.items()}  # fmt: skip
     return FitResult(
         success=False, message=reason, task=setup.task, parameters=parameters, derived={}, correlation={},
         undetermined=(), singular_values=np.full(len(free), np.nan), chi2_per_bin=None, rms_log_error=None,
-        fitted=nothing, harmonic_share=nothing, residual=nothing, deviation=None,
-        stretch=(np.zeros(0), np.zeros(0)), notices=setup.target.notices, **common,
+        fitted=nothing, harmonic_share=nothing, residual=nothing, deviation=None, profile=None, harmonic_p_value=None,
+        check={}, stretch=(np.zeros(0), np.zeros(0)), notices=setup.target.notices, **common,
     )  # fmt: skip
 
 
@@ -221,13 +176,16 @@ def _verdict(
                    f"raise max_steps or give more starts")  # fmt: skip
 
 
-def _residual_covariance(setup: "_Setup", problem: "Problem", share: np.ndarray) -> np.ndarray:
+def _residual_covariance(setup: Setup, problem: Problem, share: np.ndarray) -> np.ndarray:
     """Covariance of the data residuals: scatter of the target and of the simulated mean."""
     target = setup.target
     start, stop = WINDOW
     per_seed = target.settings.degrees_of_freedom(target.settings.segments(round((stop - start) * target.settings.rate)))
-    seeds = jax.tree.leaves(problem.model.noise)[0].shape[0] - 1
-    variance = log_power_moments(per_seed * seeds)[1] * np.maximum(1 - share**2, 0.0)
+    # A linear response has no sampling error, and a control variate leaves next to nothing of it.
+    model = problem.model
+    plain = model if isinstance(model, MonteCarlo) and not model.control else None
+    each = 0.0 if plain is None else log_power_moments(per_seed * plain.seeds)[1]
+    variance = each * np.maximum(1 - share**2, 0.0)
     correlation = bin_correlation(target.settings, target.bins, (6,))
     simulated = np.sqrt(variance)[:, None] * correlation * np.sqrt(variance)
     measured = problem.statistics.covariance
@@ -239,7 +197,7 @@ def _residual_covariance(setup: "_Setup", problem: "Problem", share: np.ndarray)
     return np.block([[total, np.zeros((len(total), len(rows)))], [np.zeros((len(rows), len(total))), np.diag(rows)]])
 
 
-def _spread_map(problem: "Problem", p: np.ndarray) -> np.ndarray:
+def _spread_map(problem: Problem, p: np.ndarray) -> np.ndarray:
     """How the spectrum's residuals move with the log powers."""
     n = len(p)
     if problem.residual == "log":
@@ -247,86 +205,3 @@ def _spread_map(problem: "Problem", p: np.ndarray) -> np.ndarray:
     if problem.residual == "linear":
         return shares_map(p) / problem.sigma[:, None]
     return (np.tril(np.ones((n, n))) @ shares_map(p) / problem.sigma[:, None])[:-1]
-
-
-def _unit(name: str) -> str:
-    return PARAMETERS[name].unit if name in PARAMETERS else ""
-
-
-def _parameters(setup: "_Setup", task: Any, covariance: np.ndarray, known: Identifiability) -> dict[str, Estimate]:
-    names = setup.coordinates.names
-    slope = setup.coordinates.slope(np.array([float(task[name]) for name in names]))
-    errors = dict(zip(names, np.sqrt(np.diag(covariance)) * slope, strict=True))
-    identifiable = dict(zip(names, known.parameters, strict=True))
-    return {
-        name: Estimate(
-            float(value),
-            _unit(name),
-            float(errors[name]) if identifiable.get(name) else None,
-            name in errors,
-            bool(identifiable.get(name, name not in errors)),
-        )
-        for name, value in task.parameters.items()
-    }
-
-
-def _derived(
-    setup: "_Setup",
-    values: dict[str, Any],
-    slopes: dict[str, Any],
-    sampling: dict[str, float],
-    covariance: np.ndarray,
-    jacobian: np.ndarray,
-    prior: np.ndarray,
-) -> dict[str, Estimate]:
-    """Derived quantities; one is determined if the data leave at most a tenth of its prior variance.
-
-    Their errors are those of the parameters and, where a value comes from fresh seeds, their sampling error.
-    """
-    curvature = jacobian.T @ jacobian
-    after = np.linalg.pinv(curvature + np.diag(prior), hermitian=True)
-    before = np.diag(1 / np.maximum(prior, 1e-6))
-    table = {}
-    for name, value in values.items():
-        g = np.asarray(slopes[name])
-        free = bool(np.any(g != 0))
-        determined = free and bool(g @ after @ g <= REDUCED * (g @ before @ g))
-        stderr = float(np.hypot(np.sqrt(g @ covariance @ g), sampling.get(name, 0.0))) if determined else None
-        unit = setup.task.output_unit if name == "mean" else UNITS.get(name, "1")
-        table[name] = Estimate(float(value), unit, stderr, free, determined or not free)
-    return table
-
-
-def _correlation(names: tuple[str, ...], covariance: np.ndarray) -> dict[str, Any]:
-    sd = np.sqrt(np.diag(covariance))
-    matrix = covariance / np.maximum(np.outer(sd, sd), 1e-300)
-    return {"parameters": list(names), "matrix": matrix.tolist()}
-
-
-def rival_frequencies(setup: "_Setup", final: Descent) -> list[float]:
-    """Harmonic frequencies of other minima that fit almost as well as the best one, best first [Hz].
-
-    Almost as well: a cost `½ Σ r²` within 1.92 of the lowest, half the 95 % quantile of χ² with one degree of freedom, so
-    that a likelihood interval for the frequency would contain them.
-    """
-    chosen = contenders(setup.coordinates, setup.target, final, AMBIGUOUS)
-    if len(chosen) < 2:
-        return []
-    frequency = harmonic_frequencies(setup.coordinates, final)
-    return [float(frequency[i]) for i in chosen[1:]]
-
-
-def _without_error(name: str, table: dict[str, Estimate]) -> dict[str, Estimate]:
-    old = table[name]
-    return table | {name: Estimate(old.value, old.unit, None, old.free, False)}
-
-
-def _notices(target: Any, statistics: BinStatistics, rivals: list[float]) -> tuple[str, ...]:
-    notices = list(target.notices)
-    if not statistics.known:
-        notices.append("the target states neither segments nor sigma: every bin counts alike and there is no chi2")
-    if rivals:
-        others = " and ".join(f"{f:.2f} Hz" for f in rivals)
-        notices.append(f"harmonic_frequency is ambiguous: {others} fits almost as well (log-likelihood within {AMBIGUOUS}); "
-                       "the other numbers hold for the frequency shown")  # fmt: skip
-    return tuple(notices)

@@ -56,7 +56,9 @@ class FitResult(eqx.Module):
     do not determine; `singular_values` of the Jacobian (residuals in standard deviations, parameters in the prior's);
     `chi2_per_bin` (None without knowledge of the spread); `rms_log_error`; `fitted` proportional power (fresh seeds) on
     the target's bins, `harmonic_share` of each bin's power, `residual` and `deviation` [standard deviations, log power];
-    the table of `starts`; `stretch`, a few seconds of simulated output; `notices`; `seed`; `settings`; `versions`.
+    the table of `starts`; `stretch`, a few seconds of simulated output; `profile`, harmonic frequencies [Hz] and the rise
+    of chi² there, all else fitted anew; `harmonic_p_value`, how often spectra without harmonic would show one as strong;
+    `check`, how far linear response and nonlinear simulation differ; `notices`; `seed`; `settings`; `versions`.
     """
 
     success: bool
@@ -77,6 +79,9 @@ class FitResult(eqx.Module):
     deviation: Float[np.ndarray, " bins"] | None
     starts: tuple[Start, ...]
     stretch: tuple[np.ndarray, np.ndarray]
+    profile: tuple[np.ndarray, np.ndarray] | None
+    harmonic_p_value: float | None
+    check: dict[str, float | int]
     notices: tuple[str, ...]
     seed: int | None
     settings: dict[str, Any]
@@ -91,6 +96,19 @@ class FitResult(eqx.Module):
     def free(self) -> tuple[str, ...]:
         """Names of the fitted parameters."""
         return tuple(name for name, p in self.parameters.items() if p.free)
+
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """What was checked, in sentences: linear response against simulation, and whether there is a harmonic."""
+        said = []
+        if "largest_deviation" in self.check:
+            percent, errors = 100 * self.check["largest_deviation"], self.check["largest_deviation_se"]
+            said.append(f"simulation and linear response differ by at most {percent:.2g} % of a bin "
+                        f"({errors:.1f} standard errors of {self.check['seeds']} seeds)")  # fmt: skip
+        if self.harmonic_p_value is not None:
+            word = "significant" if self.harmonic_p_value < 0.05 else "not significant"
+            said.append(f"the harmonic is {word}: p = {self.harmonic_p_value:.2g} by bootstrap without it")
+        return tuple(said)
 
     def plot(self) -> "Figure":
         """The figure of the fit."""
@@ -111,6 +129,7 @@ class FitResult(eqx.Module):
             lines.append(f"  chi2 per bin {self.chi2_per_bin:.2f}, rms log error {self.rms_log_error:.3f}")
         elif self.rms_log_error is not None:
             lines.append(f"  rms log error {self.rms_log_error:.3f} (no chi2: the target states no spread)")
+        lines += [f"  {sentence}" for sentence in self.remarks]
         rows = [("parameter", {n: p for n, p in self.parameters.items() if p.free}), ("derived", self.derived)]
         for title, table in rows:
             lines.append(f"  {title:<24}{'value':>12}   {'std. error':<14} unit")
@@ -162,6 +181,11 @@ def _to_json(result: FitResult) -> dict[str, Any]:
         },
         "starts": [{"cost": s.cost, "success": s.success, "steps": s.steps} for s in result.starts],
         "stretch": {"time": _numbers(result.stretch[0]), "output": _numbers(result.stretch[1])},
+        "profile": None
+        if result.profile is None
+        else {"frequency_hz": _numbers(result.profile[0]), "chi2_rise": _numbers(result.profile[1])},
+        "harmonic_p_value": result.harmonic_p_value,
+        "check": result.check,
         "notices": list(result.notices),
         "seed": result.seed,
         "settings": result.settings,
@@ -196,7 +220,7 @@ def load_result(path: str | Path) -> FitResult:
 
 
 def _from_json(table: dict[str, Any]) -> FitResult:
-    spectrum = table["spectrum"]
+    spectrum, profile = table["spectrum"], table.get("profile")
 
     def estimate(p):
         return Estimate(np.nan if p["value"] is None else p["value"], p["unit"], p["stderr"], p["free"], p["identifiable"])
@@ -220,6 +244,9 @@ def _from_json(table: dict[str, Any]) -> FitResult:
         deviation=None if spectrum["deviation"] is None else _array(spectrum["deviation"]),
         starts=tuple(Start(s["cost"], s["success"], s["steps"]) for s in table["starts"]),
         stretch=(_array(table["stretch"]["time"]), _array(table["stretch"]["output"])),
+        profile=None if profile is None else (_array(profile["frequency_hz"]), _array(profile["chi2_rise"])),
+        harmonic_p_value=table.get("harmonic_p_value"),
+        check=table.get("check", {}),
         notices=tuple(table["notices"]),
         seed=table["seed"],
         settings=table["settings"],

@@ -9,18 +9,20 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
+from ._linear import LinearTask, check_equilibrium, linearised
 from ._noise import AbstractNoise, Realisation
-from ._operating import fastest_rate
+from ._operating import OperatingPointError, fastest_rate
 from ._parameter import as_arrays, as_numbers, is_concrete
 from ._path import Grid, observe, solve
 from ._task import AbstractTask
-from ._trajectory import Trajectory, one, stack
+from ._trajectory import WINDOW, Trajectory, one, stack
 
 MAX_RATE_STEP = 0.5
 MAX_SUBSTEPS = 256
 CHUNK = 64
 DURATION = 15.0
 DT = 1e-3
+TRANSIENT = 1e-3
 
 
 class SimulationError(RuntimeError):
@@ -69,12 +71,17 @@ def ensemble(
     substeps: int | None = None,
     sampling: str | None = None,
     chunk: int = CHUNK,
+    control: bool | None = None,
     progress: bool = False,
 ) -> Trajectory:
     """Simulate many seeds (0 to seeds - 1, or those given), `chunk` at a time; seed i is `simulate(..., seed=i)`.
 
     Arguments, returns and errors as in `simulate`; `progress` shows a bar. What does not stay finite is an error that
     names every such seed, never averaged in silently.
+
+    `control` carries the linearised task along on the same noise paths, as control variate for
+    `Trajectory.mean_spectrum`; None does so wherever it pays: the run covers the analysed window and the task has a
+    stable equilibrium whose transients have decayed there.
     """
     numbers = np.arange(seeds) if isinstance(seeds, int) else np.asarray(seeds)
     if numbers.size == 0:
@@ -83,17 +90,42 @@ def ensemble(
         raise ValueError(f"chunk = {chunk} must be at least 1")
     grid, sampling, rate = _plan(task, duration, dt, rate, substeps, sampling)
     if not _all_concrete((task, key)):
-        return _run(task, key, jnp.asarray(numbers), grid, sampling, rate)
+        linear = LinearTask.of(as_arrays(task)) if control else None
+        return _run(task, key, jnp.asarray(numbers), grid, sampling, rate, linear)
+    linear = None if control is False else _companion(task, duration, required=control is True)
     size = min(chunk, 8 * math.ceil(numbers.size / 8))
     parts = []
     for start in _progress(range(0, numbers.size, size), size, numbers.size, progress):
         here = numbers[start : start + size]
         padded = np.concatenate([here, np.full(size - here.size, here[-1])])
-        result = _run(task, key, jnp.asarray(padded), grid, sampling, rate)
+        result = _run(task, key, jnp.asarray(padded), grid, sampling, rate, linear)
         parts.append(jax.tree.map(lambda x, n=here.size: x[:n] if np.ndim(x) and x.shape[0] == size else x, result)
                      if here.size < size else result)  # fmt: skip
     _require_finite(parts)
     return stack(parts)
+
+
+def _companion(task: AbstractTask, duration: float, *, required: bool) -> LinearTask | None:
+    """The linearised task, if its response is stationary in the analysed window; else None, or an error if required."""
+    with jax.enable_x64(True):
+        linear = linearised(as_arrays(task))
+        try:
+            slowest = check_equilibrium(task, np.asarray(linear.system.point), np.asarray(linear.system.A))
+        except OperatingPointError:
+            if required:
+                raise
+            return None
+        moved = np.abs(np.asarray(as_arrays(task).initial_state()) - np.asarray(linear.system.point))
+    # A task that starts settled has nothing to forget.
+    left = math.exp(-slowest * WINDOW[0]) if np.max(moved) > 1e-9 else 0.0
+    if duration < WINDOW[1] or left > TRANSIENT:
+        if required:
+            raise ValueError(
+                f"control = True: duration = {duration} s must reach {WINDOW[1]} s, and by {WINDOW[0]} s the slowest motion "
+                f"must have decayed to {TRANSIENT:g} of its start, but {left:.2g} is left: simulate settled(task)"
+            )
+        return None
+    return linear
 
 
 def _progress(starts: range, size: int, total: int, show: bool) -> Any:
@@ -172,14 +204,26 @@ def respond(
 
 
 @eqx.filter_jit
-def _simulate_seeds(task, key, seeds, grid, sampling):
-    normals = draw(task.noise, key, seeds, grid.steps)
-    return jax.vmap(lambda z: respond(task, task.noise.realise(z, grid.dt), grid, sampling))(normals)
+def _simulate_seeds(task, linear, key, seeds, grid, sampling):
+    def one(normals):
+        path = task.noise.realise(normals, grid.dt)
+        beside = None if linear is None else respond(linear, path, grid, sampling)[1]
+        return *respond(task, path, grid, sampling), beside
+
+    return jax.vmap(one)(draw(task.noise, key, seeds, grid.steps))
 
 
-def _run(task: AbstractTask, key: PRNGKeyArray, seeds: Any, grid: Grid, sampling: str, rate: float) -> Trajectory:
-    states, output = _simulate_seeds(as_arrays(task), key, seeds, grid, sampling)
-    return Trajectory(task, states, output, seeds, rate, grid.dt, grid.substeps, sampling)
+def _run(
+    task: AbstractTask,
+    key: PRNGKeyArray,
+    seeds: Any,
+    grid: Grid,
+    sampling: str,
+    rate: float,
+    linear: LinearTask | None = None,
+) -> Trajectory:
+    states, output, beside = _simulate_seeds(as_arrays(task), as_arrays(linear), key, seeds, grid, sampling)
+    return Trajectory(task, states, output, seeds, rate, grid.dt, grid.substeps, sampling, beside)
 
 
 def _require_finite(parts: list[Trajectory]) -> None:

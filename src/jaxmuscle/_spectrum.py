@@ -313,6 +313,12 @@ def periodogram(
     return np.fft.rfftfreq(signal.shape[-1], 1 / settings.rate), _density(signal, settings)
 
 
+@eqx.filter_jit
+def _filtered_power(signal: Any, settings: SpectrumSettings, edges: tuple[int, int] | None) -> Float[Array, "*batch bins"]:
+    filtered = lowpass(signal, settings)
+    return welch(filtered if edges is None else filtered[..., edges[0] : edges[1]], settings)
+
+
 def spectrum_of(
     signal: Real[Array | np.ndarray, "*batch times"],
     settings: SpectrumSettings,
@@ -330,12 +336,12 @@ def spectrum_of(
     **Raises:** `ValueError` if the window lies outside the signal or is shorter than one segment. **Source:**
     Slifkin & Newell 1999, J Exp Psychol HPP 25(3):837-851.
     """
-    filtered = lowpass(signal, settings)
+    edges = None
     if window is not None:
-        samples = filtered.shape[-1]
+        samples = np.shape(signal)[-1]
         start, stop = (round(time * settings.rate) for time in window)
         remedy = f"give 0 <= start < stop <= {samples / settings.rate:g} s, the duration of the signal"
         require(0 <= start < stop <= samples, "window", window, remedy)
-        filtered = filtered[..., start:stop]
-    power = welch(filtered, settings)
+        edges = (start, stop)
+    power = _filtered_power(signal, settings, edges)
     return Spectrum(jnp.asarray(settings.frequency, power.dtype), power, settings, unit)

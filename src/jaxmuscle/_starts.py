@@ -1,6 +1,5 @@
 """Where the starts of a fit begin, and which different minima they ended in."""
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 from scipy.special import ndtri
@@ -47,7 +46,7 @@ def contenders(coordinates: Coordinates, target: Target, descent: Descent, margi
 
 def harmonic_frequencies(coordinates: Coordinates, descent: Descent) -> Float[np.ndarray, " starts"]:
     """Harmonic frequency that each start reached [Hz]."""
-    theta = np.asarray(coordinates.theta(jnp.asarray(descent.s)))
+    theta = np.asarray(coordinates.theta(descent.s))
     column = coordinates.names.index("harmonic_frequency")
     return coordinates.centre[column] * np.exp(coordinates.sd[column] * theta[:, column])
 
@@ -57,6 +56,6 @@ def _candidate_frequencies(target: Target, count: int) -> Float[np.ndarray, " st
     inner = np.flatnonzero((p[1:-1] > p[:-2]) & (p[1:-1] > p[2:])) + 1
     rise = p[inner] - 0.5 * (p[inner - 1] + p[inner + 1])
     peaks = f[inner[np.argsort(-rise)]]
-    spread = np.geomspace(2 * f[0], f[-1], max(count, 2))
+    spread = np.geomspace(f[0], f[-1], max(count, 2))
     order = np.argsort([-np.min(np.abs(np.log(s / np.append(peaks, 1e9)))) for s in spread])
     return np.concatenate([peaks[: max(1, count // 2)], spread[order], peaks[max(1, count // 2) :]])[:count]

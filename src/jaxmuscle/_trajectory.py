@@ -10,14 +10,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from ._parameter import PARAMETERS, as_numbers
+from ._estimate import SpectrumEstimate, estimated
+from ._expected import WINDOW, expected_spectrum
+from ._parameter import PARAMETERS, as_numbers, is_concrete
 from ._spectrum import Spectrum, SpectrumSettings, spectrum_of
 from ._task import AbstractTask
 
 if TYPE_CHECKING:
     import xarray
-
-WINDOW = (5.0, 15.0)
 
 
 class Trajectory(eqx.Module):
@@ -25,7 +25,8 @@ class Trajectory(eqx.Module):
 
     **Fields:** `task`; `states` [m, m/s], shape (seeds, samples, states) or (samples, states); `output` [N or m], shape
     (seeds, samples) or (samples,); `seeds`, the seed numbers; `rate` [Hz]; `dt` [s], `substeps` (integration steps per
-    dt); `sampling`, "instant" or "average" over the sampling interval.
+    dt); `sampling`, "instant" or "average" over the sampling interval; `linear`, the output of the linearised task on the
+    same noise paths, or None.
     """
 
     task: AbstractTask
@@ -36,6 +37,7 @@ class Trajectory(eqx.Module):
     dt: float = eqx.field(static=True)
     substeps: int = eqx.field(static=True)
     sampling: str = eqx.field(static=True)
+    linear: Float[Array | np.ndarray, "*seeds samples"] | None = None
 
     @property
     def time(self) -> Float[np.ndarray, " samples"]:
@@ -45,6 +47,9 @@ class Trajectory(eqx.Module):
     @property
     def finite(self) -> Bool[Array | np.ndarray, "*seeds"]:
         """Whether a seed's output and states stayed finite."""
+        if is_concrete(self.output) and is_concrete(self.states):  # NumPy needs no compilation
+            output, states = np.asarray(self.output), np.asarray(self.states)
+            return np.asarray(np.isfinite(output).all(-1) & np.isfinite(states).all((-2, -1)))
         return jnp.isfinite(self.output).all(-1) & jnp.isfinite(self.states).all((-2, -1))
 
     def state(self, name: str) -> Float[Array | np.ndarray, "*seeds samples"]:
@@ -66,13 +71,46 @@ class Trajectory(eqx.Module):
         **Arguments:** `settings` (the task's by default; their rate must divide this trajectory's); `window` [s].
         """
         settings = self.task.settings if settings is None else settings
+        return spectrum_of(self._at_rate_of(settings, self.output), settings, window, unit=self.task.output_unit)
+
+    def mean_spectrum(
+        self, settings: SpectrumSettings | None = None, window: tuple[float, float] = WINDOW, *, control: bool | None = None
+    ) -> SpectrumEstimate:
+        """The expected spectrum, estimated from these seeds, with its standard error per bin.
+
+            P_k = e_k + ⟨p_ik - l_ik⟩
+
+        p_i is a seed's Welch power, l_i that of the linearised task on the same noise path, e its exact expectation
+        (`expected_spectrum`): the linear part has no sampling error and no time-step error left. `control=False`, or a
+        trajectory without `linear`, gives the plain mean ⟨p_ik⟩.
+
+        **Raises:** `ValueError` for `control=True` without `linear`, or with another `sampling` than was simulated.
+        """
+        settings = self.task.settings if settings is None else settings
+        plain = np.atleast_2d(np.asarray(self.spectrum(settings, window).power))
+        same = self.sampling == settings.sampling and self.rate == settings.rate
+        if control and (self.linear is None or not same):
+            raise ValueError("control = True needs a trajectory simulated with control, and with the rate and sampling of "
+                             "the spectrum's settings")  # fmt: skip
+        if control is False or self.linear is None or not same:
+            return estimated(plain, None, None, settings, self.task.output_unit)
+        beside = np.atleast_2d(np.asarray(self.beside().spectrum(settings, window).power))
+        exact = np.asarray(expected_spectrum(self.task, settings, window).power)
+        return estimated(plain, beside, exact, settings, self.task.output_unit)
+
+    def beside(self) -> "Trajectory":
+        """The linearised task on the same noise paths, as a trajectory. Raises `ValueError` if it was not carried."""
+        if self.linear is None:
+            raise ValueError("this trajectory has no linear response beside it: simulate with control=True")
+        return eqx.tree_at(lambda t: t.output, self, self.linear)
+
+    def _at_rate_of(self, settings: SpectrumSettings, output: Any) -> Any:
         every = round(self.rate / settings.rate)
         if abs(every * settings.rate - self.rate) > 1e-9 * self.rate or every < 1:
             raise ValueError(
                 f"a spectrum at {settings.rate} Hz needs a trajectory at a multiple of that rate, this has {self.rate} Hz"
             )
-        spectrum = spectrum_of(self.output[..., ::every], settings, window)
-        return Spectrum(spectrum.frequency, spectrum.power, settings, self.task.output_unit)
+        return output[..., ::every]
 
     def plot(self, ax: Any = None) -> Any:
         """Output against time: one line, or mean and quantile band over seeds. Returns the axes."""
@@ -118,10 +156,10 @@ def versions() -> dict[str, str]:
 
 def stack(parts: list[Trajectory]) -> Trajectory:
     """Join trajectories along the seed axis."""
-    joined = {
-        name: np.concatenate([np.asarray(getattr(part, name)) for part in parts]) for name in ("states", "output", "seeds")
-    }
     first = parts[0]
+    names = ("states", "output", "seeds") + (() if first.linear is None else ("linear",))
+    joined: dict[str, Any] = {name: np.concatenate([np.asarray(getattr(part, name)) for part in parts]) for name in names}
+    joined.setdefault("linear", None)
     return Trajectory(first.task, **joined, rate=first.rate, dt=first.dt, substeps=first.substeps,
                       sampling=first.sampling)  # fmt: skip
 

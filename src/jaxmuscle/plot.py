@@ -9,9 +9,12 @@ import matplotlib.pyplot as plt
 import numpy as np
 from jaxtyping import Float, Real
 from matplotlib.axes import Axes
+from matplotlib.colors import SymLogNorm
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
+from ._estimate import SpectrumEstimate
+from ._sensitivity import Sensitivity
 from ._spectrum import Spectrum
 from ._target import Target
 from ._trajectory import WINDOW, Trajectory
@@ -90,6 +93,29 @@ def spectrum(spectrum: Spectrum, ax: Axes | None = None, *, log: bool = False, p
     _frequency_axis(ax, log)
     legend(ax, "lower left" if log else "upper right")
     ax.set_ylabel(_PROPORTIONAL if proportional else f"Power ({_density_unit(spectrum.unit)})")
+    return ax
+
+
+@styled
+def estimate(estimate: SpectrumEstimate, ax: Axes | None = None, *, log: bool = False) -> Axes:
+    """Draws the proportional power of a `SpectrumEstimate`, with two standard errors either way, and without control.
+
+    **Arguments:** `estimate`; `ax`, or a new figure; `log`, both axes logarithmic. **Returns:** the axes.
+    """
+    ax = _axes(ax)
+    frequency, whole = np.asarray(estimate.frequency), float(np.sum(estimate.power))
+    shown = slice(None) if not log else frequency > 0
+    rows = [(estimate.power, estimate.stderr, BLUE, "with control variate" if estimate.expected is not None else "mean")]
+    if estimate.expected is not None:
+        rows.append((estimate.plain_power, estimate.plain_stderr, GREY, "without"))
+    for order, (power, stderr, color, name) in enumerate(rows):
+        low, high = ((power + side * stderr)[shown] / whole for side in (-2, 2))
+        ax.fill_between(frequency[shown], low, high, color=color, alpha=0.25, lw=0, zorder=2 - order)
+        label = f"{name} ({estimate.seeds} seeds, ± 2 SE)"
+        ax.plot(frequency[shown], power[shown] / whole, color=color, label=label, zorder=3 - order)
+    _frequency_axis(ax, log)
+    legend(ax, "lower left" if log else "upper right")
+    ax.set_ylabel(_PROPORTIONAL)
     return ax
 
 
@@ -265,3 +291,30 @@ def _frequency_axis(ax: Axes, log: bool) -> None:
     ax.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
     ax.xaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:g}"))
     ax.xaxis.set_minor_formatter(NullFormatter())
+
+
+@styled
+def sensitivity(sensitivity: Sensitivity, ax: Axes | None = None) -> Axes:
+    """Draws how proportional power answers to the parameters as a heat map, parameters that do nothing left out.
+
+    **Arguments:** `sensitivity`; `ax`, or a new figure high enough for the parameters. **Returns:** the axes.
+    """
+    table = np.asarray(sensitivity.proportional)
+    shown = np.flatnonzero(np.max(np.abs(table), axis=1) > 1e-6)
+    if ax is None:
+        ax = plt.figure(figsize=(6.5, 1.3 + 0.22 * len(shown)), layout="constrained").add_subplot()
+    frequency = np.asarray(sensitivity.frequency)
+    half = 0.5 * (frequency[1] - frequency[0]) if len(frequency) > 1 else 0.5
+    edges = np.append(frequency - half, frequency[-1] + half)
+    largest = float(np.max(np.abs(table[shown]), initial=1e-6))
+    # Logarithmic beyond a tenth: a frequency moves its own bins hundreds of times as much as anything else does.
+    scale = SymLogNorm(min(0.1, largest), vmin=-largest, vmax=largest)
+    mesh = ax.pcolormesh(edges, np.arange(len(shown) + 1), table[shown], cmap="RdBu_r", norm=scale)
+    labels = [sensitivity.names[i] + ("" if sensitivity.relative[i] else " *") for i in shown]
+    ax.set_yticks(np.arange(len(shown)) + 0.5, labels)
+    ax.invert_yaxis()
+    ax.set_xlabel("Frequency (Hz)")
+    ax.figure.colorbar(mesh, ax=ax, label="d ln p / d ln parameter")
+    if not np.all(sensitivity.relative[shown]):
+        ax.set_title("* d ln p / d parameter, in its own unit", size="small")
+    return ax

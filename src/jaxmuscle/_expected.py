@@ -1,0 +1,310 @@
+"""The expected Welch spectrum of a task in linear response, in closed form."""
+
+import functools
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.signal
+from jaxtyping import Array, Complex, Float
+
+from ._linear import Linearisation, check_equilibrium, linearise
+from ._muscle import Perturbation
+from ._noise import ShapingFilter
+from ._parameter import as_arrays, is_concrete
+from ._signal import Constant
+from ._spectrum import Spectrum, SpectrumSettings, spectrum_of
+from ._task import AbstractTask
+
+TAIL = 1e-13
+WINDOW = (5.0, 15.0)
+
+
+class Moments(NamedTuple):
+    """What a fit compares: Welch power per bin, that of the harmonic alone, mean and variance in the window."""
+
+    power: Float[Array | np.ndarray, " bins"]
+    line: Float[Array | np.ndarray, " bins"]
+    mean: Float[Array | np.ndarray, ""]
+    variance: Float[Array | np.ndarray, ""]
+
+    @property
+    def proportional(self) -> Float[Array, " bins"]:
+        """Proportional power on the compared bins."""
+        return jnp.asarray(self.power) / jnp.sum(self.power)
+
+    @property
+    def variation(self) -> Float[Array, ""]:
+        """Coefficient of variation."""
+        return jnp.sqrt(self.variance) / jnp.abs(self.mean)
+
+
+def _sylvester(A: Array, F: Array, Q: Array) -> Array:
+    """X with `A X + X Fᵀ + Q = 0`; a leading axis of Q is a batch with the same matrices."""
+    n, m = A.shape[0], F.shape[0]
+    both = jnp.kron(A, jnp.eye(m, dtype=A.dtype)) + jnp.kron(jnp.eye(n, dtype=A.dtype), F)
+    right = -Q.reshape(-1, n * m).T
+    return jnp.linalg.solve(both, right).T.reshape(Q.shape)
+
+
+class _Covariances(NamedTuple):
+    """A linear system without input whose output from `start` is the autocovariance: `r(s) = row exp(matrix s) start`."""
+
+    matrix: Float[Array, "all all"]
+    row: Float[Array, " all"]
+    start: Float[Array, " all"]
+
+
+def _covariances(task: AbstractTask, system: Linearisation) -> _Covariances:
+    """The stationary response to the noise, its filters as further states."""
+    scale = task.noise_scale()
+    b, d, e = (x * scale for x in (system.B, system.D, system.E))
+    if task.noise.shared:
+        b, d, e = b.sum(-1, keepdims=True), d.sum(keepdims=True), e.sum(keepdims=True)
+    made: ShapingFilter = jax.tree.map(lambda x: x.astype(b.dtype), task.noise.shaping_filter())
+    F, G, H, L = made.F, made.G, made.H, made.L
+    A, C, n, size, k = system.A, system.C, len(system.A), len(F), d.shape[0]
+    seen = d[:, None] * H + e[:, None] * (H @ F if size else H)
+    if size:
+        own = _sylvester(F, F, jnp.outer(G, G))
+        drive = jnp.einsum("nk,s->kns", b, own @ H + G * L)
+        cross = _sylvester(A, F, drive)
+        fed = jnp.einsum("kns,s,mk->nm", cross, H, b)
+    else:
+        own, cross, fed = jnp.zeros((0, 0), b.dtype), jnp.zeros((k, n, 0), b.dtype), jnp.zeros((n, n), b.dtype)
+    inner = _sylvester(A, A, fed + fed.T + L**2 * b @ b.T)
+    start_y = inner @ C + jnp.einsum("kns,ks->n", cross, seen)
+    start_q = jnp.einsum("kns,n->ks", cross, C) + seen @ own
+    top = jnp.concatenate([A, jnp.einsum("nk,s->nks", b, H).reshape(n, k * size)], axis=1)
+    bottom = jnp.concatenate([jnp.zeros((k * size, n), b.dtype), jnp.kron(jnp.eye(k, dtype=b.dtype), F)], axis=1)
+    return _Covariances(
+        jnp.concatenate([top, bottom]),
+        jnp.concatenate([C, seen.reshape(-1)]),
+        jnp.concatenate([start_y, start_q.reshape(-1)]),
+    )
+
+
+def _autocovariance(system: _Covariances, interval: float, lags: int, sampling: str) -> Float[Array, " lags"]:
+    """r at lags 0, Δ, 2Δ ... of the sampled output; powers of the transition by repeated squaring."""
+    matrix, row, start = system
+    first = None
+    if sampling == "average":
+        # Means over the interval: r(0) = 2/Δ² c ∫(Δ-s) e^(Ms) ds v and r(lΔ) = c J Φ^(l-1) J v / Δ², J = ∫ e^(Ms) ds.
+        n = len(matrix)
+        zero, eye = jnp.zeros_like(matrix), jnp.eye(n, dtype=matrix.dtype)
+        blocks = jnp.block([[matrix * interval, eye, zero], [zero, zero, eye], [zero, zero, zero]])
+        whole = jax.scipy.linalg.expm(blocks)
+        step, mean, ramp = whole[:n, :n], whole[:n, n : 2 * n], whole[:n, 2 * n :]
+        first = 2 * row @ ramp @ start
+        row, start = row @ mean, mean @ start
+    else:
+        step = jax.scipy.linalg.expm(matrix * interval)
+    rows, power = row[None], step
+    while len(rows) < lags:
+        rows, power = jnp.concatenate([rows, rows @ power]), power @ power
+    # The last power carries an unstable system beyond any bound: no stationary covariance, so none is returned.
+    stable = jnp.max(jnp.abs(power)) < 1e3
+    r = jnp.where(stable, rows @ start, jnp.nan)
+    return r[:lags] if first is None else jnp.concatenate([first[None], r[: lags - 1]])
+
+
+@functools.cache
+def _bin_rows(settings: SpectrumSettings) -> Complex[np.ndarray, "bins length"]:
+    """Detrending, taper and transform of a segment as one matrix: X_k = Σ_m a_km x_m, scaled so that power is |X_k|²."""
+    n, m = settings.length, np.arange(settings.length)
+    k = np.arange(settings.first_bin, settings.last_bin + 1)
+    sides = np.where((k == 0) | (2 * k == n), 1.0, 2.0)
+    rows = settings.taper * np.exp(-2j * np.pi * np.outer(k, m) / n)
+    rows = rows * np.sqrt(sides / (settings.rate * np.sum(settings.taper**2)))[:, None]
+    if settings.detrend != "none":
+        rows = rows - rows.mean(axis=1, keepdims=True)
+    if settings.detrend == "linear":
+        line = m - m.mean()
+        rows = rows - np.outer(rows @ line, line) / (line @ line)
+    return rows
+
+
+@functools.cache
+def covariance_operator(settings: SpectrumSettings) -> Float[np.ndarray, "bins lags"]:
+    """M with expected Welch power `E_k = Σ_l M_kl r(l Δ)`: low-pass, detrending, taper and transform.
+
+    The low-pass turns r into `r * ρ`, ρ the autocorrelation of its impulse response; a bin is `Σ_l α_k(l) r(l)`, α_k the
+    autocorrelation of its row of `_bin_rows`. Both are folded onto lags l >= 0.
+    """
+    rows, reach = _bin_rows(settings), 1
+    spread = np.ones(1)
+    if settings.sections is not None:
+        impulse = scipy.signal.sosfilt(settings.sections, np.eye(1, 64 * settings.length)[0])
+        spread = scipy.signal.correlate(impulse, impulse, method="fft")
+        if settings.filter_direction == "both":
+            spread = scipy.signal.correlate(spread, spread, method="fft")
+        centre = len(spread) // 2
+        reach = int(np.max(np.flatnonzero(np.abs(spread) > TAIL * np.abs(spread).max())) - centre)
+        spread = spread[centre - reach : centre + reach + 1]
+    lagged = np.array([scipy.signal.correlate(row, row, method="fft").real for row in rows])
+    full = np.array([scipy.signal.convolve(row, spread, method="fft") for row in lagged])
+    centre = full.shape[1] // 2
+    folded = full[:, centre:].copy()
+    folded[:, 1:] += full[:, centre - 1 :: -1]
+    return folded
+
+
+def _turn(angle: Float[Array, "*any"]) -> Complex[Array, "*any"]:
+    """exp(i angle)."""
+    return jax.lax.complex(jnp.cos(angle), jnp.sin(angle))
+
+
+def _times_i(x: Float[Array, "*any"]) -> Complex[Array, "*any"]:
+    return jax.lax.complex(jnp.zeros_like(x), x)
+
+
+def _transfer(system: Linearisation, base: Perturbation, omega: Float[Array, ""]) -> Complex[Array, ""]:
+    """Response of the output to the harmonic on all its channels, `C (s - A)⁻¹ B + D + s E` times base, s = iω."""
+    s = _times_i(omega)
+    A, B, C = (x.astype(s.dtype) for x in (system.A, system.B @ base, system.C))
+    inside = jnp.linalg.solve(s * jnp.eye(len(A), dtype=s.dtype) - A, B)
+    return C @ inside + jax.lax.complex(system.D @ base, omega * (system.E @ base))
+
+
+def _low_pass(settings: SpectrumSettings, turn: Complex[Array, ""]) -> Complex[Array, ""]:
+    """Frequency response of the digital low-pass at z = `turn`."""
+    if settings.sections is None:
+        return jnp.ones_like(turn)
+    back = jnp.stack([jnp.ones_like(turn), 1 / turn, 1 / turn**2])
+    sections = jnp.asarray(settings.sections, turn.dtype)
+    gain = jnp.prod((sections[:, :3] @ back) / (sections[:, 3:] @ back))
+    return gain * jnp.conj(gain) if settings.filter_direction == "both" else gain
+
+
+def _sample_mean(angle: Float[Array, ""], sampling: str) -> Complex[Array, ""]:
+    """What averaging over the sampling interval before each sample does to a line that turns by `angle` in it."""
+    return (1 - _turn(-angle)) / _times_i(angle) if sampling == "average" else jnp.ones_like(_turn(angle))
+
+
+def _line(
+    task: AbstractTask, system: Linearisation, settings: SpectrumSettings, window: tuple[float, float]
+) -> tuple[Float[Array, " bins"], Float[Array, ""]]:
+    """Welch power of the harmonic's response, phase and leakage included, and its variance in the window."""
+    harmonic = task.harmonic
+    if not isinstance(harmonic.envelope, Constant):
+        return _enveloped_line(task, system, settings, window)
+    dtype = system.A.dtype
+    omega = 2 * jnp.pi * jnp.asarray(harmonic.frequency, dtype)
+    angle = omega / settings.rate
+    turn = _turn(angle)
+    size = jnp.asarray(harmonic.amplitude, dtype) * jnp.asarray(harmonic.envelope.level, dtype)
+    reply = (
+        size.astype(turn.dtype) * _turn(jnp.asarray(harmonic.phase, dtype)) * _transfer(system, task.harmonic_base(), omega)
+    )
+    reply = reply * _sample_mean(angle, settings.sampling)
+    start, stop = (round(edge * settings.rate) for edge in window)
+    begins = start + settings.step * np.arange(settings.segments(stop - start))
+    rows = jnp.asarray(_bin_rows(settings), turn.dtype)
+    spin = _turn(angle * np.arange(settings.length, dtype=dtype))
+    ahead, behind = rows @ spin, rows @ jnp.conj(spin)
+    here = reply * _low_pass(settings, turn) * _turn(angle * begins.astype(dtype))[:, None]
+    power = jnp.mean(jnp.abs(0.5 * (here * ahead - jnp.conj(here) * behind)) ** 2, axis=0)
+    return power, jnp.var(jnp.imag(reply * _turn(angle * np.arange(start, stop, dtype=dtype))))
+
+
+def _enveloped_line(
+    task: AbstractTask, system: Linearisation, settings: SpectrumSettings, window: tuple[float, float]
+) -> tuple[Float[Array, " bins"], Float[Array, ""]]:
+    """The same for an envelope that changes: the deterministic response, slow in the frame that turns with the harmonic.
+
+    `Y' = (A - iω) Y + B b a(t)` for y = Im(Y e^{i(ωt + φ)}) is stepped exactly for an envelope a linear between samples,
+    from the steady state of its value at t = 0.
+    """
+    harmonic, base, dtype = task.harmonic, task.harmonic_base(), system.A.dtype
+    omega, interval = 2 * jnp.pi * jnp.asarray(harmonic.frequency, dtype), 1 / settings.rate
+    start, stop = (round(edge * settings.rate) for edge in window)
+    time = jnp.arange(stop, dtype=dtype) * interval
+    level, slope = jax.vmap(lambda t: jax.jvp(harmonic.envelope, (t,), (jnp.ones_like(t),)))(time)
+    whirl = _times_i(omega)
+    n, drive = len(system.A), (system.B @ base).astype(whirl.dtype)
+    turning = system.A.astype(whirl.dtype) - whirl * jnp.eye(n, dtype=whirl.dtype)
+    blocks = jnp.zeros((n + 2, n + 2), whirl.dtype)
+    blocks = blocks.at[:n, :n].set(turning * interval).at[:n, n].set(drive * interval).at[n, n + 1].set(1.0)
+    whole = jax.scipy.linalg.expm(blocks)
+    step, held, ramp = whole[:n, :n], whole[:n, n], whole[:n, n + 1]
+
+    def advance(Y, pair):
+        Y = step @ Y + held * pair[0] + ramp * (pair[1] - pair[0])
+        return Y, Y
+
+    pairs = jnp.stack([level[:-1], level[1:]], axis=1).astype(whirl.dtype)
+    first = -jnp.linalg.solve(turning, drive * pairs[0, 0])
+    _, later = jax.lax.scan(advance, first, pairs)
+    Y = jnp.concatenate([first[None], later])
+    around = _turn(omega * time + jnp.asarray(harmonic.phase, dtype)) * _sample_mean(omega * interval, settings.sampling)
+    through, ahead = system.D @ base, system.E @ base
+    direct = jax.lax.complex(through * level + ahead * slope, ahead * omega * level)
+    z = jnp.asarray(harmonic.amplitude, dtype) * jnp.imag((Y @ system.C.astype(Y.dtype) + direct) * around)
+    return jnp.asarray(spectrum_of(z, settings, window).power), jnp.var(z[start:stop])
+
+
+def response(task: AbstractTask, settings: SpectrumSettings, window: tuple[float, float]) -> tuple[Moments, Linearisation]:
+    """Expected moments of the linearised task in the window, and the linearisation. Not finite where it is unstable."""
+    system = linearise(task)
+    samples = round(window[1] * settings.rate) - round(window[0] * settings.rate)
+    operator = covariance_operator(settings)
+    lags = max(operator.shape[1], samples)
+    r = _autocovariance(_covariances(task, system), 1 / settings.rate, lags, settings.sampling)
+    noise = jnp.asarray(operator, r.dtype) @ r[: operator.shape[1]]
+    weights = np.where(np.arange(samples) == 0, 1.0, 2.0) * (samples - np.arange(samples)) / samples**2
+    line, swing = _line(task, system, settings, window)
+    variance = r[0] - jnp.asarray(weights, r.dtype) @ r[:samples] + swing
+    return Moments(noise + line, line, system.rest, variance), system
+
+
+@eqx.filter_jit
+def expected_moments(
+    task: AbstractTask, settings: SpectrumSettings, window: tuple[float, float]
+) -> tuple[Moments, Linearisation]:
+    """`response`, compiled."""
+    return response(task, settings, window)
+
+
+def expected_spectrum(
+    task: AbstractTask, settings: SpectrumSettings | None = None, window: tuple[float, float] = WINDOW
+) -> Spectrum:
+    """The expected Welch spectrum of a task's output, to first order in its perturbations: no Monte Carlo.
+
+        E_k = Σ_l M_kl r(l Δ) + line_k,    r(τ) = c exp(𝒜 τ) P cᵀ,    𝒜 P + P 𝒜ᵀ + 𝒬 = 0
+
+    𝒜 is the task linearised about its equilibrium together with the filters that shape the noise; M holds window,
+    detrending and low-pass (`covariance_operator`), Δ is the sampling interval, so that aliases are part of it; line_k is
+    the harmonic's response with phase and leakage, all its channels added coherently. The estimate's mean for a process
+    that has forgotten its start; exact where the response is linear, as it is within 0.2 % at human force fluctuations.
+
+    **Arguments:** `task`; `settings` (the task's own by default); the analysed `window` [s] (only the harmonic's phase
+    and an envelope that changes depend on it).
+
+    **Returns:** a `Spectrum`, power [unit²/Hz] of shape (bins,); differentiable, also under `jit` and `vmap`.
+
+    **Raises:** `OperatingPointError` (a `ValueError`) without a stable, damped equilibrium; `ValueError` for a harmonic
+    beyond half the sampling rate and for a task without noise and harmonic. Under a transformation, where values cannot
+    be looked at, the result is not finite instead.
+    """
+    settings = task.settings if settings is None else settings
+    concrete = all(is_concrete(leaf) for leaf in jax.tree.leaves(task))
+    if concrete:
+        check_line(task, settings)
+    moments, system = expected_moments(as_arrays(task), settings, window)
+    if concrete:
+        check_equilibrium(task, np.asarray(system.point), np.asarray(system.A))
+        if not np.any(np.asarray(moments.power) > 0):
+            raise ValueError(f"the expected spectrum of this {type(task).__name__} is zero: it has neither noise nor a "
+                             f"harmonic that moves {task.output_name}; set noise_K_w, say")  # fmt: skip
+    frequency = jnp.asarray(settings.frequency, moments.power.dtype)
+    return Spectrum(frequency, moments.power, settings, task.output_unit)
+
+
+def check_line(task: AbstractTask, settings: SpectrumSettings) -> None:
+    """Refuse a harmonic that sampling would fold to another frequency."""
+    frequency = float(task.harmonic.frequency)
+    if frequency >= settings.rate / 2 and float(task.harmonic.amplitude) > 0:
+        raise ValueError(f"harmonic_frequency = {frequency} Hz is not below half the sampling rate of {settings.rate} Hz: "
+                         "raise rate, or set harmonic_amplitude = 0")  # fmt: skip

@@ -1,0 +1,161 @@
+"""What a fit minimises: residuals of a model's moments against a target, and how the problem is set up."""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ._expected import Moments
+from ._law import Scalar
+from ._objective import Coordinates, Linear, MonteCarlo, at
+from ._operating import fastest_rate
+from ._parameter import as_arrays
+from ._path import Grid
+from ._simulate import DURATION, MAX_RATE_STEP, draw, whole
+from ._target import Target
+from ._task import AbstractTask
+from ._trajectory import WINDOW
+from ._uncertainty import BinStatistics, bin_statistics, shares_map
+
+MOST_SUBSTEPS = 16
+
+
+class Problem(eqx.Module):
+    """Everything that the residuals of a fit depend on besides the free coordinates."""
+
+    task: AbstractTask
+    coordinates: Coordinates
+    model: Linear | MonteCarlo
+    target: Float[Array | np.ndarray, " bins"]
+    statistics: BinStatistics
+    sigma: Float[Array | np.ndarray, " bins"]
+    prior: Float[Array | np.ndarray, " free"]
+    moving: Float[Array | np.ndarray, " free"]
+    extra: tuple[tuple[Scalar, Scalar] | None, tuple[Scalar, Scalar] | None]
+    residual: str = eqx.field(static=True)
+
+    def moments(self, theta: Float[Array, " free"]) -> Moments:
+        """Moments of the model at θ."""
+        return self.model.moments(at(self.task, self.coordinates, theta))
+
+    def data_residuals(self, moments: Moments) -> Float[Array, " residuals"]:
+        """Residuals in standard deviations of the data: spectrum, then coefficient of variation and mean force."""
+        rows = [jnp.asarray(self._spectrum_residuals(moments))]
+        variation, mean = self.extra
+        if variation is not None:
+            rows.append((jnp.log(moments.variation) - variation[0])[None] / variation[1])
+        if mean is not None:
+            rows.append((moments.mean - mean[0])[None] / mean[1])
+        return jnp.concatenate(rows)
+
+    def _spectrum_residuals(self, moments: Moments) -> Float[Array | np.ndarray, " bins"]:
+        if self.residual == "log":
+            z = jnp.log(self.target) - self.statistics.bias - jnp.log(moments.power)
+            return (z - jnp.mean(z)) / self.statistics.sd
+        difference = self.target - moments.proportional
+        if self.residual == "linear":
+            return difference / self.sigma
+        return jnp.cumsum(difference)[:-1] / self.sigma[:-1]
+
+    def residuals(self, s: Float[Array, " free"]) -> Float[Array, " all"]:
+        """Data residuals, then those of the prior; what is not `moving` (1, else 0) stays where it starts."""
+        s = jnp.where(self.moving > 0, s, jax.lax.stop_gradient(s))
+        theta = self.coordinates.theta(s)
+        return jnp.concatenate([self.data_residuals(self.moments(theta)), jnp.sqrt(self.prior) * theta])
+
+
+def residual_sigma(kind: str, target: Target, statistics: BinStatistics) -> Float[np.ndarray, " bins"]:
+    """What the linear and the cumulative residual are divided by: standard deviations of p_k or of its running sum."""
+    p = target.proportional_power
+    if kind == "linear" and target.sigma is not None and target.segments is None:
+        return np.asarray(target.sigma)
+    spread = shares_map(p) @ statistics.covariance @ shares_map(p).T
+    if kind == "cumulative":
+        summed = np.tril(np.ones((len(p), len(p))))
+        spread = summed @ spread @ summed.T
+    return np.sqrt(np.maximum(np.diag(spread), 1e-300))
+
+
+@dataclasses.dataclass(frozen=True)
+class Setup:
+    """The arguments of a fit, checked; makes the problem for a number of seeds."""
+
+    task: AbstractTask
+    target: Target
+    coordinates: Coordinates
+    prior: np.ndarray
+    extra: tuple
+    residual: str
+    method: str
+    dt: float
+    key: Any
+    seeds: int
+    control: bool
+    tell: Callable[[str, float], None]
+
+    @property
+    def steps_per_sample(self) -> int:
+        """Steps of the noise grid per sampling interval. Raises `ValueError` if dt does not divide it."""
+        interval = 1 / self.target.settings.rate
+        return whole(interval / self.dt, f"dt = {self.dt} s does not divide the sampling interval {interval} s")
+
+    def linear(self, line_share: np.ndarray | None = None, correction: Moments | None = None) -> Problem:
+        """The problem in linear response, times a correction of its moments."""
+        chosen = self.target.bins - self.target.settings.first_bin
+        if correction is None:
+            ones = np.ones(len(chosen))
+            correction = Moments(ones, ones, np.ones(()), np.ones(()))
+        return self._with_model(Linear(chosen, jax.tree.map(jnp.asarray, correction), WINDOW), line_share)
+
+    def montecarlo(self, seeds: int, line_share: np.ndarray | None = None) -> Problem:
+        """The problem on the first `seeds` noise paths."""
+        task, settings, every = as_arrays(self.task), self.target.settings, self.steps_per_sample
+        self.task.noise.check_step(self.dt)
+        grid = Grid(self.dt, every * round(DURATION * settings.rate), every, 1, reverse=False)
+        normals = draw(task.noise, jax.random.fold_in(self.key, 0), jnp.arange(seeds), grid.steps)
+        colour = any(name in ("noise_cutoff", "noise_correlation_time") for name in self.coordinates.names)
+        chosen = self.target.bins - settings.first_bin
+        model = MonteCarlo.of(task, normals, grid, chosen, WINDOW, colour_free=colour, control=self.control)
+        return self._with_model(model, line_share)
+
+    def _with_model(self, model: Linear | MonteCarlo, line_share: np.ndarray | None) -> Problem:
+        statistics = bin_statistics(self.target, line_share)
+        given = {
+            "target": self.target.proportional_power,
+            "statistics": statistics,
+            "sigma": residual_sigma(self.residual, self.target, statistics),
+            "prior": self.prior,
+            "moving": np.ones(len(self.prior)),
+            "extra": self.extra,
+        }
+        arrays = as_arrays(given)
+        return Problem(as_arrays(self.task), self.coordinates, model, **arrays, residual=self.residual)
+
+    def finer(self, problem: Problem, points: np.ndarray) -> Problem:
+        """The problem with as many sub-steps as the stiffest of the points asks for; never fewer than it has."""
+        if isinstance(problem.model, Linear):
+            return problem
+        fastest = 0.0
+        for s in points:
+            theta = np.asarray(self.coordinates.theta(s))
+            rate = _rate(problem.task, self.coordinates, theta)
+            fastest = max(fastest, rate if np.isfinite(rate) else 0.0)
+        needed = 2 ** int(np.ceil(np.log2(max(fastest * self.dt / MAX_RATE_STEP, 1.0))))
+        needed = min(needed, MOST_SUBSTEPS)
+        grid = problem.model.grid
+        if needed <= grid.substeps:
+            return problem
+        grid = Grid(grid.dt, grid.steps, grid.every, needed, reverse=False)
+        return eqx.tree_at(lambda p: p.model.grid, problem, grid, is_leaf=lambda x: isinstance(x, Grid))
+
+
+def _rate(task: AbstractTask, coordinates: Coordinates, theta: np.ndarray) -> float:
+    try:
+        return fastest_rate(at(task, coordinates, jnp.asarray(theta)), DURATION)
+    except ValueError:
+        return np.nan
