@@ -1,6 +1,8 @@
 .POSIX:
 PYTHON ?= python3
 BIN = .venv/bin
+# Two workers, whatever the machine: each compiles a lot and takes up to 5 GiB.
+PYTEST = $(BIN)/python -m pytest -q -n 2 --dist loadfile
 PIP = $(BIN)/python -m pip --quiet --disable-pip-version-check install
 
 .PHONY: help fit test test-fast bench clean
@@ -20,10 +22,10 @@ test: .venv/.stamp-test
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
 	$(BIN)/basedpyright
-	$(BIN)/python -m pytest -q
+	$(PYTEST)
 
 test-fast: .venv/.stamp-test
-	$(BIN)/python -m pytest -q -m "not slow"
+	$(PYTEST) -m "not slow"
 
 bench: .venv/.stamp-bench
 	$(BIN)/python benchmarks/run.py --out out/bench.json
