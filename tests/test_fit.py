@@ -423,6 +423,16 @@ def test_bad_arguments_are_named(arguments, message):
         jm.fit(jm.Isometric(), simple_target(), **arguments)
 
 
+def test_a_task_that_does_not_fluctuate():
+    still = jm.Isometric(noise=jm.BandLimitedNoise(0.0), harmonic=jm.Harmonic(amplitude=0.0))
+    with pytest.raises(ValueError, match="neither noise nor a harmonic"):
+        jm.fit(still, simple_target(), free=("c_w",), **QUICK)
+    result = jm.fit(still.replace(noise_C_w=0.01), simple_target(), free=("c_w",), **QUICK)
+    assert not result.success and "noise on C does nothing at rest" in result.message
+    with pytest.raises(ValueError, match=r"harmonic_frequency = 60.0 Hz is not below half the sampling rate"):
+        jm.fit(jm.Isometric(), simple_target(), fix={"harmonic_frequency": 60.0}, **QUICK)
+
+
 def test_fewer_bins_than_parameters():
     few = jm.Target("few", np.full(5, 0.2), bins=np.arange(1, 6), segments=12)
     with pytest.raises(ValueError, match=r"5 bins cannot determine 8 free parameters \(k_w, .*fix some"):

@@ -118,6 +118,8 @@ def fit(
     _check_names("priors", priors or {}, names)
     _check_names("bounds", bounds or {}, names)
     check_line(task, target.settings)
+    if not (np.any(np.asarray(task.noise.amplitude) > 0) or float(task.harmonic.amplitude) > 0):
+        raise ValueError("the task has neither noise nor a harmonic, so its spectrum is zero: set noise_K_w, say")
     control = has_response(task, required=method == "linear")
     starts, seeds = starts or (100 if control else 8), seeds or (32 if control else 48)
     check_seeds = check_seeds or (64 if control else 200)

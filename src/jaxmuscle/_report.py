@@ -72,6 +72,9 @@ def report_fit(
               "settings": settings, "versions": versions()}  # fmt: skip
     if not np.isfinite(final.cost[final.best]):
         reason = "no start has a finite spectrum: the model explodes there; lower the noise or damping of the task"
+        if setup.method == "linear":
+            reason = ("no start has a finite spectrum in linear response: there is no stable equilibrium, or no noise that "
+                      f"moves {setup.task.output_name} (noise on C does nothing at rest)")  # fmt: skip
         return _failed(setup, common, reason)
     theta = best_theta(setup, final)
     (moments, residuals, _), (_, jacobian, found_slopes) = linearised_at(problem, jnp.asarray(theta))

@@ -70,6 +70,8 @@ def _linear(setup: Setup, points: np.ndarray, max_steps: int, stages: list[Stage
     """All starts in linear response, the best of them with the line's share known, then the nonlinear correction."""
     problem = setup.linear()
     first = in_batches(problem, points, max_steps, _stage(setup, stages, problem, "trying starts", (0.05, 0.5), max_steps))
+    if not np.isfinite(first.cost[first.best]):
+        return
     best = first.s[contenders(setup.coordinates, setup.target, first, RIVAL_MARGIN)[:BATCH]]
     share = _share(problem, best[0])
     problem = setup.linear(share)
@@ -119,6 +121,8 @@ def _montecarlo(setup: Setup, points: np.ndarray, max_steps: int, stages: list[S
         problem = setup.montecarlo(max(8, setup.seeds // 3))
         show = _stage(setup, stages, problem, "trying starts", (0.05, 0.4), FIRST_STEPS)
         first = descend(problem, points, FIRST_STEPS, prepare=setup.finer, report=show)
+    if not np.isfinite(first.cost[first.best]):
+        return
     best = first.s[contenders(setup.coordinates, setup.target, first, RIVAL_MARGIN)[:MOST_RIVALS]]
     share = _share(problem, best[0])
     problem = setup.finer(setup.montecarlo(setup.seeds, share), best)
