@@ -1,7 +1,8 @@
 """The paper's Figure 4a: Task 1 with the paper's noise and harmonic frequency, reconstructed from the text.
 
 This is the fit behind the preset `zagrodny-slifkin`; `--preset FILE` writes it (four significant digits). The masses,
-reference displacements and the starting values come from an earlier search by hand; noise amplitudes and harmonic frequency are the paper's and stay fixed.
+reference displacements and the starting values come from an earlier search by hand; noise amplitudes and harmonic
+frequency are the paper's and stay fixed.
 """
 
 import argparse
