@@ -18,25 +18,29 @@ class Unequal(Exception):
 
 @dataclasses.dataclass(frozen=True)
 class Row:
-    """One number; a ratio says to what (`ratio_to`), and what it should reach (`target`) if anything is asked."""
+    """One number; a ratio says to what (`ratio_to`); `target`, if anything is asked, is to be reached, or kept `at_most`."""
 
     name: str
     value: float
     unit: str
     ratio_to: str | None = None
     target: float | None = None
+    at_most: bool = False
 
     @property
     def met(self) -> bool | None:
         """Whether the target was reached; None without one."""
-        return None if self.target is None else self.value >= self.target
+        if self.target is None:
+            return None
+        return self.value <= self.target if self.at_most else self.value >= self.target
 
     def as_dict(self) -> dict[str, Any]:
         """The row as the JSON file holds it."""
         return dataclasses.asdict(self) | {"met": self.met}
 
     def __str__(self) -> str:
-        verdict = {None: "", True: f"  >= {self.target}: met", False: f"  >= {self.target}: MISSED"}[self.met]
+        asked = f"  {'<=' if self.at_most else '>='} {self.target}: "
+        verdict = {None: "", True: asked + "met", False: asked + "MISSED"}[self.met]
         versus = "" if self.ratio_to is None else f"  of {self.ratio_to}"
         return f"{self.name:<64}{self.value:>10.4g}  {self.unit}{versus}{verdict}"
 

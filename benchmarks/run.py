@@ -11,8 +11,11 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import alternative
+import fits
 import integration
 import jax
+import linear
 import usage
 from measure import DTYPES, Row, Unequal
 
@@ -22,9 +25,14 @@ SECTIONS: dict[str, Callable[[int], list[Row]]] = {
     "white": lambda n: integration.rows("white", n),
     "band-limited": lambda n: integration.rows("band-limited", n),
     "stock": lambda n: integration.rows("stock", n),
+    "expected": linear.expected,
+    "control": linear.control,
     "ensemble": usage.ensembles,
     "gradient": usage.gradients,
-    "fit": lambda n: usage.fits(),
+    "fit": lambda n: fits.fits(),
+    "starts": fits.starts,
+    "alternative": lambda n: alternative.rows(),
+    "cold": lambda n: fits.cold(),
 }
 
 

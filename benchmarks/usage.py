@@ -1,4 +1,4 @@
-"""Rows 4 and 5: what a user waits for. Fits, compilation, ensembles, gradients."""
+"""Row 5: what a user of simulations waits for. Compilation, ensembles, gradients."""
 
 import time
 
@@ -14,31 +14,7 @@ from jaxmuscle._parameter import DEFAULT_FREE, as_arrays
 from jaxmuscle._path import Grid
 from jaxmuscle._simulate import draw, respond
 
-TARGETS = ("vastus-lateralis-26mvc", "fdi-abduction-45mvc")
-NOISES = ("band-limited", "ornstein-uhlenbeck")
 GRADIENT_SEEDS = 8
-
-
-def fits() -> list[Row]:
-    """Row 4: every measured target with two noises, the second of two equal calls timed."""
-    found: list[Row] = []
-    print(f"{'chi2 per bin (warm wall time)':<32}" + "".join(f"{noise:>24}" for noise in NOISES))
-    for name in TARGETS:
-        print(f"{name:<32}", end="", flush=True)
-        target = jm.load_target(name)
-        for noise in NOISES:
-            task = jm.task_for(target, noise=noise)
-            jm.fit(task, target)
-            start = time.perf_counter()
-            result = jm.fit(task, target)
-            wall = time.perf_counter() - start
-            chi2 = np.nan if result.chi2_per_bin is None else result.chi2_per_bin
-            found += [Row(f"fit {name}, {noise}: chi2 per bin", float(chi2), "1 (expected: about 0.7)")]
-            found += [Row(f"fit {name}, {noise}: warm wall time", wall, "s")]
-            cell = f"{chi2:.2f} ({wall:.0f} s)" + ("" if result.success else ", failed")
-            print(f"{cell:>24}", end="", flush=True)
-        print()
-    return found
 
 
 def ensembles(repetitions: int) -> list[Row]:

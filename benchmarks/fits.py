@@ -1,0 +1,95 @@
+"""What a user of fits waits for: a fit, its search from many starts, the command in a cold process."""
+
+import os
+import subprocess
+import sys
+import tempfile
+import time
+
+import jax
+import numpy as np
+from measure import Row, seconds
+
+import jaxmuscle as jm
+from jaxmuscle._descend import in_batches
+from jaxmuscle._fit import DT, free_names
+from jaxmuscle._objective import Coordinates
+from jaxmuscle._parameter import PARAMETERS, as_numbers
+from jaxmuscle._problem import Setup
+from jaxmuscle._starts import starting_points
+from jaxmuscle._uncertainty import target_variation
+
+TARGETS = ("vastus-lateralis-26mvc", "fdi-abduction-45mvc")
+NOISES = ("band-limited", "ornstein-uhlenbeck")
+STARTS, MAX_STEPS, SEEDS = 100, 40, 32
+NEAR = 1e-3
+CHI2, SEARCH, FOUND_AGAIN, COLD, WARM = 1.2, 6.0, 10, 45.0, 15.0
+
+
+def fits() -> list[Row]:
+    """Every measured target with two noises, the second of two equal calls timed; the first noise is the default."""
+    found: list[Row] = []
+    print(f"{'chi2 per bin (warm wall time)':<32}" + "".join(f"{noise:>24}" for noise in NOISES))
+    for name in TARGETS:
+        print(f"{name:<32}", end="", flush=True)
+        target = jm.load_target(name)
+        for noise in NOISES:
+            task = jm.task_for(target, noise=noise)
+            jm.fit(task, target)
+            start = time.perf_counter()
+            result = jm.fit(task, target)
+            wall = time.perf_counter() - start
+            chi2 = np.nan if result.chi2_per_bin is None else result.chi2_per_bin
+            group, asked = f"fit {name}, {noise}", CHI2 if noise == NOISES[0] else None
+            found += [Row(f"{group}: chi2 per bin", float(chi2), "1 (expected: about 0.7)", target=asked, at_most=True)]
+            found += [Row(f"{group}: warm wall time", wall, "s")]
+            cell = f"{chi2:.2f} ({wall:.0f} s)" + ("" if result.success else ", failed")
+            print(f"{cell:>24}", end="", flush=True)
+        print()
+    return found
+
+
+def _setup(target: jm.Target) -> Setup:
+    """What `jm.fit(jm.task_for(target), target)` sets up."""
+    task = as_numbers(jm.task_for(target))
+    names = free_names(task, None, {}, len(target.bins))
+    values, sds = ({n: float(x[n]) for n in names} for x in (task, {n: PARAMETERS[n].prior_sd for n in names}))
+    extra = (target_variation(target), None)
+    return Setup(task, target, Coordinates.of(values, {}, sds), np.ones(len(names)), extra, "log", "linear", DT,
+                 jax.random.key(0), SEEDS, True, lambda text, share: None)  # fmt: skip
+
+
+def starts(repetitions: int) -> list[Row]:
+    """The search of a default fit: every start to its minimum in linear response, and how many end in the best one."""
+    found: list[Row] = []
+    for name in TARGETS:
+        with jax.enable_x64(True):
+            setup = _setup(jm.load_target(name))
+            points = starting_points(setup.coordinates, setup.target, STARTS)
+            program = lambda s=setup, p=points: in_batches(s.linear(), p, MAX_STEPS, lambda descent: None)  # noqa: E731
+            wall, busy = (float(np.median(t)) for t in seconds({"search": program}, min(repetitions, 5))["search"])
+            cost = program().cost
+        again = int(np.sum(cost <= (1 + NEAR) * np.nanmin(cost)))
+        found += [
+            Row(f"{STARTS} starts, {name}: warm wall time", wall, "s", target=SEARCH, at_most=True),
+            Row(f"{STARTS} starts, {name}: processor time", busy, "s"),
+            Row(f"{STARTS} starts, {name}: within {100 * NEAR:g} % of the best cost", again, "starts", target=FOUND_AGAIN),
+        ]
+    return found
+
+
+def cold() -> list[Row]:
+    """`jaxmuscle fit` of a bundled target in a new process, without and with compiled programs on disk."""
+    found: list[Row] = []
+    with tempfile.TemporaryDirectory() as folder:
+        environment = os.environ | {"JAX_COMPILATION_CACHE_DIR": os.path.join(folder, "cache")}
+        command = [sys.executable, "-m", "jaxmuscle._cli", "fit", TARGETS[0], "--out", os.path.join(folder, "fit")]
+        for state, limit in (("an empty", COLD), ("a warm", WARM)):
+            group = f"jaxmuscle fit, new process, {state} compilation cache"
+            start, before = time.perf_counter(), os.times()
+            subprocess.run(command, env=environment, stdout=subprocess.DEVNULL, check=True)
+            wall, after = time.perf_counter() - start, os.times()
+            busy = sum(after[2:4]) - sum(before[2:4])
+            found += [Row(f"{group}: wall time", wall, "s", target=limit, at_most=True)]
+            found += [Row(f"{group}: processor time", busy, "s")]
+    return found
