@@ -1,0 +1,497 @@
+"""The expected spectrum: against quadrature of hand-derived transfer functions, scipy, simulation; derivatives, errors."""
+
+import functools
+from typing import ClassVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import references
+import scipy.linalg
+import scipy.optimize
+import scipy.signal
+
+import jaxmuscle as jm
+from jaxmuscle._expected import covariance_operator, expected_moments
+from jaxmuscle._linear import has_response
+from jaxmuscle._parameter import as_arrays
+
+KEY = jax.random.key(31)
+WINDOW = (5.0, 15.0)
+Settings = jm.SpectrumSettings
+
+
+def root(function):
+    return scipy.optimize.brentq(function, -1.0, 1.0, xtol=1e-16, rtol=1e-15)
+
+
+def coefficients(p, x_w, x_z):
+    """At rest: K_w's tangent, K_z, C_w, C_z."""
+    K_w = p["k_w"] * (p["x_ref_w"] ** 2 + 3 * x_w**2)
+    K_z = p["k_z"] * (p["x_ref_z"] ** 2 + x_z**2)
+    return K_w, K_z, p["c_w"] * p["v_ref_w"] ** 2, p["c_z"] * p["v_ref_z"] ** 2
+
+
+def active(p, x):
+    return p["k_w"] * (p["x_ref_w"] ** 2 + x**2) * x
+
+
+def isometric(p, s):
+    """Responses of F_ext to N_Kw and N_Kz by equation (1a) with x_z held, and F_ext at rest."""
+    held = p["x_z"]
+    K_z = coefficients(p, 0.0, held)[1]
+    x = root(lambda x: active(p, x) + K_z * (x - held) - p["P_w"])
+    K_w, _, C_w, C_z = coefficients(p, x, held)
+    passive = (C_z * s + K_z) / (p["m_w"] * s**2 + (C_w + C_z) * s + K_w + K_z)
+    return -x * passive, (x - held) * (1 - passive), K_z * (x - held)
+
+
+def prescribed_force(p, s):
+    """Responses of x_z by (1a) and (1b), solved by Cramer's rule; K_z at x_z as printed, so its tangent is not K_z."""
+    x_w = root(lambda x: active(p, x) + p["F_ext"] - p["P_w"])
+    x_z = root(lambda z: coefficients(p, x_w, z)[1] * (z - x_w) + p["F_ext"])
+    K_w, K_z, C_w, C_z = coefficients(p, x_w, x_z)
+    tangent = K_z + 2 * p["k_z"] * x_z * (x_z - x_w)
+    inner, link = p["m_w"] * s**2 + (C_w + C_z) * s + K_w + K_z, C_z * s + K_z
+    outer, back = p["m_z"] * s**2 + C_z * s + tangent, C_z * s + tangent
+    determinant = inner * outer - back * link
+    return -link * x_w / determinant, (x_z - x_w) * (link - inner) / determinant, x_z
+
+
+def prescribed_motion(p, s):
+    """Responses of P_w: (1b) gives x_w, (1a) then P_w."""
+    K_z = coefficients(p, 0.0, p["x_z"])[1]
+    x = p["x_z"] + p["F_ext"] / K_z
+    K_w, _, C_w, C_z = coefficients(p, x, p["x_z"])
+    along = (p["x_z"] - x) / (C_z * s + K_z)
+    return x + 0 * s, along * (p["m_w"] * s**2 + C_w * s + K_w), active(p, x) + p["F_ext"]
+
+
+RESPONSES = {"Isometric": isometric, "PrescribedForce": prescribed_force, "PrescribedMotion": prescribed_motion}
+
+
+def stiffness(p):
+    return p["k_w"] * p["x_ref_w"] ** 2, p["k_z"] * p["x_ref_z"] ** 2
+
+
+def density(task, p, settings, f):
+    """Two-sided density of the output's noise before sampling."""
+    H_w, H_z, _ = RESPONSES[type(task).__name__](p, 2j * np.pi * f)
+    from_w, from_z = (p[f"noise_{n}"] * K * H for n, K, H in zip(("K_w", "K_z"), stiffness(p), (H_w, H_z), strict=True))
+    gain = np.abs(from_w + from_z) ** 2 if task.noise.shared else np.abs(from_w) ** 2 + np.abs(from_z) ** 2
+    match task.noise:
+        case jm.WhiteNoise():
+            shape = 1 / p["noise_rate"]
+        case jm.BandLimitedNoise():
+            shape = 1 / p["noise_rate"] / (1 + (f / p["noise_cutoff"]) ** 4)
+        case _:
+            tau = p["noise_correlation_time"]
+            shape = 2 * tau / (1 + (2 * np.pi * f * tau) ** 2)
+    averaged = np.sinc(f / settings.rate) ** 2 if settings.sampling == "average" else 1.0
+    return gain * shape * averaged
+
+
+REACH = 100
+
+
+def sampled(density, rate, f):
+    """Density of the sampled signal, the aliases beyond REACH as the integral over their power law."""
+    total = references.aliased(density, rate, f, REACH)
+    for sign in (-1, 1):
+        near, far = f + sign * (REACH + 1) * rate, f + 2 * sign * (REACH + 1) * rate
+        edge = np.abs(f + sign * (REACH + 0.5) * rate)
+        at_near, at_far = density(near), density(far)
+        seen = at_near > 0
+        power = np.log(at_near[seen] / at_far[seen]) / np.log(far[seen] / near[seen])
+        total[seen] += at_near[seen] * (np.abs(near[seen]) / edge[seen]) ** power * edge[seen] / ((power - 1) * rate)
+    return total
+
+
+# The rest is a midpoint rule for Σ m^-2 from REACH on, which is 1 / 12 REACH³ = 8e-8 of the aliases, themselves at most
+# ten times what lies below half the sampling rate.
+ALIASES = 1e-6
+
+
+def detrended(x, settings):
+    """Along the first axis, for complex segments, too."""
+    if settings.detrend == "none":
+        return x
+    return sum(f * scipy.signal.detrend(part, 0, settings.detrend) for f, part in ((1, x.real), (1j, x.imag)))
+
+
+def low_pass(settings, f):
+    if settings.filter_cutoff is None:
+        return np.ones_like(f, dtype=complex)
+    sos = scipy.signal.butter(settings.filter_order, settings.filter_cutoff, fs=settings.rate, output="sos")
+    gain = scipy.signal.sosfreqz(sos, f, fs=settings.rate)[1]
+    return np.abs(gain) ** 2 if settings.filter_direction == "both" else gain
+
+
+def welch_by_scipy(x, settings):
+    """Along the first axis."""
+    cut = {"nperseg": settings.length, "noverlap": settings.length - settings.step}
+    detrend = False if settings.detrend == "none" else settings.detrend
+    power = scipy.signal.welch(x, settings.rate, settings.window, **cut, detrend=detrend, axis=0)[1]
+    return power[settings.first_bin : settings.last_bin + 1]
+
+
+def line_by_scipy(task, settings, window=WINDOW):
+    """Welch power of the harmonic's steady response as a time series, and its variance before the low-pass."""
+    p = {name: float(value) for name, value in task.parameters.items()}
+    f = np.array([p["harmonic_frequency"]])
+    H_w, H_z, _ = RESPONSES[type(task).__name__](p, 2j * np.pi * f)
+    K_w, K_z = stiffness(p)
+    reply = (K_w * H_w + K_z * H_z) * p["harmonic_amplitude"] * np.exp(1j * p["harmonic_phase"])
+    if settings.sampling == "average":
+        reply = reply * np.sinc(f / settings.rate) * np.exp(-1j * np.pi * f / settings.rate)
+    time = np.arange(round(window[0] * settings.rate), round(window[1] * settings.rate)) / settings.rate
+    turning = np.exp(2j * np.pi * f * time)
+    return welch_by_scipy((reply * low_pass(settings, f) * turning).imag, settings), np.var((reply * turning).imag)
+
+
+def by_quadrature(task, settings, points=4096):
+    """Noise, line, mean and variance, all written from the equations.
+
+    Every integrand is periodic in f, so equally spaced points integrate it to what is left of the autocovariance after
+    `points` samples.
+    """
+    p = {name: float(value) for name, value in task.parameters.items()}
+    f = (np.arange(points) / points - 0.5) * settings.rate
+    S = sampled(functools.partial(density, task, p, settings), settings.rate, f)
+    bins, m = np.arange(settings.first_bin, settings.last_bin + 1), np.arange(settings.length)
+    taper = scipy.signal.get_window(settings.window, settings.length)
+    waves = detrended(np.exp(2j * np.pi * np.outer(m, f) / settings.rate), settings) * taper[:, None]
+    kernel = np.abs(np.exp(-2j * np.pi * np.outer(bins, m) / settings.length) @ waves) ** 2
+    sides = np.where((bins == 0) | (2 * bins == settings.length), 1.0, 2.0) / (settings.rate * np.sum(taper**2))
+    noise = sides * (kernel @ (S * np.abs(low_pass(settings, np.abs(f))) ** 2)) * settings.rate / points
+    line, swing = line_by_scipy(task, settings)
+    samples = round((WINDOW[1] - WINDOW[0]) * settings.rate)
+    turn = np.exp(2j * np.pi * f / settings.rate)
+    mean = np.where(f == 0, samples, (turn**samples - 1) / np.where(f == 0, 1, turn - 1)) / samples
+    variance = np.sum(S * (1 - np.abs(mean) ** 2)) * settings.rate / points
+    return noise, line, RESPONSES[type(task).__name__](p, np.zeros(1))[2], variance + swing
+
+
+BOTH = {"K_w": 0.15, "K_z": 0.05}
+ALONE = {"K_w": 0.15}
+RHYTHM = jm.Harmonic(0.003, 4.25, 0.7)
+CASES = {
+    "isometric, band-limited": (jm.Isometric, jm.BandLimitedNoise(BOTH), {}),
+    "isometric, OU": (jm.Isometric, jm.OrnsteinUhlenbeckNoise(BOTH, 0.05), {"filter_direction": "both", "first_bin": 0}),
+    "isometric, white": (jm.Isometric, jm.WhiteNoise(ALONE), {"detrend": "none", "filter_cutoff": None, "last_bin": 128}),
+    "force, band-limited": (jm.PrescribedForce, jm.BandLimitedNoise(BOTH), {}),
+    "force, shared OU": (
+        jm.PrescribedForce,
+        jm.OrnsteinUhlenbeckNoise(BOTH, shared=True),
+        {"rate": 200.0, "length": 100, "sampling": "average"},
+    ),
+    "force, white": (jm.PrescribedForce, jm.WhiteNoise(BOTH), {"window": "hamming", "overlap": 0.3}),
+    "motion, band-limited": (jm.PrescribedMotion, jm.BandLimitedNoise(BOTH), {}),
+    "motion, shared": (
+        jm.PrescribedMotion,
+        jm.BandLimitedNoise(BOTH, cutoff=20.0, shared=True),
+        {"filter_direction": "both", "detrend": "linear", "sampling": "average"},
+    ),
+}
+INPUTS = {jm.Isometric: (5.0, 0.003), jm.PrescribedForce: (5.0, 1.0), jm.PrescribedMotion: (0.004, 6.0)}
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_closed_form_is_the_quadrature_of_the_transfer_functions(x64, name):
+    kind, noise, changes = CASES[name]
+    settings = Settings().replace(**changes)
+    task = kind(*INPUTS[kind], noise=noise, harmonic=RHYTHM)
+    moments, _ = expected_moments(as_arrays(task), settings, WINDOW)
+    noise, line, mean, variance = by_quadrature(task, settings)
+    np.testing.assert_allclose(moments.power, noise + line, rtol=ALIASES)
+    np.testing.assert_allclose(moments.line, line, rtol=1e-8, atol=1e-12 * line.max())  # rounding, of the peak far from it
+    np.testing.assert_allclose(moments.mean, mean, rtol=1e-10)
+    np.testing.assert_allclose(moments.variance, variance, rtol=ALIASES)
+    np.testing.assert_array_equal(jm.expected_spectrum(task, settings).power, moments.power)
+
+
+@pytest.mark.parametrize("phase", [0.0, np.pi / 2])
+def test_phase_of_a_slow_harmonic(x64, phase):
+    """At 0.5 Hz the leakage from negative frequencies depends on the phase; a segment starts it anew."""
+    task = references.quiet(jm.Isometric(5.0, 0.003), harmonic_amplitude=1e-5, harmonic_frequency=0.5)
+    settings, window = Settings(), (2.7, 12.7)
+    here, other = (
+        jm.expected_spectrum(task.replace(harmonic_phase=p), settings, window) for p in (phase, phase + np.pi / 2)
+    )
+    expected = line_by_scipy(task.replace(harmonic_phase=phase), settings, window)[0]
+    np.testing.assert_allclose(here.power, expected, rtol=1e-8)
+    assert np.all(np.abs(np.asarray(other.power / here.power)[4:] - 1) > 0.05)
+
+
+ENVELOPES = {
+    "isometric": (jm.Isometric, jm.Harmonic(1e-5, 4.25, 0.7, jm.Decay(1.0, 0.2, 5.0, 3.0)), {}),
+    "force": (jm.PrescribedForce, jm.Harmonic(1e-5, 4.25, 0.7, jm.RampHold(1.0, 6.0, 4.0, 0.5, 0.1)), {}),
+    "motion": (jm.PrescribedMotion, jm.Harmonic(1e-5, 4.25, 0.7, jm.Decay(1.0, 0.2, 5.0, 3.0)), {"sampling": "average"}),
+    "slow": (jm.Isometric, jm.Harmonic(1e-5, 0.5, 1.2), {}),
+}
+# An average over the interval before a sample lags by half of it: Δ a' / 2 a of the amplitude, a' / a = 0.2/s at most.
+LAG = {"motion": 2e-3}
+
+
+@pytest.mark.parametrize("name", [n if n == "isometric" else pytest.param(n, marks=pytest.mark.slow) for n in ENVELOPES])
+def test_line_is_the_spectrum_of_a_noise_free_simulation(x64, name):
+    kind, harmonic, changes = ENVELOPES[name]
+    task = references.quiet(kind(*INPUTS[kind], harmonic=harmonic, settings=Settings().replace(**changes)))
+    power = np.asarray(jm.simulate(jm.settled(task), KEY, dt=5e-4).spectrum().power)
+    # Heun's relative error of a response, (|λ| dt)² / 6 with |λ| <= 120/s; the closed form joins the envelope's samples
+    # by lines, Δ² a'' / 8 = 1e-5 of its size.
+    expected = jm.expected_spectrum(task).power
+    np.testing.assert_allclose(expected, power, rtol=6e-4 + LAG.get(name, 0.0), atol=1e-6 * power.max())
+
+
+def test_an_envelope_that_does_not_change_is_a_constant_one(x64):
+    task = references.quiet(jm.Isometric(5.0, 0.003))
+    still = task.with_parts(harmonic=jm.Harmonic(0.003, 4.25, 0.7, jm.Constant(0.5)))
+    decayed = task.with_parts(harmonic=jm.Harmonic(0.003, 4.25, 0.7, jm.Decay(0.5, 0.5)))
+    # The low-pass starts at t = 0 in one and long before in the other: by 5 s that is forgotten, to rounding.
+    a, b = (jm.expected_spectrum(t).power for t in (still, decayed))
+    np.testing.assert_allclose(a, b, rtol=1e-8, atol=1e-13 * np.max(a))
+
+
+def test_constant_covariance_is_detrended_away():
+    for detrend in ("constant", "linear"):
+        operator = covariance_operator(Settings(detrend=detrend))
+        # Rounding of the sums over the folded lags.
+        assert np.abs(operator.sum(axis=1)).max() < 1e-12 * np.abs(operator).sum(axis=1).max()
+    operator = covariance_operator(Settings(detrend="none", first_bin=0, filter_cutoff=None))
+    taper = scipy.signal.get_window("hann", 256)
+    leak = np.abs(np.fft.rfft(taper)[:31]) ** 2 * np.r_[1.0, np.full(30, 2.0)] / (100.0 * np.sum(taper**2))
+    np.testing.assert_allclose(operator.sum(axis=1), leak, atol=1e-12 * leak.max())
+
+
+WHITE = np.eye(1, 2000)[0]
+RINGING = np.exp(-np.arange(2000) / 20) * np.cos(np.arange(2000) / 3)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {},
+        {"detrend": "linear", "filter_direction": "both"},
+        {"detrend": "none", "first_bin": 0, "filter_cutoff": None},
+        {"window": "boxcar", "filter_order": 4, "filter_cutoff": 10.0, "length": 100, "last_bin": 50},
+        {"window": "hamming", "filter_order": 2, "filter_direction": "both", "rate": 250.0, "length": 75, "first_bin": 0},
+    ],
+    ids=str,
+)
+@pytest.mark.parametrize("covariance", [WHITE, RINGING], ids=["white", "ringing"])
+def test_covariance_operator_is_scipys_expectation(changes, covariance):
+    """x = L e has the covariance L Lᵀ, and its expected power is the sum of the powers of the columns of L."""
+    settings, edge = Settings().replace(**changes), 400
+    samples = settings.length + 2 * edge
+    columns = scipy.linalg.cholesky(scipy.linalg.toeplitz(covariance[:samples]), lower=True)
+    if settings.filter_cutoff is not None:
+        sos = scipy.signal.butter(settings.filter_order, settings.filter_cutoff, fs=settings.rate, output="sos")
+        columns = scipy.signal.sosfilt(sos, columns, axis=0)
+        if settings.filter_direction == "both":
+            columns = scipy.signal.sosfilt(sos, columns[::-1], axis=0)[::-1]
+    expected = welch_by_scipy(columns[edge:-edge], settings).sum(axis=1)
+    operator = covariance_operator(settings)
+    assert operator.shape[1] <= 2000
+    # The impulse responses are cut at 1e-13 of their largest value.
+    np.testing.assert_allclose(operator @ covariance[: operator.shape[1]], expected, rtol=1e-10)
+
+
+def test_settled_tasks_rest(x64):
+    for kind, inputs in INPUTS.items():
+        still = references.quiet(jm.settled(kind(*inputs)), harmonic_amplitude=0.0)
+        output = np.asarray(jm.simulate(still, KEY, duration=1.0).output)
+        np.testing.assert_allclose(output, output[-1], rtol=1e-9)  # the root find stops at 1e-12 m of 1e-2 m
+    start = jax.jit(lambda P: jnp.stack(jm.settled(jm.Isometric(P)).initial))(5.0)
+    np.testing.assert_allclose(start, jm.settled(jm.Isometric(5.0)).initial, rtol=1e-12)
+
+
+DIFFERENTIATED = {
+    "isometric": jm.Isometric(5.0, 0.003, noise=jm.OrnsteinUhlenbeckNoise(0.05)),
+    "force": jm.PrescribedForce(5.0, 1.0, noise=jm.WhiteNoise(0.05)),
+    "motion": jm.PrescribedMotion(0.004, 5.0),
+}
+# At rest nothing moves: noise on damping has no first-order effect, nor has the mass of an insertion that is held.
+SILENT = {"noise_C_w", "noise_C_z"}
+SILENT_IN = {"isometric": SILENT | {"m_z"}, "force": SILENT, "motion": SILENT | {"m_z"}}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", DIFFERENTIATED)
+def test_every_derivative_forward_reverse_and_by_differences(x64, name):
+    task = DIFFERENTIATED[name].replace(harmonic_phase=0.4, harmonic_amplitude=0.003)
+    names = task.parameter_names
+    scale = np.array([float(task[n]) for n in names])
+    assert np.all(scale != 0)
+
+    def log_power(relative):
+        values = {name: x * s for name, x, s in zip(names, relative, scale, strict=True)}
+        return jnp.log(jm.expected_spectrum(task.replace(**values)).power)
+
+    one = np.ones(scale.size)
+    forward = np.asarray(jax.jit(jax.jacfwd(log_power))(one))
+    reverse = np.asarray(jax.jit(jax.jacrev(log_power))(one))
+    h = 1e-5  # truncation h² f''' / 6, and rounding 1e-12 / h of an equilibrium found to 1e-12
+    differences = np.stack([log_power(one + h * e) - log_power(one - h * e) for e in np.eye(one.size)], axis=1) / (2 * h)
+    largest = np.abs(forward).max()
+    np.testing.assert_allclose(reverse, forward, rtol=1e-8, atol=1e-9 * largest)
+    np.testing.assert_allclose(forward, differences, atol=1e-5 * largest)
+    silent = {n for n, column in zip(names, forward.T, strict=True) if np.all(np.abs(column) < 1e-9 * largest)}
+    assert silent == SILENT_IN[name]
+
+
+def test_gradient_by_a_natural_name_under_jit_and_vmap(x64):
+    task = jm.Isometric()
+
+    def last_bin(k_w):
+        return jm.expected_spectrum(task.replace(k_w=k_w)).power[-1]
+
+    k_w, h = np.array([3e5, 5e5, 8e5]), 50.0
+    power, slope = jax.jit(jax.vmap(jax.value_and_grad(last_bin)))(k_w)
+    np.testing.assert_allclose(power, [last_bin(k) for k in k_w], rtol=1e-9)  # rounding, in another order of summation
+    np.testing.assert_allclose(slope, [(last_bin(k + h) - last_bin(k - h)) / (2 * h) for k in k_w], rtol=1e-6)
+
+
+@pytest.mark.parametrize("name", ["isometric, band-limited", "force, band-limited", "motion, band-limited"])
+def test_single_precision(name):
+    kind, noise, _ = CASES[name]
+    task = kind(*INPUTS[kind], noise=noise, harmonic=RHYTHM)
+    single = np.asarray(jm.expected_spectrum(task).power)
+    assert single.dtype == np.float32
+    with jax.enable_x64(True):
+        moments, system = expected_moments(as_arrays(task), task.settings, WINDOW)
+        A, double = np.asarray(system.A), np.asarray(moments.power)
+    # Rounding, of sums over 280 lags and of the Lyapunov equations.
+    condition = np.linalg.cond(np.kron(A, np.eye(len(A))) + np.kron(np.eye(len(A)), A))
+    np.testing.assert_allclose(single, double, rtol=6e-8 * (280 + condition))
+
+
+class Crossbridge(jm.AbstractMuscle):
+    """A user's own muscle: a cubic active and a linear passive tissue. Counts how often it is traced."""
+
+    m_w: float = 0.4
+    m_z: float = 0.6
+    stiffness: float = 300.0
+    damping: float = 40.0
+    looks: ClassVar[list] = []
+
+    def base(self):
+        return jnp.stack([jnp.asarray(v) * 1.0 for v in (self.stiffness, 200.0, self.damping, 5.0)])
+
+    def active_force(self, x_w, v_w, u):
+        self.looks.append(None)
+        return (self.stiffness * (1 + (x_w / 0.03) ** 2) + u[0]) * x_w + (self.damping + u[2]) * v_w
+
+    def passive_force(self, x_w, v_w, x_z, v_z, u):
+        return (200.0 + u[1]) * (x_z - x_w) + (5.0 + u[3]) * (v_z - v_w)
+
+    def contraction_velocity(self, x_w, x_z, v_z, force, u):
+        return v_z - (force - (200.0 + u[1]) * (x_z - x_w)) / (5.0 + u[3])
+
+
+def test_a_users_own_muscle_in_closed_form(x64):
+    """The same muscle out of jaxmuscle's parts: k (x_ref² + x²) with k x_ref² the stiffness and x_ref = 0.03."""
+    inner, outer = jm.QuadraticStiffness(300.0 / 0.03**2, 0.03), jm.QuadraticStiffness(200.0 / 1e8, 1e4)
+    made = jm.Muscle(0.4, 0.6, inner, outer, jm.QuadraticDamping(40.0, 1.0), jm.QuadraticDamping(5.0 / 1e8, 1e4))
+    for kind in INPUTS:
+        theirs, ours = (jm.expected_spectrum(kind(*INPUTS[kind], muscle=m)) for m in (Crossbridge(), made))
+        # x_ref = 1e4 m makes a law constant to 1e-12.
+        np.testing.assert_allclose(theirs.power, ours.power, rtol=1e-8)
+        assert theirs.unit == kind.output_unit
+
+
+AVERAGE = Settings(sampling="average", filter_direction="both")
+SIMULATED = {
+    "own muscle": jm.Isometric(5.0, 0.003, muscle=Crossbridge()),
+    "shared noise": jm.PrescribedForce(5.0, 1.0, noise=jm.BandLimitedNoise(BOTH, shared=True)),
+    "average": jm.PrescribedMotion(0.004, 6.0, settings=AVERAGE),
+}
+
+
+@pytest.mark.slow
+def test_the_mean_of_simulations_is_as_expected(x64):
+    z, window = [], (1.0, 6.12)  # a settled task forgets that it starts without fluctuations, by 1 s to e^-7
+    options = {"seeds": 1000, "duration": window[1], "dt": 1.25e-3, "control": False}
+    for i, task in enumerate(SIMULATED.values()):
+        runs = jm.ensemble(jm.settled(task), jax.random.fold_in(KEY, i), **options)
+        power = np.asarray(runs.spectrum(window=window).power)
+        expected = np.asarray(jm.expected_spectrum(task, window=window).power)
+        z.append((power.mean(axis=0) - expected) / (power.std(axis=0, ddof=1) / np.sqrt(len(power))))
+    references.assert_standard_normal(z, every=3)
+
+
+def test_one_trace_per_structure(x64):
+    looks = Crossbridge.looks
+    task = jm.Isometric(5.0, 0.002, muscle=Crossbridge(m_w=0.3), settings=Settings(last_bin=29))
+    before = len(looks)
+    jm.expected_spectrum(task)
+    once = len(looks)
+    assert once > before
+    other = task.replace(stiffness=250.0, harmonic_amplitude=0.01, noise_K_w=0.1, P_w=4.0, x_z=0.0)
+    jm.expected_spectrum(other)
+    jm.expected_spectrum(other.with_parts(harmonic=jm.Harmonic(0.002, 8.0, 1.0)))
+    assert len(looks) == once
+
+
+def snapped(P_w=41.57, F_ext=7.0):
+    """A passive spring K_z(x_z) that softens faster than it is let go: started at its unstable equilibrium."""
+    p = {name: float(value) for name, value in jm.PrescribedForce(P_w, F_ext).parameters.items()}
+    x_w = root(lambda x: active(p, x) + F_ext - P_w)
+    x_z = scipy.optimize.brentq(lambda z: coefficients(p, x_w, z)[1] * (z - x_w) + F_ext, 0.008, 0.016)
+    return jm.PrescribedForce(P_w, F_ext, initial=(x_w, 0.0, x_z, 0.0))
+
+
+LITERAL = {"x_ref_w": 0.0, "x_ref_z": 0.0, "v_ref_w": 0.0, "v_ref_z": 0.0}
+REFUSED = {
+    "unstable": (snapped(), r"equilibrium of this PrescribedForce is unstable: eigenvalues .* 1/s at \["),
+    "literal force": (
+        jm.PrescribedForce(5.0, 1.0).replace(**LITERAL),
+        r"PrescribedForce is undamped: eigenvalues .*v_ref_w",
+    ),
+    "literal isometric": (jm.Isometric(5.0, 0.003).replace(**LITERAL), "Isometric is undamped: eigenvalues"),
+    "no damping": (jm.Isometric().replace(c_w=0.0, c_z=0.0), "Isometric is undamped"),
+    "no stiffness": (
+        jm.PrescribedForce().replace(k_w=0.0),
+        r"PrescribedForce has no equilibrium at t = 15.0 s .* stiffness",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_what_has_no_linear_response(x64, name):
+    task, message = REFUSED[name]
+    with pytest.raises(jm.OperatingPointError, match=message):
+        jm.expected_spectrum(task)
+    with pytest.raises(ValueError, match=message):
+        has_response(task, required=True)
+    assert not has_response(task, required=False)
+    assert has_response(jm.Isometric(), required=True)
+
+
+def test_without_an_equilibrium_under_a_transformation_it_is_not_finite(x64):
+    power = jax.jit(lambda F: jm.expected_spectrum(eqx.tree_at(lambda t: t.F_ext.level, snapped(), F)).power)
+    assert not np.any(np.isfinite(power(7.0)))
+    stiff = jax.jit(lambda k: jm.expected_spectrum(jm.PrescribedForce().replace(k_w=k)).power)
+    assert not np.any(np.isfinite(stiff(0.0)))
+    assert np.all(np.isfinite(stiff(5e5)))
+
+
+def test_nothing_to_see(x64):
+    with pytest.raises(
+        ValueError, match="spectrum of this Isometric is zero: it has neither noise nor a harmonic that moves"
+    ):
+        jm.expected_spectrum(references.quiet(jm.Isometric(), harmonic_amplitude=0.0))
+    # Without external force the insertion follows the active mass, and noise on K_z moves nothing.
+    unmoved = references.quiet(jm.PrescribedForce(5.0, 0.0), harmonic_amplitude=0.0).replace(noise_K_z=0.1)
+    with pytest.raises(ValueError, match=r"is zero: .* moves x_z"):
+        jm.expected_spectrum(unmoved)
+
+
+def test_a_harmonic_beyond_half_the_sampling_rate(x64):
+    task = jm.Isometric().replace(harmonic_frequency=50.0)
+    with pytest.raises(ValueError, match=r"harmonic_frequency = 50.0 Hz is not below half the sampling rate of 100.0 Hz"):
+        jm.expected_spectrum(task)
+    assert np.all(np.isfinite(jm.expected_spectrum(task.replace(harmonic_amplitude=0.0)).power))
+    assert np.all(np.isfinite(jm.expected_spectrum(task, Settings(rate=200.0)).power))
