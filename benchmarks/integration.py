@@ -56,7 +56,7 @@ def _against_scan(label: str, noise: Any, given: Any, scans: dict[str, Any], rep
         return states, states[..., 2]
 
     calls = {
-        OURS: lambda: (lambda r: (r.states, r.output))(jm.ensemble(task, key, seeds=SEEDS)),
+        OURS: lambda: (lambda r: (r.states, r.output))(jm.ensemble(task, key, seeds=SEEDS, control=False)),
         SCAN: lambda: whole(task, key),
     }
     tolerance = EPSILONS * float(jnp.finfo(normals.dtype).eps)
@@ -111,7 +111,7 @@ def stock(dtype: str, repetitions: int) -> list[Row]:
         keys = jax.vmap(lambda i: jax.random.fold_in(key, i))(jnp.arange(SEEDS))
         return jax.vmap(lambda k: stock_diffrax(task, path(k), noise.rate, DT, steps, EVERY))(keys)
 
-    programs = {OURS: lambda: jm.ensemble(task, key, seeds=SEEDS).states}
+    programs = {OURS: lambda: jm.ensemble(task, key, seeds=SEEDS, control=False).states}
     programs |= {name: partial(run, task, key, name) for name in paths}
     steps = {OURS: SEEDS * STEPS} | {name: SEEDS * n for name, (_, n) in paths.items()}
     for name, (_, count) in paths.items():
