@@ -11,7 +11,7 @@ import numpy as np
 from measure import Row, seconds
 
 import jaxmuscle as jm
-from jaxmuscle._descend import in_batches
+from jaxmuscle._descend import descend
 from jaxmuscle._fit import DT, free_names
 from jaxmuscle._objective import Coordinates
 from jaxmuscle._parameter import PARAMETERS, as_numbers
@@ -66,7 +66,7 @@ def starts(repetitions: int) -> list[Row]:
         with jax.enable_x64(True):
             setup = _setup(jm.load_target(name))
             points = starting_points(setup.coordinates, setup.target, STARTS)
-            program = lambda s=setup, p=points: in_batches(s.linear(), p, MAX_STEPS, lambda descent: None)  # noqa: E731
+            program = lambda s=setup, p=points: descend(s.linear(), p, MAX_STEPS)  # noqa: E731
             wall, busy = (float(np.median(t)) for t in seconds({"search": program}, min(repetitions, 5))["search"])
             cost = program().cost
         again = int(np.sum(cost <= (1 + NEAR) * np.nanmin(cost)))

@@ -13,7 +13,7 @@ import scipy.optimize
 import scipy.signal
 
 import jaxmuscle as jm
-from jaxmuscle._expected import covariance_operator, expected_moments
+from jaxmuscle._expected import _Autocovariance, covariance_operator, expected_moments
 from jaxmuscle._linear import has_response
 from jaxmuscle._parameter import as_arrays
 
@@ -368,9 +368,25 @@ def test_single_precision(name):
     with jax.enable_x64(True):
         moments, system = expected_moments(as_arrays(task), task.settings, WINDOW)
         A, double = np.asarray(system.A), np.asarray(moments.power)
-    # Rounding, of sums over 280 lags and of the Lyapunov equations.
+    # Rounding, of sums over hundreds of lags and of the Lyapunov equations.
     condition = np.linalg.cond(np.kron(A, np.eye(len(A))) + np.kron(np.eye(len(A)), A))
     np.testing.assert_allclose(single, double, rtol=6e-8 * (280 + condition))
+
+
+@pytest.mark.parametrize("samples", [2, 3, 64, 999, 1000])
+def test_lags_and_the_variance_of_a_mean_are_plain_sums(x64, samples):
+    rng = np.random.default_rng(samples)
+    step = 0.99 * scipy.linalg.expm(0.3 * (rng.normal(size=(3, 3)) - 2 * np.eye(3)))
+    first, row, start = 1.7, rng.normal(size=3), rng.normal(size=3)
+    r, state = [first], start
+    for _ in range(samples - 1):
+        r.append(row @ state)
+        state = step @ state
+    powers = tuple(jnp.asarray(np.linalg.matrix_power(step, 2**k)) for k in range(11))
+    found = _Autocovariance(jnp.asarray(first), jnp.asarray(row), powers, jnp.asarray(start))
+    np.testing.assert_allclose(found.lagged(samples), r, rtol=1e-12, atol=1e-13)
+    lag = np.abs(np.subtract.outer(np.arange(samples), np.arange(samples)))
+    np.testing.assert_allclose(found.mean_variance(samples), np.array(r)[lag].mean(), rtol=1e-11)
 
 
 class Crossbridge(jm.AbstractMuscle):

@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 import jaxmuscle as jm
 from jaxmuscle import _fit, _search
 from jaxmuscle._check import AMBIGUOUS, rival_frequencies
-from jaxmuscle._derived import derived, linearised_at
-from jaxmuscle._descend import BATCH, Descent, _residuals, descend, in_batches
+from jaxmuscle._derived import consequences, derived
+from jaxmuscle._descend import BATCH, Descent, _moments_and_slopes, _residuals, descend, seen_at
 from jaxmuscle._expected import Moments
 from jaxmuscle._objective import Coordinates, MonteCarlo, welch_operator
 from jaxmuscle._parameter import DEFAULT_FREE, PARAMETERS, as_arrays
@@ -202,18 +202,26 @@ def test_a_bound_below_zero_does_not_bind_a_positive_parameter(x64):
 # --- descent, on problems whose minimum is known
 
 
-class Curved(eqx.Module):
+class Direct(eqx.Module):
+    """A problem whose model gives the residuals themselves."""
+
+    model: None = None
+
+    def theta(self, s):
+        return s
+
+    def residuals(self, theta, moments):
+        return moments
+
+
+class Curved(Direct):
     """Residuals of a narrow curved valley with its minimum, 1/8, at (1, 1); not finite for s_0 < -1.5."""
 
     scale: float = 10.0
 
-    def residuals(self, s):
-        valley = jnp.stack([self.scale * (s[1] - s[0] ** 2), 1 - s[0], 0.5 * jnp.ones_like(s[0])])
-        return valley * jnp.where(s[0] < -1.5, jnp.nan, 1.0)
-
-
-def keep(problem, points):
-    return problem
+    def moments(self, theta):
+        valley = jnp.stack([self.scale * (theta[1] - theta[0] ** 2), 1 - theta[0], 0.5 * jnp.ones_like(theta[0])])
+        return valley * jnp.where(theta[0] < -1.5, jnp.nan, 1.0)
 
 
 def watch(reports):
@@ -223,7 +231,7 @@ def watch(reports):
 def test_descent_finds_the_minimum_from_every_start_but_a_bad_one(x64):
     reports = []
     starts = np.array([[-1.0, 1.0], [np.nan, 0.0], [2.0, 2.0], [-2.0, 0.0]])
-    found = descend(Curved(), starts, 80, prepare=keep, report=watch(reports))
+    found = descend(Curved(), starts, 80, report=watch(reports))
     # Settled means that a thousandth of the cost is left to gain: half a squared distance of 1/8000.
     np.testing.assert_allclose(found.cost[[0, 2]], 0.125, rtol=1e-3)
     np.testing.assert_allclose(found.s[[0, 2], 0], 1.0, atol=0.02)
@@ -235,14 +243,14 @@ def test_descent_finds_the_minimum_from_every_start_but_a_bad_one(x64):
 
 
 def test_a_step_to_where_the_model_explodes_is_rejected(x64):
-    class Cliff(eqx.Module):
+    class Cliff(Direct):
         """log(s): from s = 5 a Gauss-Newton step leads to s < 0."""
 
-        def residuals(self, s):
-            return jnp.log(s)
+        def moments(self, theta):
+            return jnp.log(theta)
 
     reports = []
-    found = descend(Cliff(), np.array([[5.0]]), 60, prepare=keep, report=watch(reports))
+    found = descend(Cliff(), np.array([[5.0]]), 60, report=watch(reports))
     assert np.all(np.isfinite([r.cost[0] for r in reports]))
     costs = [r.cost[0] for r in reports]
     assert costs == sorted(costs, reverse=True)
@@ -250,7 +258,7 @@ def test_a_step_to_where_the_model_explodes_is_rejected(x64):
 
 
 def test_no_finite_start_has_infinite_cost(x64):
-    found = descend(Curved(), np.full((2, 2), np.nan), 20, prepare=keep, report=watch([]))
+    found = descend(Curved(), np.full((2, 2), np.nan), 20)
     assert not np.any(np.isfinite(found.cost)) and not np.any(found.settled)
     assert np.all(found.steps < 20)
 
@@ -258,21 +266,24 @@ def test_no_finite_start_has_infinite_cost(x64):
 def test_descent_takes_the_problem_that_prepare_gives(x64):
     """Exchanged at the first step, as for more sub-steps: the minimum is the new problem's."""
 
-    class Line(eqx.Module):
-        at: float
+    class Line(Direct):
+        at: float = 0.0
 
-        def residuals(self, s):
-            return s - self.at
+        def moments(self, theta):
+            return theta - self.at
 
-    found = descend(Line(1.0), np.zeros((1, 1)), 20, prepare=lambda p, s: Line(2.0), report=watch([]))
+    found = descend(Line(at=1.0), np.zeros((1, 1)), 20, prepare=lambda p, s: Line(at=2.0))
     np.testing.assert_allclose(found.s, 2.0, atol=1e-6)
 
 
-def test_the_residuals_derivative_is_one_forward_pass(x64):
-    problem, s, v = Curved(), jnp.asarray([0.4, -0.3]), jnp.asarray([0.2, 1.0])
-    value, slope = jax.jvp(lambda s: _residuals(s, problem), (s,), (v,))
-    np.testing.assert_allclose(value, problem.residuals(s))
-    np.testing.assert_allclose(slope, jax.jacfwd(problem.residuals)(s) @ v)
+def test_residuals_and_their_slopes_are_exact_where_the_model_was_seen(x64):
+    problem, s = Curved(), np.array([[0.4, -0.3], [1.2, 0.7]])
+    seen = seen_at(problem, s)
+    for i, point in enumerate(jnp.asarray(s)):
+        here = jax.tree.map(lambda x, i=i: x[i], seen)
+        np.testing.assert_allclose(_residuals(point, (problem, here))[0], problem.moments(point), rtol=1e-14)
+        slope = jax.jacfwd(lambda s, here=here: _residuals(s, (problem, here))[0])(point)
+        np.testing.assert_allclose(slope, jax.jacfwd(problem.moments)(point), rtol=1e-14)
 
 
 # --- the problem that a fit solves
@@ -290,8 +301,11 @@ def _problem(residual, extra=(None, None)):
 def test_gradients_of_the_residuals_are_differences(x64, residual):
     problem = _problem(residual, ((np.log(0.02), 0.1), (2.0, 0.1)))
     s = jnp.asarray([0.2, -0.1, 0.05])
-    evaluate = eqx.filter_jit(problem.residuals)
-    forward = eqx.filter_jit(lambda s: jax.jacfwd(problem.residuals)(s))(s)
+    whole = lambda s: problem.residuals(problem.theta(s), problem.moments(problem.theta(s)))  # noqa: E731
+    evaluate = eqx.filter_jit(whole)
+    seen = jax.tree.map(lambda x: x[0], seen_at(problem, np.asarray(problem.theta(s))[None]))
+    forward = jax.jacfwd(lambda s: _residuals(s, (problem, seen))[0])(s)
+    np.testing.assert_allclose(forward, eqx.filter_jit(jax.jacfwd(whole))(s), rtol=1e-9, atol=1e-12)
     h = 1e-4
     central = np.stack([(evaluate(s + h * e) - evaluate(s - h * e)) / (2 * h) for e in np.eye(3)], axis=1)
     assert np.all(np.isfinite(forward))
@@ -340,7 +354,9 @@ def test_linear_and_cumulative_residuals_are_in_standard_deviations(x64):
 
 def null_sentences(task, extra):
     setup = setup_of(task, VASTUS, DEFAULT_FREE, extra=extra)
-    _, (_, jacobian, _) = linearised_at(setup.montecarlo(8), jnp.zeros(len(DEFAULT_FREE)))
+    problem = setup.montecarlo(8)
+    seen = jax.tree.map(lambda x: x[0], seen_at(problem, np.zeros((1, len(DEFAULT_FREE)))))
+    jacobian = consequences(problem, seen)[1][0]
     return undetermined_directions(DEFAULT_FREE, identifiability(np.asarray(jacobian)))
 
 
@@ -365,8 +381,8 @@ def test_stiff_points_get_substeps(x64):
     assert setup.finer(finer, np.array([[-5.0, 0.0]])).model.grid.substeps == 16  # never fewer again
     assert setup.finer(problem, np.array([[-5.0, 0.0], [np.nan, 0.0]])).model.grid.substeps == 1
     assert setup.finer(problem, np.array([[-5.0, 0.0], [0.0, 0.0]])).model.grid.substeps == 16
-    assert np.all(np.isfinite(eqx.filter_jit(finer.residuals)(jnp.zeros(2))))
-    assert not np.all(np.isfinite(eqx.filter_jit(problem.residuals)(jnp.zeros(2))))
+    assert np.all(np.isfinite(eqx.filter_jit(finer.moments)(jnp.zeros(2)).power))
+    assert not np.all(np.isfinite(eqx.filter_jit(problem.moments)(jnp.zeros(2)).power))
 
 
 # --- arguments
@@ -668,14 +684,16 @@ def test_controlled_moments_are_those_of_a_controlled_ensemble(x64):
     np.testing.assert_allclose(moments.power, runs.mean_spectrum().power[chosen], rtol=1e-9)
 
 
-def test_any_number_of_starts_runs_in_batches_of_one_size(x64):
-    starts = np.random.default_rng(0).uniform(-1.2, 2.0, size=(BATCH + 5, 2))
-    reports = []
-    found = in_batches(Curved(), starts, 80, watch(reports))
-    assert found.s.shape == starts.shape and np.all(np.isfinite(found.cost))
-    single = descend(Curved(), starts[-5:], 80, prepare=keep, report=watch([]))
-    np.testing.assert_allclose(found.cost[-5:], single.cost, rtol=1e-6)
-    assert np.isinf(reports[0].cost[BATCH:]).all()  # the second batch has not begun
+def test_any_number_of_points_is_one_compiled_program(x64):
+    setup = setup_of(jm.Isometric(), simple_target(), FREE, control=True)
+    problem = setup.linear()
+    theta = np.random.default_rng(0).normal(size=(BATCH + 5, 3))
+    seen = seen_at(problem, theta)
+    traces = _moments_and_slopes._cached._cache_size()
+    single = seen_at(problem, theta[-2:])
+    assert _moments_and_slopes._cached._cache_size() == traces
+    np.testing.assert_allclose(seen.moments.power[-2:], single.moments.power, rtol=1e-12)
+    assert seen.slopes.power.shape == (BATCH + 5, 30, 3)
 
 
 def test_profile_and_bootstrap_find_a_line_that_is_there():

@@ -9,7 +9,7 @@ import references
 import scipy.interpolate
 
 import jaxmuscle as jm
-from jaxmuscle._signal import derivatives
+from jaxmuscle._signal import Tabulated, derivatives
 
 TIMES = np.linspace(0.0, 6.0, 25)
 CASES = {
@@ -159,3 +159,19 @@ def test_impossible_signals_are_refused(user_view):
     ):
         with pytest.raises(ValueError, match="times"):
             jm.Sampled.through(times, values)
+
+
+@pytest.mark.parametrize("precision", ["float32", "float64"])
+@pytest.mark.parametrize("name", ["step", "ramp", "sampled"])
+def test_a_table_gives_its_signal_and_two_derivatives_at_every_grid_point(name, precision):
+    with jax.enable_x64(precision == "float64"):
+        signal, interval = CASES[name][0], 2.5e-4
+        table = Tabulated.of(signal, interval, 20_001)
+        times = np.arange(20_001.0, dtype=precision) * np.asarray(interval, precision)
+        for seen, exact in zip(
+            *(jax.vmap(lambda t, s=s: derivatives(s, t, 2))(times) for s in (table, signal)), strict=True
+        ):
+            np.testing.assert_array_equal(seen, exact)
+        # and with respect to what the signal itself depends on
+        slope = jax.grad(lambda level: Tabulated.of(jm.SmoothStep(level), interval, 9000)(2.0))(3.0)
+        np.testing.assert_allclose(slope, 1.0, rtol=1e-6)

@@ -153,6 +153,21 @@ def test_every_step_gets_its_own_noise(steps, every, substeps, precision):
             np.testing.assert_allclose(seen[1:], expected[every - 1 :: every], atol=0.02 * size)
 
 
+@pytest.mark.parametrize("task", ["motion", "force", "isometric"])
+def test_tables_of_inputs_and_harmonic_change_nothing(x64, task):
+    """A traced call, which may be differentiated in reverse, evaluates them in the loop; a plain one looks them up."""
+    rhythm = jm.Harmonic(0.02, 3.0, 0.4, jm.Decay(1.0, 0.2, 0.3, 0.2))
+    task = {
+        "motion": jm.PrescribedMotion(jm.RampHold(0.005, 0.1, 0.3, 0.1), 5.0, harmonic=rhythm),
+        "force": jm.PrescribedForce(jm.SmoothStep(5.0, 0.1, 0.3), jm.Decay(1.0, 0.0, 0.2, 0.3), harmonic=rhythm),
+        "isometric": jm.Isometric(jm.Sampled.through(np.linspace(0, 1, 9), np.sin(np.arange(9.0)) + 3), harmonic=rhythm),
+    }[task]
+    options = {"duration": 0.8, "rate": 500.0, "substeps": 3}
+    plain = jm.simulate(task, KEY, **options)
+    traced = jax.jit(lambda key: jm.simulate(task, key, **options).output)(KEY)
+    np.testing.assert_allclose(plain.output, traced, rtol=1e-9, atol=1e-9 * np.abs(plain.output).max())
+
+
 TASKS = [
     jm.PrescribedMotion(0.005, 5.0),
     jm.PrescribedForce(5.0, 1.0, noise=jm.WhiteNoise()),

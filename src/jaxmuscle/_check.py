@@ -3,13 +3,12 @@
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
-from ._derived import linearised_at
-from ._descend import Descent
+from ._derived import consequences
+from ._descend import Descent, Seen, seen_at
 from ._expected import Moments, expected_moments
-from ._operating import slowest_rate
+from ._linear import linearised
 from ._parameter import as_arrays
 from ._problem import Problem, Setup
 from ._result import Estimate
@@ -51,8 +50,10 @@ def controlled_moments(runs: Trajectory, settings: SpectrumSettings, window: Win
     return Moments(power, line, held.mean(axis=1), variance), expected
 
 
-def best_theta(setup: Setup, descent: Descent) -> np.ndarray:
-    return setup.coordinates.theta(descent.s[descent.best])
+def seen_best(problem: Problem, descent: Descent) -> Seen:
+    """What the model gives at the best point."""
+    seen = seen_at(problem, np.asarray(problem.theta(descent.s)))
+    return jax.tree.map(lambda x: x[descent.best], seen)
 
 
 def linear_check(each: np.ndarray, expected: np.ndarray, statistics: BinStatistics) -> dict[str, float | int]:
@@ -74,9 +75,7 @@ def polish_check(setup: Setup, stages: list[Stage], found: dict[str, Estimate]) 
     if "polishing" not in names or setup.method != "linear":
         return {}
     before, after = stages[names.index("linear response")], stages[-1]
-    old, new = (
-        linearised_at(stage.problem, jnp.asarray(best_theta(setup, stage.descent)))[0][2] for stage in (before, after)
-    )
+    old, new = (consequences(stage.problem, seen_best(stage.problem, stage.descent))[0][1] for stage in (before, after))
     moves = [abs(float(new[name] - old[name])) / p.stderr for name, p in found.items() if p.stderr]
     return {"polish_moved_se": max(moves, default=0.0), "polish_turns": len(stages) - 1 - names.index("linear response")}
 
@@ -85,7 +84,7 @@ def unsettled(setup: Setup, task: AbstractTask) -> float:
     """Share of the input's rise that is left when the analysed window begins."""
     if not setup.control:
         return 0.0
-    rate = float(slowest_rate(as_arrays(task)))
+    rate = np.abs(np.linalg.eigvals(np.asarray(linearised(as_arrays(task)).system.A))).min()
     return float(np.exp(-rate * (WINDOW[0] - RISEN)))
 
 

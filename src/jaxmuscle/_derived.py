@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ._descend import Seen
 from ._expected import Moments
 from ._objective import at
 from ._operating import slowest_rate
@@ -50,35 +51,25 @@ def derived(task: Any, moments: Moments) -> dict[str, Any]:
     }
 
 
-@eqx.filter_jit
-def derived_numbers(task: Any, moments: Moments) -> dict[str, Any]:
-    """`derived`, compiled."""
-    return derived(task, moments)
-
-
 def observed(moments: Moments) -> dict[str, Any]:
     """Those derived quantities that follow from simulated moments."""
     upper = moments.power.shape[0] // 3
+    proportional = moments.power / moments.power.sum()
     return {
-        "harmonic_share": jnp.sum(moments.line) / jnp.sum(moments.power),
-        "high_frequency_floor": jnp.mean(moments.proportional[-upper:]),
+        "harmonic_share": moments.line.sum() / moments.power.sum(),
+        "high_frequency_floor": proportional[-upper:].mean(),
         "coefficient_of_variation": moments.variation,
         "mean": moments.mean,
     }
 
 
-@eqx.filter_jit
-def _left_out(each: Moments) -> dict[str, Any]:
-    count = each.mean.shape[0]
-    return jax.vmap(observed)(jax.tree.map(lambda x: (jnp.sum(x, axis=0) - x) / (count - 1), each))
-
-
 def jackknife(each: Moments) -> dict[str, float]:
     """Standard errors of the observed quantities from the moments of every seed."""
-    count = len(np.asarray(each.mean))
+    count = len(each.mean)
     if count < 2:
         return {}
-    return {name: float(np.std(v) * np.sqrt(count - 1)) for name, v in _left_out(each).items()}
+    left_out = [observed(Moments(*((x.sum(axis=0) - x[i]) / (count - 1) for x in each))) for i in range(count)]
+    return {name: float(np.std([o[name] for o in left_out]) * np.sqrt(count - 1)) for name in left_out[0]}
 
 
 def unit_of(name: str) -> str:
@@ -142,17 +133,13 @@ def without_error(name: str, table: dict[str, Estimate]) -> dict[str, Estimate]:
 
 
 @eqx.filter_jit
-def linearised_at(problem: Any, theta: Any) -> tuple[Any, ...]:
-    """Moments, data residuals and derived quantities at θ, with their Jacobians."""
+def consequences(problem: Any, seen: Seen) -> tuple[Any, Any]:
+    """Data residuals and derived quantities at the point where the model was seen, and their slopes with respect to θ."""
 
     def everything(theta):
-        moments = problem.moments(theta)
-        values = (
-            moments,
-            problem.data_residuals(moments),
-            derived(at(problem.task, problem.coordinates, theta), moments),
-        )
+        moments = seen.nearby(theta)
+        values = problem.data_residuals(moments), derived(at(problem.task, problem.coordinates, theta), moments)
         return values, values
 
-    slopes, values = jax.jacfwd(everything, has_aux=True)(theta)
+    slopes, values = jax.jacfwd(everything, has_aux=True)(seen.theta)
     return values, slopes

@@ -5,14 +5,17 @@ from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
+from ._objective import Linear
+
 SMALL = 1e-3
+STILL = 1e-4
 REFUSALS = 6
 BATCH = 32
+ROWS = 128
 
 
 class Descent(NamedTuple):
@@ -29,42 +32,110 @@ class Descent(NamedTuple):
         return int(np.argmin(np.where(np.isfinite(self.cost), self.cost, np.inf)))
 
 
-@eqx.filter_custom_jvp
-def _residuals(s: Float[Array, " free"], problem: Any) -> Float[Array, " residuals"]:
-    return problem.residuals(s)
+class Seen(NamedTuple):
+    """What a problem's model gives at some θ, and its slopes with respect to θ; a leading axis of points."""
+
+    theta: Any
+    moments: Any
+    slopes: Any
+
+    def nearby(self, theta: Float[Array, " free"]) -> Any:
+        """The moments at another θ to first order (without the leading axis); exact, with exact slopes, at `self.theta`."""
+        return jax.tree.map(lambda value, slope: value + slope @ (theta - self.theta), self.moments, self.slopes)
 
 
-@_residuals.def_jvp
-def _residuals_jvp(primals, tangents):
-    s, problem = primals
-    direction = tangents[0]
-    jacobian, value = jax.jacfwd(lambda s: 2 * (problem.residuals(s),), has_aux=True)(s)
-    return value, jacobian @ direction
+@eqx.filter_jit
+def _moments_and_slopes(problem: Any, theta: Float[Array | np.ndarray, "points free"]) -> tuple[Any, Any]:
+    def one(theta):
+        def twice(theta):
+            moments = problem.moments(theta)
+            return moments, moments
+
+        slopes, moments = jax.jacfwd(twice, has_aux=True)(theta)
+        return moments, slopes
+
+    return jax.vmap(one)(theta)
 
 
-def _function(s, problem):
-    return _residuals(s, problem), None
+def seen_at(problem: Any, theta: Float[np.ndarray, "points free"]) -> Seen:
+    """The problem's moments and their slopes at every θ, as numbers.
+
+    A linear response is computed for `BATCH` points at a time, so that one compiled program serves any number of them; a
+    Monte Carlo simulation for all points together.
+    """
+    count = len(theta)
+    size = BATCH if isinstance(problem.model, Linear) else count
+    padded = np.concatenate([theta, np.broadcast_to(theta[-1], (-count % size, theta.shape[1]))])
+    batches = np.split(padded, len(padded) // size)
+    parts = [_moments_and_slopes(problem, batch) for batch in batches]
+    return Seen(theta, *jax.tree.map(lambda *x: np.concatenate(x)[:count], *parts))
+
+
+def _residuals(s: Float[Array, " free"], given: tuple[Any, Seen]) -> tuple[Float[Array, " residuals"], None]:
+    """Residuals with their slopes at the s where the model was seen: all that a Levenberg-Marquardt step asks for."""
+    problem, seen = given
+    theta = problem.theta(s)
+    return problem.residuals(theta, seen.nearby(theta)), None
 
 
 SOLVER = optx.LevenbergMarquardt(rtol=1e-9, atol=1e-9)
 
 
 @eqx.filter_jit
-def _start(problem, starts):
-    def one(s):
-        shape = eqx.filter_eval_shape(_function, s, problem)[0]
-        return SOLVER.init(_function, s, problem, {}, shape, None, frozenset())
+def _start(problem, starts, seen):
+    def one(s, seen):
+        shape = jax.eval_shape(lambda s: _residuals(s, (problem, seen))[0], s)
+        return SOLVER.init(_residuals, s, (problem, seen), {}, shape, None, frozenset())
 
-    return eqx.filter_vmap(one)(starts)
+    return eqx.filter_vmap(one)(starts, seen)
 
 
 @eqx.filter_jit
-def _step(problem, s, state):
-    def one(s, state):
-        s, state, _ = SOLVER.step(_function, s, problem, {}, state, frozenset())
-        return s, state, 0.5 * jnp.sum(state.f_info.residual**2), state.num_accepted_steps
+def _step(problem, s, state, seen):
+    def one(s, state, seen):
+        s, state, _ = SOLVER.step(_residuals, s, (problem, seen), {}, state, frozenset())
+        return s, state, 0.5 * (state.f_info.residual**2).sum(), state.num_accepted_steps
 
-    return eqx.filter_vmap(one)(s, state)
+    return eqx.filter_vmap(one)(s, state, seen)
+
+
+class _Standing(NamedTuple):
+    """Every start (and filled-up) row: where it is and looks next, its cost, accepted steps, successive small gains."""
+
+    s: np.ndarray
+    ahead: np.ndarray
+    cost: np.ndarray
+    accepted: np.ndarray
+    small: np.ndarray
+    still: np.ndarray
+    refused: np.ndarray
+    steps: np.ndarray
+    active: np.ndarray
+
+    def advanced(self, s: np.ndarray, ahead: np.ndarray, cost: np.ndarray, accepted: np.ndarray) -> "_Standing":
+        """After a step of the active rows; the others stay as they are."""
+        moved = self.active & (accepted > self.accepted)
+        with np.errstate(invalid="ignore"):
+            gain = np.where(np.isfinite(self.cost), (self.cost - cost) / self.cost, np.inf)
+        small = np.where(moved, np.where(gain < SMALL, self.small + 1, 0), self.small)
+        still = np.where(moved, np.where(gain < STILL, self.still + 1, 0), self.still)
+        refused = np.where(moved, 0, self.refused + self.active)
+        keep = self.active[:, None]
+        return _Standing(
+            np.where(keep, s, self.s),
+            np.where(keep, ahead, self.ahead),
+            np.where(self.active, cost, self.cost),
+            np.where(self.active, accepted, self.accepted),
+            small,
+            still,
+            refused,
+            self.steps + self.active,
+            self.active & (still < 2) & (refused < REFUSALS) & np.isfinite(cost),
+        )
+
+    def descent(self, count: int) -> Descent:
+        settled = (self.small >= 1) & np.isfinite(self.cost)
+        return Descent(self.s[:count], self.cost[:count], self.steps[:count], settled[:count])
 
 
 def descend(
@@ -72,65 +143,40 @@ def descend(
     starts: Float[np.ndarray, "starts free"],
     max_steps: int,
     *,
-    prepare: Callable[[Any, np.ndarray], Any],
-    report: Callable[[Descent], None],
+    prepare: Callable[[Any, np.ndarray], Any] = lambda problem, points: problem,
+    report: Callable[[Descent], None] = lambda descent: None,
 ) -> Descent:
-    """Minimise `½ |problem.residuals(s)|²` from every start; rejects steps to where it is not finite.
+    """Minimise `½ Σ r²`, `r = problem.residuals(θ, problem.moments(θ))`, from every start.
 
-    A start settles when two accepted steps in a row lower its cost by less than a thousandth; the loop ends when all
-    have or `REFUSALS` steps in a row were rejected, or after `max_steps`. `prepare(problem, points)` may exchange the
-    problem before each step (sub-steps); `report` sees where each start stands after each step.
+    Steps to where r is not finite are rejected. A start ends when two accepted steps in a row lower its cost by less than
+    `STILL` of it, after `REFUSALS` rejected steps in a row, or if it is not finite; what has ended costs nothing more.
+    `prepare(problem, points)` may exchange the problem before each step (sub-steps); `report` sees every step's outcome.
     """
-    s = jnp.asarray(starts)
-    count = len(starts)
-    cost = np.full(count, np.inf)
-    accepted = np.zeros(count, dtype=int)
-    small = np.zeros(count, dtype=int)
-    refused = np.zeros(count, dtype=int)
-    steps = np.zeros(count, dtype=int)
-    problem = prepare(problem, np.asarray(s))
-    state = _start(problem, s)
-    result = Descent(np.asarray(s), cost, steps, np.zeros(count, dtype=bool))
+    count, free = starts.shape
+    batched = isinstance(problem.model, Linear)
+    fill = -count % ROWS if batched else 0
+    s = np.concatenate([starts, np.broadcast_to(starts[-1], (fill, free))])
+    none, nothing = np.zeros(len(s), dtype=int), np.full(len(s), np.inf)
+    now = _Standing(s, s, nothing, none, none, none, none, none, np.arange(len(s)) < count)
+    seen = state = None
     for _ in range(max_steps):
-        problem = prepare(problem, np.asarray(state.y_eval))
-        s, state, now, taken = _step(problem, s, state)
-        now, taken = np.asarray(now), np.asarray(taken)
-        active = (small < 2) & (refused < REFUSALS)
-        moved = (taken > accepted) & np.isfinite(cost)
-        refused = np.where(taken > accepted, 0, refused + 1)
-        little = (cost - now) < SMALL * cost
-        small = np.where(active, np.where(moved, np.where(little, small + 1, 0), small), small)
-        steps += active
-        cost, accepted = now, taken
-        result = Descent(np.asarray(s), cost, steps.copy(), (small >= 1) & np.isfinite(cost))
-        report(result)
-        if np.all((small >= 2) | (refused >= REFUSALS) | ~np.isfinite(cost)):
+        rows = np.flatnonzero(now.active) if batched else np.arange(count)
+        problem = prepare(problem, now.ahead[rows])
+        new = seen_at(problem, np.asarray(problem.theta(now.ahead[rows])))
+        if seen is None:
+            seen = jax.tree.map(lambda x: x[np.minimum(np.arange(count + fill), count - 1)], new)
+            state = _start(problem, now.s, seen)
+        else:
+            seen = jax.tree.map(lambda old, x, rows=rows: _put(old, rows, x), seen, new)
+        s, state, cost, accepted = _step(problem, now.s, state, seen)
+        now = now.advanced(*map(np.asarray, (s, state.y_eval, cost, accepted)))
+        report(now.descent(count))
+        if not np.any(now.active):
             break
-    return result
+    return now.descent(count)
 
 
-def in_batches(
-    problem: Any, starts: Float[np.ndarray, "starts free"], max_steps: int, report: Callable[[Descent], None]
-) -> Descent:
-    """`descend` for any number of starts, `BATCH` at a time, so that one compiled step serves every number."""
-    count, size = starts.shape
-    done = Descent(starts.copy(), np.full(count, np.inf), np.zeros(count, dtype=int), np.zeros(count, dtype=bool))
-    for begin in range(0, count, BATCH):
-        here = starts[begin : begin + BATCH]
-        padded = np.concatenate([here, np.broadcast_to(here[-1], (BATCH - len(here), size))])
-        now = done
-
-        def show(part, begin=begin, so_far=done):
-            nonlocal now
-            now = Descent(*(_put(old, new[: count - begin], begin) for old, new in zip(so_far, part, strict=True)))
-            report(now)
-
-        descend(problem, padded, max_steps, prepare=lambda problem, points: problem, report=show)
-        done = now
-    return done
-
-
-def _put(old: np.ndarray, new: np.ndarray, begin: int) -> np.ndarray:
+def _put(old: np.ndarray, rows: np.ndarray, new: np.ndarray) -> np.ndarray:
     whole = old.copy()
-    whole[begin : begin + len(new)] = new
+    whole[rows] = new
     return whole

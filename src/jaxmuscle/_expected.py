@@ -10,6 +10,7 @@ import numpy as np
 import scipy.signal
 from jaxtyping import Array, Complex, Float
 
+from ._law import Scalar
 from ._linear import Linearisation, check_equilibrium, linearise
 from ._muscle import Perturbation
 from ._noise import ShapingFilter
@@ -36,9 +37,9 @@ class Moments(NamedTuple):
         return jnp.asarray(self.power) / jnp.sum(self.power)
 
     @property
-    def variation(self) -> Float[Array, ""]:
+    def variation(self) -> Scalar:
         """Coefficient of variation."""
-        return jnp.sqrt(self.variance) / jnp.abs(self.mean)
+        return self.variance**0.5 / abs(self.mean)
 
 
 def _sylvester(A: Array, F: Array, Q: Array) -> Array:
@@ -86,10 +87,47 @@ def _covariances(task: AbstractTask, system: Linearisation) -> _Covariances:
     )
 
 
-def _autocovariance(system: _Covariances, interval: float, lags: int, sampling: str) -> Float[Array, " lags"]:
-    """r at lags 0, Δ, 2Δ ... of the sampled output; powers of the transition by repeated squaring."""
+class _Autocovariance(NamedTuple):
+    """r of the sampled output: r(0), and `r(lΔ) = row powers[0]^(l-1) next` beyond; powers[k] = powers[0]^(2^k)."""
+
+    zero: Float[Array, ""]
+    row: Float[Array, " all"]
+    powers: tuple[Float[Array, "all all"], ...]
+    next: Float[Array, " all"]
+
+    def lagged(self, lags: int) -> Float[Array, " lags"]:
+        """r at lags 0, Δ, 2Δ ...: from few steps to the right and few long ones to the left, which meet in one product."""
+        short = (lags.bit_length() + 1) // 2
+        columns, rows = self.next[:, None], self.row[None]
+        for power in self.powers[:short]:
+            columns = jnp.concatenate([columns, power @ columns], axis=1)
+        for power in self.powers[short:]:
+            if len(rows) * columns.shape[1] >= lags - 1:
+                break
+            rows = jnp.concatenate([rows, rows @ power])
+        return jnp.concatenate([self.zero[None], (rows @ columns).reshape(-1)])[:lags]
+
+    def mean_variance(self, samples: int) -> Float[Array, ""]:
+        """Variance of the mean of that many successive samples, `Σ_l 2 (n - l) / n² r(lΔ) + r(0) / n`, l = 1 ... n - 1.
+
+        Sums of `Φ^m v` and of `m Φ^m v` double their length from power to power.
+        """
+        count, length = samples - 1, 1
+        sum_all, rise_all = jnp.zeros_like(self.next), jnp.zeros_like(self.next)
+        sum_here, rise_here = self.next, jnp.zeros_like(self.next)
+        for power in self.powers[: count.bit_length()]:
+            if count & length:  # this block, then what is there already
+                rise_all = rise_here + power @ (rise_all + length * sum_all)
+                sum_all = sum_here + power @ sum_all
+            rise_here = rise_here + power @ (rise_here + length * sum_here)
+            sum_here = sum_here + power @ sum_here
+            length *= 2
+        return self.zero / samples + 2 / samples**2 * self.row @ (count * sum_all - rise_all)
+
+
+def _autocovariance(system: _Covariances, interval: float, lags: int, sampling: str) -> _Autocovariance:
+    """Autocovariance of the sampled output, good for that many lags; not finite where it does not decay."""
     matrix, row, start = system
-    first = None
     if sampling == "average":
         # Means over the interval: r(0) = 2/Δ² c ∫(Δ-s) e^(Ms) ds v and r(lΔ) = c J Φ^(l-1) J v / Δ², J = ∫ e^(Ms) ds.
         n = len(matrix)
@@ -97,17 +135,16 @@ def _autocovariance(system: _Covariances, interval: float, lags: int, sampling: 
         blocks = jnp.block([[matrix * interval, eye, zero], [zero, zero, eye], [zero, zero, zero]])
         whole = jax.scipy.linalg.expm(blocks)
         step, mean, ramp = whole[:n, :n], whole[:n, n : 2 * n], whole[:n, 2 * n :]
-        first = 2 * row @ ramp @ start
-        row, start = row @ mean, mean @ start
+        first, row, following = 2 * row @ ramp @ start, row @ mean, mean @ start
     else:
         step = jax.scipy.linalg.expm(matrix * interval)
-    rows, power = row[None], step
-    while len(rows) < lags:
-        rows, power = jnp.concatenate([rows, rows @ power]), power @ power
+        first, following = row @ start, step @ start
+    powers = [step]
+    while 2 ** (len(powers) - 1) < lags:
+        powers.append(powers[-1] @ powers[-1])
     # The last power carries an unstable system beyond any bound: no stationary covariance, so none is returned.
-    stable = jnp.max(jnp.abs(power)) < 1e3
-    r = jnp.where(stable, rows @ start, jnp.nan)
-    return r[:lags] if first is None else jnp.concatenate([first[None], r[: lags - 1]])
+    stable = jnp.max(jnp.abs(powers[-1])) < 1e3
+    return _Autocovariance(jnp.where(stable, first, jnp.nan), row, tuple(powers), jnp.where(stable, following, jnp.nan))
 
 
 @functools.cache
@@ -250,12 +287,11 @@ def response(task: AbstractTask, settings: SpectrumSettings, window: tuple[float
     system = linearise(task)
     samples = round(window[1] * settings.rate) - round(window[0] * settings.rate)
     operator = covariance_operator(settings)
-    lags = max(operator.shape[1], samples)
-    r = _autocovariance(_covariances(task, system), 1 / settings.rate, lags, settings.sampling)
-    noise = jnp.asarray(operator, r.dtype) @ r[: operator.shape[1]]
-    weights = np.where(np.arange(samples) == 0, 1.0, 2.0) * (samples - np.arange(samples)) / samples**2
+    lags = operator.shape[1]
+    r = _autocovariance(_covariances(task, system), 1 / settings.rate, max(lags, samples), settings.sampling)
+    noise = jnp.asarray(operator, r.zero.dtype) @ r.lagged(lags)
     line, swing = _line(task, system, settings, window)
-    variance = r[0] - jnp.asarray(weights, r.dtype) @ r[:samples] + swing
+    variance = r.zero - r.mean_variance(samples) + swing
     return Moments(noise + line, line, system.rest, variance), system
 
 

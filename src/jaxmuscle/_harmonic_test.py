@@ -4,18 +4,16 @@ from typing import NamedTuple
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 from scipy.special import gammaincinv, ndtr
 
-from ._derived import linearised_at
-from ._descend import BATCH, Descent, in_batches
-from ._expected import Moments
-from ._objective import at
+from ._check import seen_best
+from ._derived import consequences
+from ._descend import Descent, descend, seen_at
 from ._problem import Problem, Setup
 
-PROFILE = 2 * BATCH
+PROFILE = 64
 STEPS = 40
 ABSENT = 1e-6
 TEMPLATES = 128
@@ -58,22 +56,10 @@ def _profile(setup: Setup, problem: Problem, final: Descent) -> tuple[np.ndarray
     coordinates, column = setup.coordinates, setup.coordinates.names.index("harmonic_frequency")
     frequency = np.linspace(float(setup.target.frequency[0]), float(setup.target.frequency[-1]), PROFILE)
     theta = np.tile(np.asarray(coordinates.theta(final.s[final.best])), (PROFILE, 1))
-    theta[:, column] = np.log(frequency / coordinates.centre[column]) / coordinates.sd[column]
-    found = in_batches(_pinned(problem, [column]), coordinates.from_theta(theta), STEPS, lambda descent: None)
-    best = in_batches(problem, final.s[[final.best]], STEPS, lambda descent: None)
+    theta[:, column] = coordinates.theta_of("harmonic_frequency", frequency)
+    found = descend(_pinned(problem, [column]), coordinates.from_theta(theta), STEPS)
+    best = descend(problem, final.s[[final.best]], STEPS)
     return frequency, 2 * (found.cost - min(np.nanmin(found.cost), best.cost[0]))
-
-
-@eqx.filter_jit
-def _with_lines(problem: Problem, theta: Float[Array, " free"], frequencies: Float[Array, " frequencies"]) -> Moments:
-    """Moments at θ with a harmonic of the default amplitude at each of the frequencies."""
-    task = at(problem.task, problem.coordinates, theta)
-    amplitude = problem.task.harmonic.amplitude
-
-    def one(frequency: Float[Array, ""]) -> Moments:
-        return problem.model.moments(task.replace(harmonic_amplitude=amplitude, harmonic_frequency=frequency))
-
-    return jax.vmap(one)(frequencies)
 
 
 def _p_value(setup: Setup, problem: Problem, final: Descent) -> float:
@@ -86,16 +72,20 @@ def _p_value(setup: Setup, problem: Problem, final: Descent) -> float:
     names = setup.coordinates.names
     columns = [names.index(name) for name in ("harmonic_amplitude", "harmonic_frequency")]
     theta = np.array(setup.coordinates.theta(final.s))
-    theta[:, columns[0]] = np.log(ABSENT) / setup.coordinates.sd[columns[0]]
+    theta[:, columns[0]] = setup.coordinates.theta_of("harmonic_amplitude", ABSENT)
     problem = _pinned(problem, columns)
-    without = in_batches(problem, setup.coordinates.from_theta(theta), STEPS, lambda descent: None)
+    without = descend(problem, setup.coordinates.from_theta(theta), STEPS)
+    here = seen_best(problem, without)
+    (residual, _), (jacobian, _) = jax.tree.map(np.asarray, consequences(problem, here))
+    null, theta = here.moments, np.tile(here.theta, (TEMPLATES, 1))
     frequencies = np.linspace(float(setup.target.frequency[0]), float(setup.target.frequency[-1]), TEMPLATES)
-    theta = setup.coordinates.theta(without.s[without.best])
-    (null, residual, _), (_, jacobian, _) = jax.tree.map(np.asarray, linearised_at(problem, theta))
-    lines = jax.tree.map(np.asarray, _with_lines(problem, theta, jnp.asarray(frequencies)))
+    theta[:, columns] = np.stack(
+        [np.zeros(TEMPLATES), setup.coordinates.theta_of("harmonic_frequency", frequencies)], axis=1
+    )
+    lines = seen_at(problem, theta).moments
     n, sd = len(setup.target.bins), np.asarray(problem.statistics.sd)
     kept = np.delete(np.arange(len(names)), columns)
-    residual = np.concatenate([residual, np.sqrt(setup.prior[kept]) * np.asarray(theta)[kept]])
+    residual = np.concatenate([residual, np.sqrt(setup.prior[kept]) * here.theta[kept]])
     jacobian = np.concatenate([jacobian[:, kept], np.diag(np.sqrt(setup.prior[kept]))])
 
     strength = lines.line / null.power

@@ -83,6 +83,11 @@ class Coordinates(eqx.Module):
         natural = xp.where(self.positive, self.centre * xp.exp(xp.where(self.positive, step, 0.0)), self.centre + step)
         return dict(zip(self.names, natural, strict=True))
 
+    def theta_of(self, name: str, values: Float[np.ndarray, "*values"] | float) -> Float[np.ndarray, "*values"]:
+        """θ of one positive parameter at natural values."""
+        i = self.names.index(name)
+        return np.asarray(np.log(values / self.centre[i]) / self.sd[i])
+
     def slope(self, values: Float[np.ndarray, " free"]) -> Float[np.ndarray, " free"]:
         """dv/dθ at natural values."""
         return np.where(self.positive, values, 1.0) * self.sd

@@ -1,5 +1,6 @@
 """The integrator: a Brownian path on the step grid and a sub-cycled Heun solver, for diffrax."""
 
+import dataclasses
 from typing import Any, ClassVar
 
 import diffrax as dfx
@@ -9,6 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ._noise import Realisation
+from ._signal import AbstractSignal, Constant, Tabulated
 from ._task import AbstractTask
 
 
@@ -142,11 +144,27 @@ def _harmonic(task: AbstractTask) -> Any:
     return lambda t: base * task.harmonic(t)
 
 
+def tabulated(task: AbstractTask, grid: Grid) -> AbstractTask:
+    """The task with its harmonic and inputs looked up on the grid of sub-steps.
+
+    They are the same for every seed, but inside the loop they would be computed for each state of each seed. Not for the
+    reverse mode, which would carry a gradient of the whole table through every step.
+    """
+    if grid.reverse:
+        return task
+    interval, points = grid.dt / grid.substeps, grid.steps * grid.substeps + 1
+    names = [f.name for f in dataclasses.fields(task) if isinstance(getattr(task, f.name), AbstractSignal)]
+    names = [name for name in names if not isinstance(getattr(task, name), Constant)]
+    parts = [Tabulated.of(signal, interval, points) for signal in (*(getattr(task, n) for n in names), task.harmonic)]
+    return eqx.tree_at(lambda t: [*(getattr(t, n) for n in names), t.harmonic], task, parts)
+
+
 def solve(task: AbstractTask, path: Realisation, grid: Grid) -> Float[Array, "samples states"]:
     """States at every `every`-th grid point, the first included; what overflows is not finite, never an exception."""
     brownian = None
     if path.increments is not None:
         brownian = GridPath(jnp.broadcast_to(path.increments, (grid.steps, 4)))
+    task = tabulated(task, grid)
     solution = dfx.diffeqsolve(
         GridTerm(task, perturbation_at(task, path, grid), task.noise_scale(), brownian, grid.dt),
         SubcycledHeun(grid.every * grid.substeps, 1 / grid.substeps),

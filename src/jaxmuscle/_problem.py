@@ -39,6 +39,12 @@ class Problem(eqx.Module):
     extra: tuple[tuple[Scalar, Scalar] | None, tuple[Scalar, Scalar] | None]
     residual: str = eqx.field(static=True)
 
+    def theta(self, s: Float[Array | np.ndarray, "*rows free"]) -> Float[Array | np.ndarray, "*rows free"]:
+        """Coordinates in prior standard deviations; what is not `moving` (1, else 0) has no slope."""
+        if not isinstance(s, np.ndarray):
+            s = jnp.where(self.moving > 0, s, jax.lax.stop_gradient(s))
+        return self.coordinates.theta(s)
+
     def moments(self, theta: Float[Array, " free"]) -> Moments:
         """Moments of the model at θ."""
         return self.model.moments(at(self.task, self.coordinates, theta))
@@ -62,11 +68,9 @@ class Problem(eqx.Module):
             return difference / self.sigma
         return jnp.cumsum(difference)[:-1] / self.sigma[:-1]
 
-    def residuals(self, s: Float[Array, " free"]) -> Float[Array, " all"]:
-        """Data residuals, then those of the prior; what is not `moving` (1, else 0) stays where it starts."""
-        s = jnp.where(self.moving > 0, s, jax.lax.stop_gradient(s))
-        theta = self.coordinates.theta(s)
-        return jnp.concatenate([self.data_residuals(self.moments(theta)), jnp.sqrt(self.prior) * theta])
+    def residuals(self, theta: Float[Array, " free"], moments: Moments) -> Float[Array, " all"]:
+        """Data residuals of the moments at θ, then those of the prior."""
+        return jnp.concatenate([self.data_residuals(moments), jnp.sqrt(self.prior) * theta])
 
 
 def residual_sigma(kind: str, target: Target, statistics: BinStatistics) -> Float[np.ndarray, " bins"]:

@@ -3,30 +3,30 @@
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from ._check import (
     Stage,
-    best_theta,
     controlled_moments,
     linear_check,
     notices_of,
     polish_check,
     rival_frequencies,
+    seen_best,
     unsettled,
 )
 from ._derived import (
+    consequences,
     correlation_table,
-    derived_numbers,
     derived_table,
     jackknife,
-    linearised_at,
+    observed,
     parameter_table,
     unit_of,
     without_error,
 )
 from ._descend import SMALL, Descent
+from ._expected import Moments
 from ._harmonic_test import harmonic_test
 from ._linear import settled
 from ._objective import MonteCarlo
@@ -48,7 +48,6 @@ from ._uncertainty import (
 )
 
 STRETCH = 5.0
-CHECK_CHUNK = 32
 
 
 def report_fit(
@@ -76,13 +75,13 @@ def report_fit(
             reason = ("no start has a finite spectrum in linear response: there is no stable equilibrium, or no noise that "
                       f"moves {setup.task.output_name} (noise on C does nothing at rest)")  # fmt: skip
         return _failed(setup, common, reason)
-    theta = best_theta(setup, final)
-    (moments, residuals, _), (_, jacobian, found_slopes) = linearised_at(problem, jnp.asarray(theta))
-    residuals, jacobian = np.asarray(residuals), np.asarray(jacobian)
+    seen = seen_best(problem, final)
+    (residuals, quantities), (jacobian, found_slopes) = jax.tree.map(np.asarray, consequences(problem, seen))
+    theta, moments = seen.theta, seen.moments
     task = as_numbers(setup.task.replace(**{n: float(v) for n, v in setup.coordinates.values(theta).items()}))
     simulated = as_numbers(settled(as_arrays(task))) if setup.control else task
     try:
-        runs = ensemble(simulated, jax.random.fold_in(setup.key, 1), seeds=check_seeds, chunk=CHECK_CHUNK)
+        runs = ensemble(simulated, jax.random.fold_in(setup.key, 1), seeds=check_seeds)
     except (SimulationError, ValueError) as error:
         return _failed(setup, common, f"the fitted task cannot be simulated: {error}")
     each, expected = controlled_moments(runs, setup.target.settings, WINDOW)
@@ -90,13 +89,13 @@ def report_fit(
     power_of_each = np.asarray(each.power)[:, chosen]
     each = each._replace(power=power_of_each)
     power = power_of_each.mean(axis=0)
-    line = np.minimum(np.asarray(moments.line), power)
-    share = np.asarray(moments.line / moments.power)
+    line = np.minimum(moments.line, power)
+    share = moments.line / moments.power
     each = each._replace(line=np.tile(line, (len(power_of_each), 1)))
-    values = derived_numbers(as_arrays(task), jax.tree.map(lambda x: np.asarray(x).mean(axis=0), each))
+    values = quantities | observed(Moments(*(np.mean(x, axis=0) for x in each)))
     scatter = _residual_covariance(setup, problem, share)
-    seen = jacobian / np.sqrt(np.maximum(np.diag(scatter), 1.0))[:, None]
-    known = identifiability(seen)
+    scaled = jacobian / np.sqrt(np.maximum(np.diag(scatter), 1.0))[:, None]
+    known = identifiability(scaled)
     success, message = _verdict(final, residuals, jacobian, setup.prior, theta, known, starts, max_steps)
     if interrupted:
         success, message = False, f"interrupted after {int(final.steps.max())} steps; this is what had been reached"
@@ -108,7 +107,7 @@ def report_fit(
     start = round((runs.time[-1] - STRETCH) * runs.rate)
     rivals = rival_frequencies(setup, first if setup.method == "linear" else final)
     parameters = parameter_table(setup, task, covariance, known)
-    found = derived_table(setup, values, found_slopes, jackknife(each), covariance, seen, setup.prior)
+    found = derived_table(setup, values, found_slopes, jackknife(each), covariance, scaled, setup.prior)
     if rivals:
         parameters, found = without_error("harmonic_frequency", parameters), without_error("harmonic_frequency", found)
     check = {} if expected is None else linear_check(power_of_each, np.asarray(expected.power)[chosen], statistics)

@@ -7,13 +7,12 @@ import numpy as np
 from jaxtyping import Float
 
 from ._check import Stage, controlled_moments
-from ._derived import linearised_at
-from ._descend import BATCH, Descent, descend, in_batches
+from ._descend import BATCH, Descent, descend, seen_at
 from ._expected import Moments
 from ._linear import settled
 from ._parameter import as_arrays, as_numbers
 from ._problem import Problem, Setup
-from ._report import CHECK_CHUNK, report_fit
+from ._report import report_fit
 from ._result import FitResult
 from ._simulate import SimulationError, ensemble
 from ._starts import contenders, starting_points
@@ -69,13 +68,15 @@ def _stage(setup: Setup, stages: list[Stage], problem: Problem, name: str, share
 def _linear(setup: Setup, points: np.ndarray, max_steps: int, stages: list[Stage]) -> None:
     """All starts in linear response, the best of them with the line's share known, then the nonlinear correction."""
     problem = setup.linear()
-    first = in_batches(problem, points, max_steps, _stage(setup, stages, problem, "trying starts", (0.05, 0.5), max_steps))
+    show = _stage(setup, stages, problem, "trying starts", (0.05, 0.5), max_steps)
+    first = descend(problem, points, max_steps, report=show)
     if not np.isfinite(first.cost[first.best]):
         return
     best = first.s[contenders(setup.coordinates, setup.target, first, RIVAL_MARGIN)[:BATCH]]
-    share = _share(problem, best[0])
+    share = _share(problem, first)
     problem = setup.linear(share)
-    found = in_batches(problem, best, max_steps, _stage(setup, stages, problem, "linear response", (0.5, 0.6), 15))
+    show = _stage(setup, stages, problem, "linear response", (0.5, 0.6), 15)
+    found = descend(problem, best, max_steps, report=show)
     correction = None
     for turn in range(POLISHES):
         new = _correction(setup, found)
@@ -85,8 +86,8 @@ def _linear(setup: Setup, points: np.ndarray, max_steps: int, stages: list[Stage
         if change < STILL:
             return
         correction, problem = new, setup.linear(share, new)
-        shares = (0.6 + 0.05 * turn, 0.65 + 0.05 * turn)
-        found = in_batches(problem, found.s, max_steps, _stage(setup, stages, problem, "polishing", shares, 15))
+        show = _stage(setup, stages, problem, "polishing", (0.6 + 0.05 * turn, 0.65 + 0.05 * turn), 15)
+        found = descend(problem, found.s, max_steps, report=show)
 
 
 def _correction(setup: Setup, found: Descent) -> Moments | None:
@@ -96,9 +97,7 @@ def _correction(setup: Setup, found: Descent) -> Moments | None:
     values = setup.coordinates.values(setup.coordinates.theta(found.s[found.best]))
     task = setup.task.replace(**{name: float(v) for name, v in values.items()})
     try:
-        runs = ensemble(
-            as_numbers(settled(as_arrays(task))), jax.random.fold_in(setup.key, 2), seeds=setup.seeds, chunk=CHECK_CHUNK
-        )
+        runs = ensemble(as_numbers(settled(as_arrays(task))), jax.random.fold_in(setup.key, 2), seeds=setup.seeds)
     except (SimulationError, ValueError):
         return None  # the check on fresh seeds meets the same error and reports it
     chosen = setup.target.bins - setup.target.settings.first_bin
@@ -116,7 +115,7 @@ def _montecarlo(setup: Setup, points: np.ndarray, max_steps: int, stages: list[S
     if setup.control:
         problem = setup.linear()
         show = _stage(setup, stages, problem, "trying starts", (0.05, 0.4), max_steps)
-        first = in_batches(problem, points, max_steps, show)
+        first = descend(problem, points, max_steps, report=show)
     else:
         problem = setup.montecarlo(max(8, setup.seeds // 3))
         show = _stage(setup, stages, problem, "trying starts", (0.05, 0.4), FIRST_STEPS)
@@ -124,13 +123,14 @@ def _montecarlo(setup: Setup, points: np.ndarray, max_steps: int, stages: list[S
     if not np.isfinite(first.cost[first.best]):
         return
     best = first.s[contenders(setup.coordinates, setup.target, first, RIVAL_MARGIN)[:MOST_RIVALS]]
-    share = _share(problem, best[0])
+    share = _share(problem, first)
     problem = setup.finer(setup.montecarlo(setup.seeds, share), best)
     descend(problem, best, max_steps, prepare=setup.finer,
             report=_stage(setup, stages, problem, "polishing", (0.4, 0.8), 15))  # fmt: skip
 
 
-def _share(problem: Problem, s: Float[np.ndarray, " free"]) -> Float[np.ndarray, " bins"]:
-    """Share of the harmonic's line in each bin."""
-    moments = linearised_at(problem, problem.coordinates.theta(s))[0][0]
-    return np.clip(np.nan_to_num(np.asarray(moments.line) / np.asarray(moments.power)), 0.0, 1.0)
+def _share(problem: Problem, descent: Descent) -> Float[np.ndarray, " bins"]:
+    """Share of the harmonic's line in each bin at the best point."""
+    moments = seen_at(problem, np.asarray(problem.theta(descent.s))).moments
+    share = moments.line[descent.best] / moments.power[descent.best]
+    return np.clip(np.nan_to_num(share), 0.0, 1.0)

@@ -1,6 +1,8 @@
 """Inputs as functions of time: constant, smooth step, ramp and hold, decay, sampled signal."""
 
 import abc
+from collections.abc import Callable
+from functools import partial
 from typing import ClassVar
 
 import equinox as eqx
@@ -149,12 +151,42 @@ class Sampled(AbstractSignal):
         return self.level * jnp.polyval(coefficients[piece], t - breaks[piece])
 
 
+class Tabulated(AbstractSignal):
+    """A function of time and its first two derivatives at multiples of `interval` [s], looked up: for use in a loop."""
+
+    rows: Float[Array, "3 points"]
+    interval: float = eqx.field(static=True)
+    level: Scalar = 1.0
+    smoothness: ClassVar[int] = 2
+
+    @classmethod
+    def of(cls, signal: Callable[[Scalar], Scalar], interval: float, points: int) -> "Tabulated":
+        """A signal or harmonic from t = 0 on."""
+        rows = jax.vmap(lambda t: jnp.stack(derivatives(signal, t, 2)))(jnp.arange(float(points)) * interval)
+        return cls(rows=rows.T, interval=interval)
+
+    def __call__(self, t: Scalar) -> Scalar:
+        return _row(0, self.interval, self.rows, t)
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(0, 1))
+def _row(order: int, interval: float, rows: Array, t: Scalar) -> Scalar:
+    return rows[order, jnp.clip(jnp.round(t / interval).astype(int), 0, rows.shape[1] - 1)]
+
+
+@_row.defjvp
+def _row_jvp(order, interval, primals, tangents):
+    (rows, t), (rows_dot, t_dot) = primals, tangents
+    slope = _row(order, interval, rows_dot, t) + _row(order + 1, interval, rows, t) * t_dot
+    return _row(order, interval, rows, t), slope
+
+
 def as_signal(value: AbstractSignal | Scalar) -> AbstractSignal:
     """A signal as it is; a number as a smooth step to that level."""
     return value if isinstance(value, AbstractSignal) else SmoothStep(value)
 
 
-def derivatives(signal: AbstractSignal, t: Scalar, order: int) -> tuple[Scalar, ...]:
+def derivatives(signal: Callable[[Scalar], Scalar], t: Scalar, order: int) -> tuple[Scalar, ...]:
     """The signal and its time derivatives up to `order`."""
     t = jnp.asarray(t)
 

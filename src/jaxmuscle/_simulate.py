@@ -1,6 +1,7 @@
 """Simulation of a task: one seed or an ensemble, jitted, vmapped over seeds, in chunks that bound memory."""
 
 import math
+from collections.abc import Iterable
 from typing import Any
 
 import equinox as eqx
@@ -19,7 +20,8 @@ from ._trajectory import WINDOW, Trajectory, one, stack
 
 MAX_RATE_STEP = 0.5
 MAX_SUBSTEPS = 256
-CHUNK = 64
+CHUNK = 32
+DRAWN = 8
 DURATION = 15.0
 DT = 1e-3
 TRANSIENT = 1e-3
@@ -56,7 +58,7 @@ def simulate(
     seeds = jnp.atleast_1d(jnp.asarray(seed))
     grid, sampling, rate = _plan(task, duration, dt, rate, substeps, sampling)
     result = one(_run(task, key, seeds, grid, sampling, rate))
-    _require_finite([result])
+    _require_finite(result)
     return result
 
 
@@ -94,15 +96,11 @@ def ensemble(
         return _run(task, key, jnp.asarray(numbers), grid, sampling, rate, linear)
     linear = None if control is False else _companion(task, duration, required=control is True)
     size = min(chunk, 8 * math.ceil(numbers.size / 8))
-    parts = []
-    for start in _progress(range(0, numbers.size, size), size, numbers.size, progress):
-        here = numbers[start : start + size]
-        padded = np.concatenate([here, np.full(size - here.size, here[-1])])
-        result = _run(task, key, jnp.asarray(padded), grid, sampling, rate, linear)
-        parts.append(jax.tree.map(lambda x, n=here.size: x[:n] if np.ndim(x) and x.shape[0] == size else x, result)
-                     if here.size < size else result)  # fmt: skip
-    _require_finite(parts)
-    return stack(parts)
+    blocks = np.concatenate([numbers, np.full(-numbers.size % size, numbers[-1])]).reshape(-1, size)
+    parts = (_run(task, key, jnp.asarray(block), grid, sampling, rate, linear) for block in blocks)
+    found = stack(_progress(parts, len(blocks), numbers.size, progress), numbers.size)
+    _require_finite(found)
+    return found
 
 
 def _companion(task: AbstractTask, duration: float, *, required: bool) -> LinearTask | None:
@@ -128,12 +126,12 @@ def _companion(task: AbstractTask, duration: float, *, required: bool) -> Linear
     return linear
 
 
-def _progress(starts: range, size: int, total: int, show: bool) -> Any:
+def _progress(parts: Iterable[Trajectory], count: int, total: int, show: bool) -> Iterable[Trajectory]:
     if not show:
-        return starts
+        return parts
     from rich.progress import track
 
-    return track(starts, description=f"simulating {total} seeds", transient=True)
+    return track(parts, description=f"simulating {total} seeds", total=count, transient=True)
 
 
 def _all_concrete(tree: Any) -> bool:
@@ -185,8 +183,8 @@ def stable_substeps(task: AbstractTask, dt: float, duration: float = DURATION) -
 
 
 def draw(noise: AbstractNoise, key: PRNGKeyArray, seeds: Int[Array, " seeds"], steps: int) -> Float[Array, "..."]:
-    """Normals of every seed; seed i depends on nothing but the key and i."""
-    return jax.vmap(lambda i: noise.draw(jax.random.fold_in(key, i), steps))(seeds)
+    """Normals of every seed; seed i depends on nothing but the key and i. Few at a time, which stay in the cache."""
+    return jax.lax.map(lambda i: noise.draw(jax.random.fold_in(key, i), steps), seeds, batch_size=DRAWN)
 
 
 def respond(
@@ -226,15 +224,14 @@ def _run(
     return Trajectory(task, states, output, seeds, rate, grid.dt, grid.substeps, sampling, beside)
 
 
-def _require_finite(parts: list[Trajectory]) -> None:
-    if not _all_concrete([part.output for part in parts]):
+def _require_finite(found: Trajectory) -> None:
+    if not _all_concrete(found.output):
         return
-    bad = [int(s) for part in parts for s in np.atleast_1d(part.seeds)[~np.atleast_1d(np.asarray(part.finite))]]
-    if bad:
-        task = parts[0].task
-        values = ", ".join(f"{name} = {float(value):.6g}" for name, value in as_numbers(task.parameters).items())
-        shown = ", ".join(map(str, bad[:10])) + (f" and {len(bad) - 10} more" if len(bad) > 10 else "")
+    bad = np.atleast_1d(found.seeds)[~np.atleast_1d(np.asarray(found.finite))]
+    if bad.size:
+        values = ", ".join(f"{name} = {float(value):.6g}" for name, value in as_numbers(found.task.parameters).items())
+        shown = ", ".join(str(int(s)) for s in bad[:10]) + (f" and {len(bad) - 10} more" if len(bad) > 10 else "")
         raise SimulationError(
-            f"{len(bad)} seed(s) did not stay finite ({shown}) in {type(task).__name__} at dt = {parts[0].dt} s, "
-            f"{parts[0].substeps} sub-step(s): lower the noise amplitude or dt. Parameters: {values}"
+            f"{len(bad)} seed(s) did not stay finite ({shown}) in {type(found.task).__name__} at dt = {found.dt} s, "
+            f"{found.substeps} sub-step(s): lower the noise amplitude or dt. Parameters: {values}"
         )

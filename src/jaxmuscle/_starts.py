@@ -22,7 +22,7 @@ def starting_points(coordinates: Coordinates, target: Target, count: int) -> Flo
     if "harmonic_frequency" in coordinates.names:
         column = coordinates.names.index("harmonic_frequency")
         frequencies = _candidate_frequencies(target, count)
-        theta[:, column] = np.log(frequencies / coordinates.centre[column]) / coordinates.sd[column]
+        theta[:, column] = coordinates.theta_of("harmonic_frequency", frequencies)
     return coordinates.from_theta(theta)
 
 

@@ -2,6 +2,7 @@
 
 import functools
 import json
+from collections.abc import Iterable
 from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
 
@@ -154,11 +155,14 @@ def versions() -> dict[str, str]:
     return {name: version(name) for name in ("jaxmuscle", "jax", "diffrax", "optimistix", "equinox", "numpy")}
 
 
-def stack(parts: list[Trajectory]) -> Trajectory:
-    """Join trajectories along the seed axis."""
+def stack(parts: Iterable[Trajectory], count: int) -> Trajectory:
+    """Join trajectories along the seed axis and keep the first `count` seeds."""
+    parts = list(parts)
     first = parts[0]
     names = ("states", "output", "seeds") + (() if first.linear is None else ("linear",))
-    joined: dict[str, Any] = {name: np.concatenate([np.asarray(getattr(part, name)) for part in parts]) for name in names}
+    joined: dict[str, Any] = {
+        name: np.concatenate([np.asarray(getattr(part, name)) for part in parts])[:count] for name in names
+    }
     joined.setdefault("linear", None)
     return Trajectory(first.task, **joined, rate=first.rate, dt=first.dt, substeps=first.substeps,
                       sampling=first.sampling)  # fmt: skip
