@@ -375,13 +375,13 @@ def test_ctrl_c(tmp_path):
     """A real signal, once the first steps have been taken."""
     code = """
 import contextlib
-from jaxmuscle import _cli
+from jaxmuscle import _cli, _cli_fit
 
 @contextlib.contextmanager
 def loud(title):
     yield lambda text, share: print(text, flush=True)
 
-_cli._progress = loud
+_cli_fit.progress = loud
 _cli.main()
 """
     arguments = ["fit", str(csv_file(tmp_path)), "--free", "c_w,noise_K_w", "--starts", "4", "--seeds", "24"]

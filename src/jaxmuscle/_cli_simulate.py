@@ -1,0 +1,73 @@
+"""`jaxmuscle simulate`."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from ._console import Output, Seed, TaskName, csv_text, err, out, reporting, save_figure, writable
+
+if TYPE_CHECKING:
+    from ._task import AbstractTask
+
+
+def simulate(
+    preset: Annotated[str, typer.Argument(help="Bundled preset (see `jaxmuscle presets`), preset file or fit.json.")],
+    task: Annotated[TaskName | None, typer.Option(help="Put the same muscle into another task.")] = None,
+    seeds: Annotated[int, typer.Option(min=1, help="Noise paths.")] = 50,
+    seed: Seed = 0,
+    output: Output = Path("out"),
+) -> None:
+    """Simulate a saved task.
+
+    Writes DIR/trajectories.nc, DIR/spectrum.csv and DIR/simulate.png.
+
+    Examples:
+
+        jaxmuscle simulate zagrodny-slifkin --seeds 200 --out out/simulate
+
+        jaxmuscle simulate out/fit/fit.json --task prescribed-force
+    """
+    with reporting():
+        from ._cache import keep_compiled_programs
+        from ._preset import load_preset
+        from ._task import TASKS
+
+        keep_compiled_programs()
+        model = load_preset(preset)
+        if task is not None and type(model) is not TASKS[task]:
+            model = model.as_task(TASKS[task])
+        writable(output)
+        _simulate(model, seeds, seed, output)
+
+
+def _simulate(model: "AbstractTask", seeds: int, seed: int, folder: Path) -> None:
+    import jax
+    import numpy as np
+
+    from . import plot
+    from ._metrics import peaks
+    from ._simulate import ensemble
+    from ._store import replacing, write_text
+
+    runs = ensemble(model, jax.random.key(seed), seeds=seeds, progress=err.is_terminal)
+    spectra = runs.spectrum()
+    estimate = runs.mean_spectrum()
+    mean = estimate.spectrum
+    dataset = runs.to_xarray().assign_attrs(seed=seed)
+    with replacing(folder / "trajectories.nc") as temporary:
+        dataset.to_netcdf(temporary, engine="h5netcdf")
+    low, high = np.quantile(np.asarray(spectra.proportional), [0.05, 0.95], axis=0)
+    columns = {"frequency_hz": np.asarray(mean.frequency), "power": np.asarray(mean.power), "power_stderr": estimate.stderr,
+               "proportional_power": np.asarray(mean.proportional), "quantile_05": low, "quantile_95": high}  # fmt: skip
+    write_text(folder / "spectrum.csv", csv_text(columns))
+    save_figure(plot.simulation(runs), folder / "simulate.png")
+    held = np.asarray(runs.between())
+    found = peaks(mean)
+    unit = model.output_unit
+    out.print(f"{type(model).__name__}, {seeds} seeds of {runs.time[-1]:g} s: {model.output_name} "
+              f"{held.mean():.4g} {unit}, coefficient of variation "
+              f"{100 * np.mean(held.std(axis=1) / np.abs(held.mean(axis=1))):.3g} %", highlight=False)  # fmt: skip
+    locals_ = ", ".join(f"{p.frequency:.3f}" for p in found.local_maxima) or "none"
+    out.print(f"Spectrum: maximum at {found.maximum.frequency:.3f} Hz, local maxima at {locals_} Hz", highlight=False)
+    out.print(f"Written: {folder}/trajectories.nc, spectrum.csv, simulate.png", highlight=False)

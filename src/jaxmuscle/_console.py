@@ -1,0 +1,93 @@
+"""What the commands share: consoles, exit codes, errors in one line, progress, tables and figures as files."""
+
+import contextlib
+import csv
+import io
+import os
+from collections.abc import Iterator
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+
+CONVERGED, NOT_CONVERGED, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
+
+out = Console(soft_wrap=False)
+err = Console(stderr=True, soft_wrap=True)
+
+Output = Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for the results.")]
+Seed = Annotated[int, typer.Option(help="Seed of all random numbers.")]
+
+
+class TaskName(StrEnum):
+    isometric = "isometric"
+    motion = "prescribed-motion"
+    force = "prescribed-force"
+
+
+@contextlib.contextmanager
+def reporting() -> Iterator[None]:
+    """Turn a user's mistake into one line and exit code 2, a numerical failure into 1, an interruption into 130."""
+    from ._simulate import SimulationError
+
+    try:
+        yield
+    except (ValueError, OSError) as error:
+        err.print(f"[bold red]error:[/] {plain(_words(error))}", highlight=False)
+        raise typer.Exit(BAD_INPUT) from None
+    except SimulationError as error:
+        err.print(f"[bold red]failed:[/] {plain(error)}", highlight=False)
+        raise typer.Exit(NOT_CONVERGED) from None
+    except KeyboardInterrupt:
+        err.print("interrupted")
+        raise typer.Exit(INTERRUPTED) from None
+
+
+def _words(error: Exception) -> str:
+    if isinstance(error, OSError) and error.filename is not None:
+        return f"{error.filename}: {error.strerror}"
+    return str(error)
+
+
+def plain(text: object) -> str:
+    return str(text).replace("[", r"\[")
+
+
+def writable(folder: Path) -> None:
+    """Fail before the long work, not after it."""
+    if folder.exists() and not folder.is_dir():
+        raise ValueError(f"--out {folder}: is a file, give a folder")
+    folder.mkdir(parents=True, exist_ok=True)
+    if not os.access(folder, os.W_OK | os.X_OK):
+        raise ValueError(f"--out {folder}: cannot be written to")
+
+
+@contextlib.contextmanager
+def progress(title: str) -> Iterator[Any]:
+    """A progress bar on a terminal, nothing elsewhere."""
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+    columns = (TextColumn("{task.fields[title]}"), BarColumn(), TextColumn("{task.description}"), TimeElapsedColumn())
+    with Progress(*columns, console=err, transient=True, disable=not err.is_terminal) as bar:
+        row = bar.add_task("starting", total=1.0, title=title)
+        yield lambda text, share: bar.update(row, description=text, completed=share)
+
+
+def csv_text(columns: dict[str, Any]) -> str:
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(columns)
+    writer.writerows([f"{value:.8g}" for value in row] for row in zip(*columns.values(), strict=True))
+    return text.getvalue()
+
+
+def save_figure(figure: Any, path: Path) -> None:
+    import matplotlib.pyplot as plt
+
+    from ._store import replacing
+
+    with replacing(path) as temporary:
+        figure.savefig(temporary, dpi=150)
+    plt.close(figure)
