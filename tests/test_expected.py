@@ -389,6 +389,21 @@ def test_lags_and_the_variance_of_a_mean_are_plain_sums(x64, samples):
     np.testing.assert_allclose(found.mean_variance(samples), np.array(r)[lag].mean(), rtol=1e-11)
 
 
+@pytest.mark.parametrize("name", ["zagrodny-slifkin", "zagrodny-hamilton"])
+def test_heavy_forces_on_soft_tissue_have_an_equilibrium_in_single_precision(name):
+    """Accelerations of 1e3 m/s² are rounded by more than displacements of 1e-2 m are large."""
+    task = jm.load_preset(name).as_task(jm.PrescribedForce)
+    single = np.asarray(jm.equilibrium(task))
+    with jax.enable_x64(True):
+        np.testing.assert_allclose(single, jm.equilibrium(task), rtol=1e-6, atol=1e-8)
+
+
+def test_a_task_from_outside_a_compiled_function():
+    task = jm.Isometric()
+    scaled = jax.jit(lambda x: x * jm.expected_spectrum(task).power)(2.0)
+    np.testing.assert_allclose(scaled, 2 * np.asarray(jm.expected_spectrum(task).power), rtol=1e-5)
+
+
 class Crossbridge(jm.AbstractMuscle):
     """A user's own muscle: a cubic active and a linear passive tissue. Counts how often it is traced."""
 

@@ -206,11 +206,12 @@ class Direct(eqx.Module):
     """A problem whose model gives the residuals themselves."""
 
     model: None = None
+    data: None = None
 
     def theta(self, s):
         return s
 
-    def residuals(self, theta, moments):
+    def residuals(self, theta, moments, data):
         return moments
 
 
@@ -281,8 +282,8 @@ def test_residuals_and_their_slopes_are_exact_where_the_model_was_seen(x64):
     seen = seen_at(problem, s)
     for i, point in enumerate(jnp.asarray(s)):
         here = jax.tree.map(lambda x, i=i: x[i], seen)
-        np.testing.assert_allclose(_residuals(point, (problem, here))[0], problem.moments(point), rtol=1e-14)
-        slope = jax.jacfwd(lambda s, here=here: _residuals(s, (problem, here))[0])(point)
+        np.testing.assert_allclose(_residuals(point, (problem, None, here))[0], problem.moments(point), rtol=1e-14)
+        slope = jax.jacfwd(lambda s, here=here: _residuals(s, (problem, None, here))[0])(point)
         np.testing.assert_allclose(slope, jax.jacfwd(problem.moments)(point), rtol=1e-14)
 
 
@@ -301,10 +302,10 @@ def _problem(residual, extra=(None, None)):
 def test_gradients_of_the_residuals_are_differences(x64, residual):
     problem = _problem(residual, ((np.log(0.02), 0.1), (2.0, 0.1)))
     s = jnp.asarray([0.2, -0.1, 0.05])
-    whole = lambda s: problem.residuals(problem.theta(s), problem.moments(problem.theta(s)))  # noqa: E731
+    whole = lambda s: problem.residuals(problem.theta(s), problem.moments(problem.theta(s)), problem.data)  # noqa: E731
     evaluate = eqx.filter_jit(whole)
     seen = jax.tree.map(lambda x: x[0], seen_at(problem, np.asarray(problem.theta(s))[None]))
-    forward = jax.jacfwd(lambda s: _residuals(s, (problem, seen))[0])(s)
+    forward = jax.jacfwd(lambda s: _residuals(s, (problem, problem.data, seen))[0])(s)
     np.testing.assert_allclose(forward, eqx.filter_jit(jax.jacfwd(whole))(s), rtol=1e-9, atol=1e-12)
     h = 1e-4
     central = np.stack([(evaluate(s + h * e) - evaluate(s - h * e)) / (2 * h) for e in np.eye(3)], axis=1)
@@ -318,7 +319,7 @@ def test_gradients_of_the_residuals_are_differences(x64, residual):
 def test_the_extra_residuals_are_log_variation_and_mean(x64):
     problem = _problem("log", ((np.log(0.02), 0.1), (2.0, 0.1)))
     moments = eqx.filter_jit(problem.moments)(jnp.zeros(3))
-    rows = problem.data_residuals(moments)[-2:]
+    rows = problem.data_residuals(moments, problem.data)[-2:]
     expected = [np.log(float(moments.variation) / 0.02) / 0.1, (float(moments.mean) - 2.0) / 0.1]
     np.testing.assert_allclose(rows, expected)
 
@@ -328,9 +329,9 @@ def test_the_residuals_vanish_for_a_target_that_the_model_makes(x64):
         problem = _problem(residual)
         moments = eqx.filter_jit(problem.moments)(jnp.zeros(3))
         bias = np.exp(problem.statistics.bias) if residual == "log" else 1.0
-        made = eqx.tree_at(lambda p: p.target, problem, moments.proportional * bias)
-        np.testing.assert_allclose(made.data_residuals(moments), 0.0, atol=1e-12)
-        shifted = made.data_residuals(eqx.filter_jit(problem.moments)(jnp.full(3, 0.2)))
+        made = eqx.tree_at(lambda p: p.data.target, problem, moments.proportional * bias)
+        np.testing.assert_allclose(made.data_residuals(moments, made.data), 0.0, atol=1e-12)
+        shifted = made.data_residuals(eqx.filter_jit(problem.moments)(jnp.full(3, 0.2)), made.data)
         assert np.abs(shifted).max() > 0.1
 
 

@@ -4,6 +4,9 @@ from . import plot as plot
 from .__about__ import __version__ as __version__
 from ._bundled import list_presets as list_presets
 from ._bundled import list_targets as list_targets
+from ._cohort import CohortResult as CohortResult
+from ._cohort import Difference as Difference
+from ._cohort import fit_cohort as fit_cohort
 from ._estimate import SpectrumEstimate as SpectrumEstimate
 from ._expected import expected_spectrum as expected_spectrum
 from ._fit import FitInterrupted as FitInterrupted
@@ -33,9 +36,15 @@ from ._parameter import PARAMETERS as PARAMETERS
 from ._parameter import Parameter as Parameter
 from ._preset import load_preset as load_preset
 from ._preset import save_preset as save_preset
+from ._recording import Recording as Recording
+from ._recording_file import load_recording as load_recording
+from ._recording_summary import RecordingSummary as RecordingSummary
 from ._result import Estimate as Estimate
 from ._result import FitResult as FitResult
 from ._result import load_result as load_result
+from ._scaling import at_level as at_level
+from ._scaling import relative_variation as relative_variation
+from ._scaling import scaled as scaled
 from ._sensitivity import Sensitivity as Sensitivity
 from ._sensitivity import sensitivity as sensitivity
 from ._signal import AbstractSignal as AbstractSignal
@@ -53,6 +62,8 @@ from ._spectrum import lowpass as lowpass
 from ._spectrum import periodogram as periodogram
 from ._spectrum import spectrum_of as spectrum_of
 from ._spectrum import welch as welch
+from ._static import StaticCharacteristics as StaticCharacteristics
+from ._static import static_characteristics as static_characteristics
 from ._target import Target as Target
 from ._target import load_target as load_target
 from ._task import AbstractTask as AbstractTask

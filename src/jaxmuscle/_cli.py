@@ -7,6 +7,7 @@ import typer
 from rich.table import Table
 
 from ._bundled import describe_presets, describe_targets
+from ._cli_analyse import analyse
 from ._cli_fit import fit
 from ._cli_simulate import simulate
 from ._console import out, plain
@@ -16,10 +17,11 @@ app = typer.Typer(
     no_args_is_help=True,
     rich_markup_mode="markdown",
     pretty_exceptions_enable=False,
-    help="A stochastic rheological muscle: simulate its force, fit it to measured force spectra.",
+    help="A stochastic rheological muscle: simulate its force, analyse recordings, fit it to measured force spectra.",
 )
 app.command()(fit)
 app.command()(simulate)
+app.command()(analyse)
 
 
 @app.command()

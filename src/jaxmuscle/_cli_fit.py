@@ -34,6 +34,11 @@ class NoiseName(StrEnum):
     ornstein_uhlenbeck = "ornstein-uhlenbeck"
 
 
+class AxisName(StrEnum):
+    linear = "linear"
+    log_log = "log-log"
+
+
 class MethodName(StrEnum):
     linear = "linear"
     montecarlo = "montecarlo"
@@ -47,7 +52,7 @@ class ResidualName(StrEnum):
 
 def fit(
     target: Annotated[
-        list[str], typer.Argument(help="Bundled target (see `jaxmuscle targets`) or path of a .toml or .csv.")
+        list[str], typer.Argument(help="Bundled target (see `jaxmuscle targets`) or path of a .toml, .csv, .json, .tar.")
     ],
     task: Annotated[TaskName | None, typer.Option(help="Default: follows from what the target measured.")] = None,
     method: Annotated[
@@ -68,11 +73,19 @@ def fit(
     seed: Seed = 0,
     segments: Annotated[int | None, typer.Option(min=1, help="Welch segments behind the target.")] = None,
     quantity: Annotated[str | None, typer.Option(help="force, torque or displacement.")] = None,
+    dataset: Annotated[str | None, typer.Option(metavar="NAME", help="Which dataset of a digitised figure.")] = None,
+    axis: Annotated[
+        AxisName, typer.Option(help="log-log: a digitised figure's points are log10 of Hz and of power.")
+    ] = AxisName.linear,
+    groups: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="CSV with the columns target, group (several targets).")
+    ] = None,
     output: Output = Path("out"),
 ) -> None:
-    """Fit the muscle to a target spectrum.
+    """Fit the muscle to a target spectrum, or to those of many people together.
 
-    Writes DIR/fit.json, DIR/fit.png and DIR/spectrum.csv (several targets: DIR/TARGET/...), prints a table.
+    Writes DIR/fit.json, DIR/fit.png and DIR/spectrum.csv prints a table. Several targets: DIR/TARGET/... and
+    DIR/cohort.csv, cohort.png (and differences.csv with groups); fitted in linear response, without its last checks.
 
     Examples:
 
@@ -81,6 +94,10 @@ def fit(
         jaxmuscle fit my-spectrum.csv --segments 12 --noise ornstein-uhlenbeck
 
         jaxmuscle fit fdi-abduction-45mvc --fix m_w=0.1 --free c_w,noise_K_w
+
+        jaxmuscle fit people/*.csv --groups groups.csv --out out/cohort
+
+        jaxmuscle fit figure.tar --dataset "95 MVC" --segments 6
     """
     with reporting():
         from ._cache import keep_compiled_programs
@@ -89,14 +106,27 @@ def fit(
         keep_compiled_programs()
         fixed = _fixed(fix or [])
         names = None if free is None else [name.strip() for name in free.split(",") if name.strip()]
-        targets = [load_target(t, quantity=quantity, segments=segments) for t in target]
-        folders = [output] if len(targets) == 1 else [output / t.name for t in targets]
-        if len(set(folders)) < len(folders):
-            raise ValueError("two targets have the same name and would share a folder: rename one")
-        options = {"free": names, "fix": fixed, "noise": str(noise), "method": str(method), "residual": str(residual),
-                   "starts": starts, "seeds": seeds, "key": seed}  # fmt: skip
-        converged = [_fit_one(t, task, folder, options) for t, folder in zip(targets, folders, strict=True)]
-    raise typer.Exit(CONVERGED if all(converged) else NOT_CONVERGED)
+        read = {"quantity": quantity, "segments": segments, "dataset": dataset, "axis": str(axis)}
+        options = {
+            "free": names,
+            "fix": fixed,
+            "noise": str(noise),
+            "residual": str(residual),
+            "starts": starts,
+            "key": seed,
+        }
+        if len(target) > 1:
+            from ._cli_cohort import fit_together
+
+            if method != MethodName.linear or seeds is not None:
+                raise ValueError("several targets are fitted together in linear response: leave out --method and --seeds, "
+                                 "or fit them one at a time")  # fmt: skip
+            raise typer.Exit(fit_together(target, read, task, groups, output, options))
+        if groups is not None:
+            raise ValueError("--groups needs several targets")
+        options |= {"method": str(method), "seeds": seeds}
+        converged = _fit_one(load_target(target[0], **read), task, output, options)  # pyright: ignore[reportArgumentType]
+    raise typer.Exit(CONVERGED if converged else NOT_CONVERGED)
 
 
 def _fit_one(target: Any, task: TaskName | None, folder: Path, options: dict[str, Any]) -> bool:
@@ -112,10 +142,10 @@ def _fit_one(target: Any, task: TaskName | None, folder: Path, options: dict[str
         with progress(f"fitting {target.name}") as tell:
             result = fit_task(model, target, progress=tell, **options)
     except FitInterrupted as stop:
-        _write_fit(stop.result, folder)
+        write_fit(stop.result, folder)
         err.print(f"interrupted: what had been reached is in {folder}")
         raise typer.Exit(INTERRUPTED) from None
-    _write_fit(result, folder)
+    write_fit(result, folder)
     _show_fit(result, folder)
     return result.success
 
@@ -136,7 +166,8 @@ def _fixed(pairs: list[str]) -> dict[str, float]:
     return fixed
 
 
-def _write_fit(result: "FitResult", folder: Path) -> None:
+def write_fit(result: "FitResult", folder: Path) -> None:
+    """fit.json, spectrum.csv and fit.png, each whole or not there."""
     from ._store import write_text
 
     result.save(folder / "fit.json")

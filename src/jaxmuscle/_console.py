@@ -76,11 +76,18 @@ def progress(title: str) -> Iterator[Any]:
 
 
 def csv_text(columns: dict[str, Any]) -> str:
+    """Columns as CSV; numbers with eight digits, None as an empty field."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(columns)
-    writer.writerows([f"{value:.8g}" for value in row] for row in zip(*columns.values(), strict=True))
+    writer.writerows([_field(value) for value in row] for row in zip(*columns.values(), strict=True))
     return text.getvalue()
+
+
+def _field(value: Any) -> str:
+    if value is None or isinstance(value, str | bool):
+        return "" if value is None else str(value)
+    return f"{value:.8g}"
 
 
 def save_figure(figure: Any, path: Path) -> None:

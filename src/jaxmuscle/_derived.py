@@ -138,7 +138,8 @@ def consequences(problem: Any, seen: Seen) -> tuple[Any, Any]:
 
     def everything(theta):
         moments = seen.nearby(theta)
-        values = problem.data_residuals(moments), derived(at(problem.task, problem.coordinates, theta), moments)
+        task = at(problem.task, problem.coordinates, theta)
+        values = problem.data_residuals(moments, problem.data), derived(task, moments)
         return values, values
 
     slopes, values = jax.jacfwd(everything, has_aux=True)(seen.theta)

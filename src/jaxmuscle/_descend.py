@@ -13,7 +13,7 @@ from ._objective import Linear
 
 SMALL = 1e-3
 STILL = 1e-4
-REFUSALS = 6
+REFUSALS = 10
 BATCH = 32
 ROWS = 128
 
@@ -71,32 +71,33 @@ def seen_at(problem: Any, theta: Float[np.ndarray, "points free"]) -> Seen:
     return Seen(theta, *jax.tree.map(lambda *x: np.concatenate(x)[:count], *parts))
 
 
-def _residuals(s: Float[Array, " free"], given: tuple[Any, Seen]) -> tuple[Float[Array, " residuals"], None]:
+def _residuals(s: Float[Array, " free"], given: tuple[Any, Any, Seen]) -> tuple[Float[Array, " residuals"], None]:
     """Residuals with their slopes at the s where the model was seen: all that a Levenberg-Marquardt step asks for."""
-    problem, seen = given
+    problem, data, seen = given
     theta = problem.theta(s)
-    return problem.residuals(theta, seen.nearby(theta)), None
+    return problem.residuals(theta, seen.nearby(theta), data), None
 
 
 SOLVER = optx.LevenbergMarquardt(rtol=1e-9, atol=1e-9)
 
 
 @eqx.filter_jit
-def _start(problem, starts, seen):
-    def one(s, seen):
-        shape = jax.eval_shape(lambda s: _residuals(s, (problem, seen))[0], s)
-        return SOLVER.init(_residuals, s, (problem, seen), {}, shape, None, frozenset())
+def _start(problem, data, starts, seen):
+    def one(data, s, seen):
+        given = (problem, data, seen)
+        shape = jax.eval_shape(lambda s: _residuals(s, given)[0], s)
+        return SOLVER.init(_residuals, s, given, {}, shape, None, frozenset())
 
-    return eqx.filter_vmap(one)(starts, seen)
+    return eqx.filter_vmap(one)(data, starts, seen)
 
 
 @eqx.filter_jit
-def _step(problem, s, state, seen):
-    def one(s, state, seen):
-        s, state, _ = SOLVER.step(_residuals, s, (problem, seen), {}, state, frozenset())
+def _step(problem, data, s, state, seen):
+    def one(data, s, state, seen):
+        s, state, _ = SOLVER.step(_residuals, s, (problem, data, seen), {}, state, frozenset())
         return s, state, 0.5 * (state.f_info.residual**2).sum(), state.num_accepted_steps
 
-    return eqx.filter_vmap(one)(s, state, seen)
+    return eqx.filter_vmap(one)(data, s, state, seen)
 
 
 class _Standing(NamedTuple):
@@ -143,11 +144,13 @@ def descend(
     starts: Float[np.ndarray, "starts free"],
     max_steps: int,
     *,
+    data: Any = None,
     prepare: Callable[[Any, np.ndarray], Any] = lambda problem, points: problem,
     report: Callable[[Descent], None] = lambda descent: None,
 ) -> Descent:
-    """Minimise `½ Σ r²`, `r = problem.residuals(θ, problem.moments(θ))`, from every start.
+    """Minimise `½ Σ r²`, `r = problem.residuals(θ, problem.moments(θ), data)`, from every start.
 
+    `data` has a leading axis of starts: each may have a target of its own; without it all have the problem's.
     Steps to where r is not finite are rejected. A start ends when two accepted steps in a row lower its cost by less than
     `STILL` of it, after `REFUSALS` rejected steps in a row, or if it is not finite; what has ended costs nothing more.
     `prepare(problem, points)` may exchange the problem before each step (sub-steps); `report` sees every step's outcome.
@@ -158,22 +161,28 @@ def descend(
     s = np.concatenate([starts, np.broadcast_to(starts[-1], (fill, free))])
     none, nothing = np.zeros(len(s), dtype=int), np.full(len(s), np.inf)
     now = _Standing(s, s, nothing, none, none, none, none, none, np.arange(len(s)) < count)
+    last = np.minimum(np.arange(count + fill), count - 1)
+    data = jax.tree.map(lambda x: np.asarray(x)[last], _for_all(problem.data, count) if data is None else data)
     seen = state = None
     for _ in range(max_steps):
         rows = np.flatnonzero(now.active) if batched else np.arange(count)
         problem = prepare(problem, now.ahead[rows])
         new = seen_at(problem, np.asarray(problem.theta(now.ahead[rows])))
         if seen is None:
-            seen = jax.tree.map(lambda x: x[np.minimum(np.arange(count + fill), count - 1)], new)
-            state = _start(problem, now.s, seen)
+            seen = jax.tree.map(lambda x: x[last], new)
+            state = _start(problem, data, now.s, seen)
         else:
             seen = jax.tree.map(lambda old, x, rows=rows: _put(old, rows, x), seen, new)
-        s, state, cost, accepted = _step(problem, now.s, state, seen)
+        s, state, cost, accepted = _step(problem, data, now.s, state, seen)
         now = now.advanced(*map(np.asarray, (s, state.y_eval, cost, accepted)))
         report(now.descent(count))
         if not np.any(now.active):
             break
     return now.descent(count)
+
+
+def _for_all(data: Any, count: int) -> Any:
+    return jax.tree.map(lambda x: np.broadcast_to(x, (count, *np.shape(x))), data)
 
 
 def _put(old: np.ndarray, rows: np.ndarray, new: np.ndarray) -> np.ndarray:

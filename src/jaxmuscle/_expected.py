@@ -325,11 +325,10 @@ def expected_spectrum(
     be looked at, the result is not finite instead.
     """
     settings = task.settings if settings is None else settings
-    concrete = all(is_concrete(leaf) for leaf in jax.tree.leaves(task))
-    if concrete:
+    if all(is_concrete(leaf) for leaf in jax.tree.leaves(task)):
         check_line(task, settings)
     moments, system = expected_moments(as_arrays(task), settings, window)
-    if concrete:
+    if is_concrete(moments.power):
         check_equilibrium(task, np.asarray(system.point), np.asarray(system.A))
         if not np.any(np.asarray(moments.power) > 0):
             raise ValueError(f"the expected spectrum of this {type(task).__name__} is zero: it has neither noise nor a "

@@ -17,7 +17,7 @@ from ._parameter import CHANNELS, DEFAULT_FREE, PARAMETERS, as_numbers
 from ._problem import Setup
 from ._result import FitResult
 from ._search import FitInterrupted as FitInterrupted
-from ._search import search
+from ._search import Plan, search
 from ._target import Target
 from ._task import AbstractTask, Isometric, PrescribedForce
 from ._uncertainty import target_variation
@@ -104,15 +104,41 @@ def fit(
     **Raises:** `ValueError` for bad arguments (unknown names with the nearest known, too few bins, values outside
     bounds); `FitInterrupted` on Ctrl-C, with what was reached.
     """
+    task, counts = with_noise(task, noise, fix), (starts, seeds, check_seeds)
+    with jax.enable_x64(True):
+        plan = planned(task, target, free=free, fix=fix, method=method, residual=residual, counts=counts, key=key,
+                       bounds=bounds, priors=priors, coefficient_of_variation=coefficient_of_variation,
+                       mean_force=mean_force, max_steps=max_steps, dt=dt, progress=progress)  # fmt: skip
+        return search(plan)
+
+
+def planned(
+    task: AbstractTask,
+    target: Target,
+    *,
+    free: Iterable[str] | None = None,
+    fix: Mapping[str, float] | None = None,
+    method: str = "linear",
+    residual: str = "log",
+    counts: tuple[int | None, int | None, int | None] = (None, None, None),
+    key: PRNGKeyArray | int = 0,
+    bounds: Mapping[str, tuple[float, float]] | None = None,
+    priors: Mapping[str, float | None] | None = None,
+    coefficient_of_variation: bool = True,
+    mean_force: tuple[float, float] | None = None,
+    max_steps: int = 40,
+    dt: float = DT,
+    progress: bool | Callable[[str, float], None] = False,
+) -> Plan:
+    """The arguments of `fit`, checked (see there); `counts` are starts, seeds, check_seeds. Needs double precision."""
     if method not in METHODS:
         raise ValueError(f"method = {method!r}: {choices(method, METHODS)}")
     if residual not in RESIDUALS:
         raise ValueError(f"residual = {residual!r}: {choices(residual, RESIDUALS)}")
-    for name, count in (("starts", starts), ("seeds", seeds), ("check_seeds", check_seeds), ("max_steps", max_steps)):
+    for name, count in zip(("starts", "seeds", "check_seeds", "max_steps"), (*counts, max_steps), strict=True):
         if count is not None and count < 1:
             raise ValueError(f"{name} = {count} must be at least 1")
-    task = with_noise(task, noise, fix).with_parts(settings=target.settings).replace(**(fix or {}))
-    task = as_numbers(task)
+    task = as_numbers(task.with_parts(settings=target.settings).replace(**(fix or {})))
     names = free_names(task, free, fix or {}, len(target.bins))
     sds = {n: (priors or {}).get(n, PARAMETERS[n].prior_sd if n in PARAMETERS else 1.0) for n in names}
     _check_names("priors", priors or {}, names)
@@ -121,25 +147,22 @@ def fit(
     if not (np.any(np.asarray(task.noise.amplitude) > 0) or float(task.harmonic.amplitude) > 0):
         raise ValueError("the task has neither noise nor a harmonic, so its spectrum is zero: set noise_K_w, say")
     control = has_response(task, required=method == "linear")
-    starts, seeds = starts or (100 if control else 8), seeds or (32 if control else 48)
-    check_seeds = check_seeds or (64 if control else 200)
-    seed = key if isinstance(key, int) else None
-    tell = _teller(progress)
+    usual = (100, 32, 64) if control else (8, 48, 200)
+    starts, seeds, check_seeds = (given or default for given, default in zip(counts, usual, strict=True))
     settings = {
         "free": list(names), "residual": residual, "starts": starts, "seeds": seeds, "dt": dt, "max_steps": max_steps,
         "check_seeds": check_seeds, "prior_sd": sds, "bounds": {n: list(b) for n, b in (bounds or {}).items()},
         "coefficient_of_variation": coefficient_of_variation and target.coefficient_of_variation is not None,
         "mean_force": None if mean_force is None else list(mean_force), "spectrum": target.settings.to_dict(),
     }  # fmt: skip
-    with jax.enable_x64(True):
-        key = jax.random.key(key) if isinstance(key, int) else key
-        values = {name: float(task[name]) for name in names}
-        coordinates = Coordinates.of(values, dict(bounds or {}), {n: sd or 1.0 for n, sd in sds.items()})
-        prior = np.array([0.0 if sds[n] is None else 1.0 for n in names])
-        extra = (target_variation(target) if coefficient_of_variation else None, mean_force)
-        setup = Setup(task, target, coordinates, prior, extra, residual, method, dt, key, seeds, control, tell)
-        settings["steps_per_sample"] = setup.steps_per_sample
-        return search(setup, starts, max_steps, check_seeds, settings, seed)
+    coordinates = Coordinates.of({name: float(task[name]) for name in names}, dict(bounds or {}),
+                                 {n: sd or 1.0 for n, sd in sds.items()})  # fmt: skip
+    prior = np.array([0.0 if sds[n] is None else 1.0 for n in names])
+    extra = (target_variation(target) if coefficient_of_variation else None, mean_force)
+    seed, key = (key, jax.random.key(key)) if isinstance(key, int) else (None, key)
+    setup = Setup(task, target, coordinates, prior, extra, residual, method, dt, key, seeds, control, _teller(progress))
+    settings["steps_per_sample"] = setup.steps_per_sample
+    return Plan(setup, starts, max_steps, check_seeds, settings, seed)
 
 
 def free_names(task: AbstractTask, free: Iterable[str] | None, fix: Mapping[str, float], bins: int) -> tuple[str, ...]:

@@ -93,9 +93,9 @@ def _p_value(setup: Setup, problem: Problem, final: Descent) -> float:
     added = np.zeros((STRENGTHS.size * TEMPLATES, len(residual)))
     logs = np.log1p(strength).reshape(-1, n)
     added[:, :n] = -(logs - logs.mean(axis=1, keepdims=True)) / sd
-    if problem.extra[0] is not None:
+    if problem.data.extra[0] is not None:
         swing = (lines.variance / null.variance - 1) / (lines.line / null.power).max(axis=1)
-        added[:, n] = 0.5 * np.log1p(STRENGTHS[:, None] * swing).reshape(-1) / float(problem.extra[0][1])
+        added[:, n] = 0.5 * np.log1p(STRENGTHS[:, None] * swing).reshape(-1) / float(problem.data.extra[0][1])
     basis = np.linalg.svd(jacobian, full_matrices=False)
     u = basis[0][:, basis[1] > 1e-9 * basis[1].max()]
     left = added - (added @ u) @ u.T
@@ -106,7 +106,7 @@ def _p_value(setup: Setup, problem: Problem, final: Descent) -> float:
 
     noise = np.zeros((REPLICATES, len(residual)))
     noise[:, :n] = _scatter(setup, problem, n)
-    if problem.extra[0] is not None:
+    if problem.data.extra[0] is not None:
         noise[:, n] = _generator(setup, 4).normal(size=REPLICATES)
     better = np.sum(improvement(noise) >= improvement(residual[None])[0])
     return float((1 + better) / (1 + REPLICATES))

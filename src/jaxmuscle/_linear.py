@@ -79,7 +79,7 @@ def settled(task: AbstractTask, time: float = HOLD) -> AbstractTask:
     Its simulation has no rise and no transient of the mean: what the linear response describes.
     """
     traced = not all(is_concrete(leaf) for leaf in jax.tree.leaves(task))
-    point = equilibrium(task, time) if traced else np.asarray(linearised(as_arrays(task), time).system.point)
+    point = equilibrium(task, time) if traced else np.asarray(linearised(as_arrays(task), time).system.point).tolist()
     held = {field.name: Constant(getattr(task, field.name)(jnp.asarray(time))) for field in dataclasses.fields(task)
             if isinstance(getattr(task, field.name), AbstractSignal)}  # fmt: skip
     return task.with_parts(**held, initial=tuple(point))

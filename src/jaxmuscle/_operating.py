@@ -27,7 +27,7 @@ def equilibrium(task: AbstractTask, time: float = HOLD) -> Float[Array, " states
     dtype = jnp.result_type(float)
     tolerance = 1e-12 if dtype == jnp.float64 else 1e-6
 
-    def at_rest(y):
+    def field(y):
         return task.vector_field(jnp.asarray(time, dtype), y, jnp.zeros(4))
 
     def newton(function, y):
@@ -39,6 +39,13 @@ def equilibrium(task: AbstractTask, time: float = HOLD) -> Float[Array, " states
     # cannot keep: the same derivative without it.
     # Off the origin, where the literal equation (2) has no stiffness and Newton's method no direction.
     start = task.initial_state() + GUESS
+    # In units of the state, so that one tolerance suits accelerations and displacements in either precision.
+    slope = jnp.sum(jnp.abs(jax.lax.stop_gradient(jax.jacfwd(field)(start))), axis=1)
+    scale = jnp.where((slope > 0) & jnp.isfinite(slope), slope, 1.0)
+
+    def at_rest(y):
+        return field(y) / scale
+
     return jax.lax.custom_root(at_rest, start, newton, lambda g, y: jnp.linalg.solve(jax.jacfwd(g)(y), y))
 
 

@@ -25,18 +25,26 @@ from ._uncertainty import BinStatistics, bin_statistics, shares_map
 MOST_SUBSTEPS = 16
 
 
+class Data(eqx.Module):
+    """What a fit knows of its target: powers, their spread, further residuals. The model does not depend on it."""
+
+    target: Float[Array | np.ndarray, "*rows bins"]
+    bias: Float[Array | np.ndarray, "*rows bins"]
+    sd: Float[Array | np.ndarray, "*rows bins"]
+    sigma: Float[Array | np.ndarray, "*rows bins"]
+    extra: tuple[tuple[Scalar, Scalar] | None, tuple[Scalar, Scalar] | None]
+
+
 class Problem(eqx.Module):
     """Everything that the residuals of a fit depend on besides the free coordinates."""
 
     task: AbstractTask
     coordinates: Coordinates
     model: Linear | MonteCarlo
-    target: Float[Array | np.ndarray, " bins"]
+    data: Data
     statistics: BinStatistics
-    sigma: Float[Array | np.ndarray, " bins"]
     prior: Float[Array | np.ndarray, " free"]
     moving: Float[Array | np.ndarray, " free"]
-    extra: tuple[tuple[Scalar, Scalar] | None, tuple[Scalar, Scalar] | None]
     residual: str = eqx.field(static=True)
 
     def theta(self, s: Float[Array | np.ndarray, "*rows free"]) -> Float[Array | np.ndarray, "*rows free"]:
@@ -49,28 +57,28 @@ class Problem(eqx.Module):
         """Moments of the model at θ."""
         return self.model.moments(at(self.task, self.coordinates, theta))
 
-    def data_residuals(self, moments: Moments) -> Float[Array, " residuals"]:
+    def data_residuals(self, moments: Moments, data: Data) -> Float[Array, " residuals"]:
         """Residuals in standard deviations of the data: spectrum, then coefficient of variation and mean force."""
-        rows = [jnp.asarray(self._spectrum_residuals(moments))]
-        variation, mean = self.extra
+        rows = [jnp.asarray(self._spectrum_residuals(moments, data))]
+        variation, mean = data.extra
         if variation is not None:
             rows.append((jnp.log(moments.variation) - variation[0])[None] / variation[1])
         if mean is not None:
             rows.append((moments.mean - mean[0])[None] / mean[1])
         return jnp.concatenate(rows)
 
-    def _spectrum_residuals(self, moments: Moments) -> Float[Array | np.ndarray, " bins"]:
+    def _spectrum_residuals(self, moments: Moments, data: Data) -> Float[Array | np.ndarray, " bins"]:
         if self.residual == "log":
-            z = jnp.log(self.target) - self.statistics.bias - jnp.log(moments.power)
-            return (z - jnp.mean(z)) / self.statistics.sd
-        difference = self.target - moments.proportional
+            z = jnp.log(data.target) - data.bias - jnp.log(moments.power)
+            return (z - jnp.mean(z)) / data.sd
+        difference = data.target - moments.proportional
         if self.residual == "linear":
-            return difference / self.sigma
-        return jnp.cumsum(difference)[:-1] / self.sigma[:-1]
+            return difference / data.sigma
+        return jnp.cumsum(difference)[:-1] / data.sigma[:-1]
 
-    def residuals(self, theta: Float[Array, " free"], moments: Moments) -> Float[Array, " all"]:
+    def residuals(self, theta: Float[Array, " free"], moments: Moments, data: Data) -> Float[Array, " all"]:
         """Data residuals of the moments at θ, then those of the prior."""
-        return jnp.concatenate([self.data_residuals(moments), jnp.sqrt(self.prior) * theta])
+        return jnp.concatenate([self.data_residuals(moments, data), jnp.sqrt(self.prior) * theta])
 
 
 def residual_sigma(kind: str, target: Target, statistics: BinStatistics) -> Float[np.ndarray, " bins"]:
@@ -129,16 +137,10 @@ class Setup:
 
     def _with_model(self, model: Linear | MonteCarlo, line_share: np.ndarray | None) -> Problem:
         statistics = bin_statistics(self.target, line_share)
-        given = {
-            "target": self.target.proportional_power,
-            "statistics": statistics,
-            "sigma": residual_sigma(self.residual, self.target, statistics),
-            "prior": self.prior,
-            "moving": np.ones(len(self.prior)),
-            "extra": self.extra,
-        }
-        arrays = as_arrays(given)
-        return Problem(as_arrays(self.task), self.coordinates, model, **arrays, residual=self.residual)
+        sigma = residual_sigma(self.residual, self.target, statistics)
+        data = Data(self.target.proportional_power, statistics.bias, statistics.sd, sigma, self.extra)
+        given = as_arrays({"data": data, "statistics": statistics, "prior": self.prior, "moving": np.ones(len(self.prior))})
+        return Problem(as_arrays(self.task), self.coordinates, model, **given, residual=self.residual)
 
     def finer(self, problem: Problem, points: np.ndarray) -> Problem:
         """The problem with as many sub-steps as the stiffest of the points asks for; never fewer than it has."""

@@ -60,7 +60,7 @@ def report_fit(
     *,
     interrupted: bool,
 ) -> FitResult:
-    """The result of a fit that ended at the best point of the last stage."""
+    """The result of a fit that ended at the best point of the last stage; `check_seeds` = 0 simulates nothing."""
     _, problem, final = stages[-1]
     first = stages[0].descent
     starts = tuple(
@@ -79,19 +79,12 @@ def report_fit(
     (residuals, quantities), (jacobian, found_slopes) = jax.tree.map(np.asarray, consequences(problem, seen))
     theta, moments = seen.theta, seen.moments
     task = as_numbers(setup.task.replace(**{n: float(v) for n, v in setup.coordinates.values(theta).items()}))
-    simulated = as_numbers(settled(as_arrays(task))) if setup.control else task
     try:
-        runs = ensemble(simulated, jax.random.fold_in(setup.key, 1), seeds=check_seeds)
+        each, expected, stretch = _simulated(setup, task, check_seeds) if check_seeds else _expected_only(moments)
     except (SimulationError, ValueError) as error:
         return _failed(setup, common, f"the fitted task cannot be simulated: {error}")
-    each, expected = controlled_moments(runs, setup.target.settings, WINDOW)
-    chosen = setup.target.bins - setup.target.settings.first_bin
-    power_of_each = np.asarray(each.power)[:, chosen]
-    each = each._replace(power=power_of_each)
-    power = power_of_each.mean(axis=0)
-    line = np.minimum(moments.line, power)
-    share = moments.line / moments.power
-    each = each._replace(line=np.tile(line, (len(power_of_each), 1)))
+    power, share = np.mean(each.power, axis=0), moments.line / moments.power
+    each = each._replace(line=np.tile(np.minimum(moments.line, power), (len(each.mean), 1)))
     values = quantities | observed(Moments(*(np.mean(x, axis=0) for x in each)))
     scatter = _residual_covariance(setup, problem, share)
     scaled = jacobian / np.sqrt(np.maximum(np.diag(scatter), 1.0))[:, None]
@@ -104,15 +97,14 @@ def report_fit(
     fitted = power / power.sum()
     residual = standardised(np.asarray(setup.target.proportional_power), fitted, statistics)
     log_error = np.log(setup.target.proportional_power / fitted)
-    start = round((runs.time[-1] - STRETCH) * runs.rate)
     rivals = rival_frequencies(setup, first if setup.method == "linear" else final)
     parameters = parameter_table(setup, task, covariance, known)
     found = derived_table(setup, values, found_slopes, jackknife(each), covariance, scaled, setup.prior)
     if rivals:
         parameters, found = without_error("harmonic_frequency", parameters), without_error("harmonic_frequency", found)
-    check = {} if expected is None else linear_check(power_of_each, np.asarray(expected.power)[chosen], statistics)
+    check = {} if expected is None else linear_check(np.asarray(each.power), expected, statistics)
     check |= polish_check(setup, stages, found)
-    line_test = None if interrupted else harmonic_test(setup, final)
+    line_test = None if interrupted or not check_seeds else harmonic_test(setup, final)
     return FitResult(
         success=success,
         message=message,
@@ -128,13 +120,30 @@ def report_fit(
         harmonic_share=share,
         residual=residual,
         deviation=statistics.sd if statistics.known else None,
-        stretch=(runs.time[start:], np.asarray(runs.output[0])[start:]),
+        stretch=stretch,
         profile=None if line_test is None else (line_test.frequency, line_test.rise),
         harmonic_p_value=None if line_test is None else line_test.p_value,
         check=check,
         notices=notices_of(setup.target, statistics, rivals, check, unsettled(setup, task)),
         **common,
     )
+
+
+def _simulated(setup: Setup, task: Any, seeds: int) -> tuple[Moments, np.ndarray | None, tuple[np.ndarray, np.ndarray]]:
+    """Moments of fresh seeds of the nonlinear model on the target's bins, the expected powers, a stretch of output."""
+    still = as_numbers(settled(as_arrays(task))) if setup.control else task
+    runs = ensemble(still, jax.random.fold_in(setup.key, 1), seeds=seeds)
+    each, expected = controlled_moments(runs, setup.target.settings, WINDOW)
+    chosen = setup.target.bins - setup.target.settings.first_bin
+    each = each._replace(power=np.asarray(each.power)[:, chosen])
+    start = round((runs.time[-1] - STRETCH) * runs.rate)
+    stretch = runs.time[start:], np.asarray(runs.output[0])[start:]
+    return each, None if expected is None else np.asarray(expected.power)[chosen], stretch
+
+
+def _expected_only(moments: Moments) -> tuple[Moments, None, tuple[np.ndarray, np.ndarray]]:
+    """The same of the linear response, where nothing is simulated."""
+    return Moments(*(np.asarray(x)[None] for x in moments)), None, (np.zeros(0), np.zeros(0))
 
 
 def _failed(setup: Setup, common: dict[str, Any], reason: str) -> FitResult:
@@ -195,7 +204,7 @@ def _residual_covariance(setup: Setup, problem: Problem, share: np.ndarray) -> n
     spread = _spread_map(problem, p)
     total = spread @ (measured + simulated) @ spread.T
     rows: list[float] = [1.0 + 0.25 * float(p @ simulated @ p) / float(extra[1]) ** 2 if i == 0 else 1.0
-            for i, extra in enumerate(problem.extra) if extra is not None]  # fmt: skip
+            for i, extra in enumerate(problem.data.extra) if extra is not None]  # fmt: skip
     return np.block([[total, np.zeros((len(total), len(rows)))], [np.zeros((len(rows), len(total))), np.diag(rows)]])
 
 
@@ -205,5 +214,5 @@ def _spread_map(problem: Problem, p: np.ndarray) -> np.ndarray:
     if problem.residual == "log":
         return (np.eye(n) - 1 / n) / problem.statistics.sd[:, None]
     if problem.residual == "linear":
-        return shares_map(p) / problem.sigma[:, None]
-    return (np.tril(np.ones((n, n))) @ shares_map(p) / problem.sigma[:, None])[:-1]
+        return shares_map(p) / problem.data.sigma[:, None]
+    return (np.tril(np.ones((n, n))) @ shares_map(p) / problem.data.sigma[:, None])[:-1]

@@ -1,6 +1,7 @@
 """The search of a fit: many starts, the best minima polished, whatever was reached when interrupted."""
 
-from typing import Any
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -33,24 +34,80 @@ class FitInterrupted(KeyboardInterrupt):
         self.result = result
 
 
-def search(setup: Setup, starts: int, max_steps: int, check_seeds: int, settings: dict, seed: int | None) -> FitResult:
+class Plan(NamedTuple):
+    """A fit to be done."""
+
+    setup: Setup
+    starts: int
+    max_steps: int
+    check_seeds: int
+    settings: dict
+    seed: int | None
+
+
+def search(plan: Plan) -> FitResult:
     """From the starting points to a result; Ctrl-C ends it with what had been reached."""
-    points = starting_points(setup.coordinates, setup.target, starts)
+    setup = plan.setup
+    points = starting_points(setup.coordinates, setup.target, plan.starts)
     stages: list[Stage] = []
     interrupted = False
     try:
         setup.tell("compiling", 0.0)
-        (_linear if setup.method == "linear" else _montecarlo)(setup, points, max_steps, stages)
+        (_linear if setup.method == "linear" else _montecarlo)(setup, points, plan.max_steps, stages)
     except KeyboardInterrupt:
         interrupted = True
     if not stages:
         raise KeyboardInterrupt("fit interrupted before its first step")
     setup.tell("checking on fresh seeds", 0.8)
-    result = report_fit(setup, stages, check_seeds, settings, seed, max_steps, interrupted=interrupted)
+    result = _reported(plan, stages, plan.check_seeds, interrupted=interrupted)
     setup.tell("done", 1.0)
     if interrupted:
         raise FitInterrupted(result)
     return result
+
+
+def _reported(plan: Plan, stages: list[Stage], check_seeds: int, *, interrupted: bool = False) -> FitResult:
+    return report_fit(plan.setup, stages, check_seeds, plan.settings, plan.seed, plan.max_steps, interrupted=interrupted)
+
+
+def search_together(plans: list[Plan], tell: Callable[[str, float], None]) -> list[FitResult]:
+    """Fits of one model to several targets on the same bins, all starts of all targets in one descent.
+
+    Linear response alone: no nonlinear correction, no check on simulated seeds, no profile over the frequency.
+    """
+    setups = [plan.setup for plan in plans]
+    points = [starting_points(plan.setup.coordinates, plan.setup.target, plan.starts) for plan in plans]
+    first = _together([setup.linear() for setup in setups], points, plans[0].max_steps, "trying starts", tell, (0.0, 0.7))
+    best = [stage.descent.s[contenders(s.coordinates, s.target, stage.descent, RIVAL_MARGIN)[:BATCH]]
+            for s, stage in zip(setups, first, strict=True)]  # fmt: skip
+    problems = [setup.linear(_share(stage.problem, stage.descent)) for setup, stage in zip(setups, first, strict=True)]
+    second = _together(problems, best, plans[0].max_steps, "linear response", tell, (0.7, 0.8))
+    results = []
+    for plan, *stages in zip(plans, first, second, strict=True):
+        results.append(_reported(plan, stages, 0))
+        tell(f"reporting {plan.setup.target.name}", 0.8 + 0.2 * len(results) / len(plans))
+    return results
+
+
+def _together(
+    problems: list[Problem],
+    points: list[np.ndarray],
+    max_steps: int,
+    name: str,
+    tell: Callable[[str, float], None],
+    shares: tuple[float, float],
+) -> list[Stage]:
+    """One stage of every problem; they differ in their data only."""
+    counts = [len(p) for p in points]
+    data = jax.tree.map(lambda *x: np.repeat(np.stack(x), counts, axis=0), *(problem.data for problem in problems))
+
+    def show(descent: Descent) -> None:
+        share = min(1.0, descent.steps.max() / max_steps)
+        tell(name, shares[0] + (shares[1] - shares[0]) * share)
+
+    found = descend(problems[0], np.concatenate(points), max_steps, data=data, report=show)
+    parts = zip(*(np.split(x, np.cumsum(counts)[:-1]) for x in found), strict=True)
+    return [Stage(name, problem, Descent(*part)) for problem, part in zip(problems, parts, strict=True)]
 
 
 def _stage(setup: Setup, stages: list[Stage], problem: Problem, name: str, shares: tuple[float, float], most: int) -> Any:

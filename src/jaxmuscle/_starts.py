@@ -52,10 +52,18 @@ def harmonic_frequencies(coordinates: Coordinates, descent: Descent) -> Float[np
 
 
 def _candidate_frequencies(target: Target, count: int) -> Float[np.ndarray, " starts"]:
+    """The target's local maxima, highest above their neighbours first, and a quarter bin beside each; then the band.
+
+    A maximum is the vertex of the parabola through the log powers of three bins: a line that is narrower than a bin is
+    found from nearby, but not from a bin away.
+    """
     f, p = np.asarray(target.frequency), np.log(np.asarray(target.proportional_power))
     inner = np.flatnonzero((p[1:-1] > p[:-2]) & (p[1:-1] > p[2:])) + 1
-    rise = p[inner] - 0.5 * (p[inner - 1] + p[inner + 1])
-    peaks = f[inner[np.argsort(-rise)]]
+    bend = 2 * p[inner] - p[inner - 1] - p[inner + 1]
+    inner, bend = inner[np.argsort(-bend)], np.sort(bend)[::-1]
+    peaks = f[inner] + 0.25 * (f[inner + 1] - f[inner - 1]) * (p[inner + 1] - p[inner - 1]) / bend
+    width = target.settings.rate / target.settings.length
+    near = np.clip(peaks[:, None] + width * np.array([0.0, -0.25, 0.25]), f[0], f[-1]).ravel()
     spread = np.geomspace(f[0], f[-1], max(count, 2))
     order = np.argsort([-np.min(np.abs(np.log(s / np.append(peaks, 1e9)))) for s in spread])
-    return np.concatenate([peaks[: max(1, count // 2)], spread[order], peaks[max(1, count // 2) :]])[:count]
+    return np.concatenate([near[: max(1, count // 2)], spread[order], near[max(1, count // 2) :]])[:count]

@@ -14,8 +14,8 @@ from jaxtyping import Float, Int
 from . import _target_check as check
 from ._bundled import TargetError
 from ._spectrum import SpectrumSettings
-from ._target_check import Provenance, Quantity
-from ._target_file import GRID_TOLERANCE, KEYS, Columns, read_target
+from ._target_check import GRID_TOLERANCE, PIXEL_OF_LOG, PIXEL_TOLERANCE, Provenance, Quantity
+from ._target_file import KEYS, Raw, read_target
 
 # A sum this near to 1 is rounding of the printed numbers, not another scale.
 SUM_TOLERANCE = 1e-3
@@ -162,19 +162,27 @@ def load_target(
     *,
     quantity: str | None = None,
     segments: int | Sequence[int] | None = None,
+    dataset: str | None = None,
+    axis: str = "linear",
 ) -> Target:
-    """Load a bundled target by name, or a .toml or .csv file by path.
+    """Load a bundled target by name, or a .toml or .csv file or a digitised figure by path.
 
-    A CSV has the columns `frequency_hz,proportional_power[,sigma]`, sorted and unique, or two columns without
-    a header (WebPlotDigitizer), which are sorted and near-duplicates averaged. Points off the grid are
-    interpolated onto the bins in log power; bins that are not covered are left out, and power is rescaled to
-    sum to 1 over the others. The target's `notices` say which of these happened.
+    A CSV has the columns `frequency_hz,proportional_power[,sigma]`, sorted and unique. A figure digitised with
+    WebPlotDigitizer is its project (.json, .tar), its CSV of all datasets, or two columns without a header; its
+    points are sorted and near-duplicates averaged (docs/digitise.md). Points off the grid are interpolated onto
+    the bins in log power, and in log frequency from a logarithmic axis; bins that are not covered are left out,
+    and power is rescaled to sum to 1 over the others. The target's `notices` say which of these happened.
 
-    **Arguments:** `quantity` and `segments` (Welch segments of each trial) replace what the file says.
+    **Arguments:**
+
+    - `quantity` and `segments` (Welch segments of each trial) replace what the file says.
+    - `dataset`: which of several datasets of a figure.
+    - `axis`: `"log-log"` if a figure's points are log10 of frequency [Hz] and of power, calibrated in decades.
 
     **Raises:** `TargetError`, a `ValueError`, naming file and line or key, what is wrong and what is right.
     """
-    file, fields, columns, notices = read_target(name_or_path)
+    raw = read_target(name_or_path, dataset, axis)
+    file, fields, notices = raw.file, raw.fields, raw.notices
     for key, value in (("quantity", quantity), ("segments", segments)):
         if value is None:
             continue
@@ -183,7 +191,7 @@ def load_target(
             notices.append(f"{key} {_words(asked)} as asked; the file says {_words(fields[key])}")
         fields[key] = asked
     try:
-        points, more = _on_grid(columns, fields["settings"])
+        points, more = _on_grid(raw, fields["settings"])
         notices = (*fields.pop("notices", ()), *notices, *more)
         return Target(**fields, **points._asdict(), notices=notices)
     except TargetError as error:
@@ -200,27 +208,34 @@ class _Points(NamedTuple):
     sigma: np.ndarray | None = None
 
 
-def _on_grid(columns: Columns, settings: SpectrumSettings) -> tuple[_Points, list[str]]:
+def _on_grid(raw: Raw, settings: SpectrumSettings) -> tuple[_Points, list[str]]:
     """The rows on the bins they cover: as they are if all lie on bins, else interpolated in log power."""
+    columns = raw.columns
     position = np.minimum(columns.frequency / settings.resolution, 1e9)
+    tolerance = np.full(position.size, PIXEL_TOLERANCE if raw.digitised else GRID_TOLERANCE)
+    if raw.log_frequency:
+        tolerance = np.maximum(tolerance, PIXEL_OF_LOG * position)
     bins = np.rint(position).astype(int)
     first, last = settings.first_bin, settings.last_bin
-    aligned = np.all(np.abs(position - bins) <= GRID_TOLERANCE) and np.unique(bins).size == bins.size
+    aligned = np.all(np.abs(position - bins) <= tolerance) and np.unique(bins).size == bins.size
     notices = []
     if aligned:
         inside = (bins >= first) & (bins <= last)
         sigma = None if columns.sigma is None else columns.sigma[inside]
         points = _Points(bins[inside], columns.power[inside], sigma)
+        if (off := np.max(np.abs(position - bins)[inside], initial=0)) > GRID_TOLERANCE:
+            notices.append(f"points up to {off:.2g} bins off the grid: taken as on the bins, within a pixel of a figure")
         if not np.all(inside):
             notices.append(f"rows outside bins {first} to {last} left out: {np.sum(~inside)}")
     else:
         every = np.arange(first, last + 1)
-        low, high = position[0] - GRID_TOLERANCE, position[-1] + GRID_TOLERANCE
+        low, high = position[0] - tolerance[0], position[-1] + tolerance[-1]
         covered = every[(every >= low) & (every <= high)]
         logs = [np.log(values) for values in (columns.power, columns.sigma) if values is not None]
-        points = _Points(covered, *(np.exp(np.interp(covered, position, log)) for log in logs))
-        gap = f"{np.max(np.diff(columns.frequency), initial=0):.3g}"
-        notices.append(f"frequencies off the grid: interpolated onto the bins in log power (widest gap {gap} Hz)")
+        at, known = (np.log(covered), np.log(position)) if raw.log_frequency else (covered, position)
+        points = _Points(covered, *(np.exp(np.interp(at, known, log)) for log in logs))
+        gap, scale = f"{np.max(np.diff(columns.frequency), initial=0):.3g}", " and frequency" * raw.log_frequency
+        notices.append(f"frequencies off the grid: interpolated onto the bins in log power{scale} (widest gap {gap} Hz)")
     if points.bins.size < 2:
         raise TargetError(
             f"covers {points.bins.size} of the bins {first} to {last} ({settings.frequency[0]:.4g} to "

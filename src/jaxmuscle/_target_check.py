@@ -14,6 +14,13 @@ from ._spectrum import SpectrumSettings
 Quantity = Literal["force", "torque", "displacement"]
 Provenance = Literal["measured", "digitised", "reconstructed", "user"]
 
+# In bins: frequencies rounded to two decimals still count as on the default grid,
+GRID_TOLERANCE = 0.02
+# digitised ones up to two pixels off where 12 Hz are 600 pixels wide,
+PIXEL_TOLERANCE = 0.1
+# or, as a fraction of the frequency, one pixel where a decade is 230 pixels wide.
+PIXEL_OF_LOG = 0.01
+
 
 class Columns(NamedTuple):
     """Columns of equal length; `places` says for messages where each row stands ("line 7", "entry 7")."""

@@ -1,4 +1,4 @@
-"""Targets in files: a bundled name or a path to the fields and columns of a TOML or CSV file."""
+"""Targets in files: a bundled name or a path to the fields and columns of a TOML, CSV or WebPlotDigitizer file."""
 
 import contextlib
 import os
@@ -10,37 +10,49 @@ import numpy as np
 from jaxtyping import Float
 
 from ._bundled import TargetError, bundled_text, choices, list_targets
+from ._digitised import AXES, Points, columns_of, read_datasets, read_project, read_tar
 from ._spectrum import SpectrumSettings
-from ._target_check import CHECKS, Columns, check_columns, is_number, metadata
+from ._target_check import CHECKS, GRID_TOLERANCE, Columns, check_columns, is_number, metadata
 from ._target_csv import merge_duplicates, read_csv
 
-# In bins: frequencies rounded to two decimals still count as on the default grid.
-GRID_TOLERANCE = 0.02
 REQUIRED = ("name", "quantity", "provenance", "source", "frequency_hz", "proportional_power")
 METADATA = ("segments", "coefficient_of_variation", "mvc_fraction", "reason", "notices")
 KEYS = (*REQUIRED, "sigma", *METADATA, "settings")
 
 
 class Raw(NamedTuple):
-    """What a file says: its name for messages, its fields other than the columns, the columns, notices."""
+    """What a file says: its name for messages, its fields other than the columns, the columns, notices.
+
+    `digitised` points carry the error of a pixel; `log_frequency` says that their frequency axis is logarithmic.
+    """
 
     file: str
     fields: dict[str, Any]
     columns: Columns
     notices: list[str]
+    digitised: bool = False
+    log_frequency: bool = False
 
 
-def read_target(name_or_path: str | os.PathLike[str]) -> Raw:
-    """Read a bundled target or a .toml or .csv file; the columns are checked, the other fields not yet.
+def read_target(name_or_path: str | os.PathLike[str], dataset: str | None = None, axis: str = "linear") -> Raw:
+    """Read a bundled target, a .toml or .csv file or a digitised figure; the columns are checked, the other fields not yet.
 
     **Raises:** `TargetError` naming file and line or key.
     """
+    if axis not in AXES:
+        raise TargetError(f"unknown axis {axis!r}; {choices(str(axis), AXES)}")
     file, kind, text = _read(name_or_path)
-    return (_parse_toml if kind == ".toml" else _parse_csv)(text, file)
+    if kind == ".json":
+        return _digitised(read_project(text, file, dataset), file, axis, f"WebPlotDigitizer project {Path(file).name}")
+    if kind == ".csv" and (points := read_datasets(text, file, dataset)) is not None:
+        return _digitised(points, file, axis, f"WebPlotDigitizer export {Path(file).name}")
+    if dataset is not None:
+        raise TargetError(f"{file}: has no named datasets; leave dataset={dataset!r} (--dataset) out")
+    return _parse_csv(text, file, axis) if kind == ".csv" else _parse_toml(text, file, axis)
 
 
 def _read(name_or_path: str | os.PathLike[str]) -> tuple[str, str, str]:
-    """What messages call the target, ".toml" or ".csv", and the text."""
+    """What messages call the target, ".toml", ".csv" or ".json" (a tar holds one), and the text."""
     if not isinstance(name_or_path, str | os.PathLike):
         raise TargetError(f"target {name_or_path!r}: give the name of a bundled target or a path")
     given, names = os.fspath(name_or_path), list_targets()
@@ -55,7 +67,7 @@ def _read(name_or_path: str | os.PathLike[str]) -> tuple[str, str, str]:
     hint = f"; the bundled target is called {path.stem!r}" if path.stem in names else ""
     try:
         if path.is_dir():
-            raise TargetError(f"{path}: is a folder; give a .toml or .csv file")
+            raise TargetError(f"{path}: is a folder; give a .toml or .csv file, or a digitised .json or .tar")
         data = path.read_bytes()
     except FileNotFoundError:
         raise TargetError(f"{path}: no such file{hint}") from None
@@ -64,8 +76,11 @@ def _read(name_or_path: str | os.PathLike[str]) -> tuple[str, str, str]:
             raise
         raise TargetError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from None
     kind = path.suffix.lower()
-    if kind not in (".toml", ".csv"):
-        raise TargetError(f"{path}: a target is a .toml or .csv file, not {kind or 'one without ending'}")
+    if kind == ".tar":
+        kind, data = ".json", read_tar(data, str(path)) if data.strip() else data
+    if kind not in (".toml", ".csv", ".json"):
+        problem = f"{path}: a target is a .toml or .csv file, not {kind or 'one without ending'}"
+        raise TargetError(f"{problem}; a WebPlotDigitizer project ends in .json or .tar")
     return str(path), kind, _decoded(data, path)
 
 
@@ -81,23 +96,39 @@ def _decoded(data: bytes, path: Path) -> str:
     return text
 
 
-def _parse_csv(text: str, file: str) -> Raw:
-    (columns, has_header, comment), notices = read_csv(text, file), []
-    check_columns(columns, file, ordered=has_header)
-    settings, path = SpectrumSettings(), Path(file)
+def _parse_csv(text: str, file: str, axis: str) -> Raw:
+    (columns, has_header, comment), path = read_csv(text, file), Path(file)
     if not has_header:
-        merged = merge_duplicates(columns, GRID_TOLERANCE * settings.resolution)
-        averaged = len(columns.places) - len(merged.places)
-        notices.append(
-            "no header: the columns are taken as frequency in Hz and proportional power, sorted by frequency"
-            + (f", {averaged} near-duplicates averaged" if averaged else "")
-        )
-        columns = merged
-    fields = {"name": path.stem, "source": comment or path.name, "settings": settings}
-    return Raw(file, fields, columns, notices)
+        points = Points(columns.frequency, columns.power, columns.places)
+        return _digitised(points, file, axis, comment or path.name)
+    _linear(axis, file)
+    check_columns(columns, file, ordered=True)
+    fields = {"name": path.stem, "source": comment or path.name, "settings": SpectrumSettings()}
+    return Raw(file, fields, columns, [])
 
 
-def _parse_toml(text: str, file: str) -> Raw:
+def _linear(axis: str, file: str) -> None:
+    if axis != "linear":
+        raise TargetError(f"{file}: states frequency in Hz and power; leave axis={axis!r} (--axis) out")
+
+
+def _digitised(points: Points, file: str, axis: str, source: str) -> Raw:
+    """Points of a figure: in Hz and power, sorted, near-duplicates averaged."""
+    columns, log_frequency = columns_of(points, axis, file)
+    settings = SpectrumSettings()
+    merged = merge_duplicates(columns, GRID_TOLERANCE * settings.resolution)
+    averaged = len(columns.places) - len(merged.places)
+    origin = "no header" if points.dataset is None else f"dataset {points.dataset!r}"
+    what = "log10 of frequency in Hz and of power" if axis == "log-log" else "frequency in Hz and proportional power"
+    notice = f"{origin}: taken as points of a figure, {what}, sorted by frequency"
+    notice += f", {averaged} near-duplicates averaged" if averaged else ""
+    source = source if points.dataset is None else f"{source}, dataset {points.dataset!r}"
+    fields = {"name": Path(file).stem, "provenance": "digitised", "source": source, "settings": settings}
+    return Raw(file, fields, merged, [notice], True, log_frequency)
+
+
+def _parse_toml(text: str, file: str, axis: str) -> Raw:
+    _linear(axis, file)
     try:
         fields: dict[str, Any] = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:

@@ -1,0 +1,76 @@
+"""The figure of a recording, for `Recording.plot`: is the window steady, and what is in its spectrum?"""
+
+from typing import Any
+
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+from ._spectrum import Spectrum, SpectrumSettings
+from .plot import BLACK, BLUE, GREY, ORANGE, SKY, legend, sampling_band, styled
+
+
+@styled
+def figure(recording: Any, settings: SpectrumSettings | None = None) -> Figure:
+    """Trace with the window, the window enlarged, and power (Welch with its error, FFT), linear and logarithmic."""
+    fig, axes = plt.subplots(2, 2, figsize=(9.0, 5.6), layout="constrained")
+    _trace(axes[0, 0], recording)
+    _window(axes[0, 1], recording, settings)
+    welch, fft = recording.spectrum(settings), recording.fft_spectrum(settings)
+    target = recording.target("welch", quantity="force", settings=settings)
+    band = [edge * np.sum(welch.power) for edge in sampling_band(target) or ()]
+    for ax, log in ((axes[1, 0], False), (axes[1, 1], True)):
+        _spectra(ax, welch, fft, band, log)
+    words = f"{recording.segments(settings)} Welch segments"
+    fig.suptitle(f"{recording.source}; {words}", x=0.01, ha="left", fontsize=8.0, parse_math=False)
+    return fig
+
+
+def _trace(ax: Axes, recording: Any) -> None:
+    time = recording.start + np.arange(recording.whole.size) / recording.rate
+    ax.plot(time, recording.whole, color=BLUE, lw=0.7)
+    if recording.window is not None:
+        ax.axvspan(*recording.window, color=ORANGE, alpha=0.25, lw=0, label="window")
+        legend(ax, "above")
+    ax.margins(x=0)
+    _label(ax, "Time (s)", f"{(recording.quantity or 'signal').capitalize()} ({recording.unit})")
+    ax.set_title("Whole recording")
+
+
+def _window(ax: Axes, recording: Any, settings: SpectrumSettings | None) -> None:
+    x, time = recording.filtered(settings), recording.time
+    ax.plot(time, recording.samples, color=SKY, lw=0.5, label="as recorded")
+    ax.plot(time[0] + np.arange(x.size) / (x.size / recording.duration), x, color=BLUE, lw=0.9, label="filtered")
+    ax.axhline(float(np.mean(x)), color=GREY, lw=0.6, ls="--")
+    ax.margins(x=0)
+    _label(ax, "Time (s)", f"{(recording.quantity or 'signal').capitalize()} ({recording.unit})")
+    ax.set_title("Window")
+    legend(ax, "above")
+
+
+def _spectra(ax: Axes, welch: Spectrum, fft: Spectrum, band: list[Any], log: bool) -> None:
+    f, power = np.asarray(welch.frequency), np.asarray(welch.power)
+    shown = slice(None) if not log else f > 0
+    ax.plot(fft.frequency, fft.power, color=GREY, lw=0.6, alpha=0.8, label="FFT of the window", zorder=2)
+    if band:
+        ax.fill_between(f[shown], band[0][shown], band[1][shown], color=BLUE, alpha=0.2, lw=0, label="± 1 SD", zorder=3)
+    ax.plot(f[shown], power[shown], color=BLACK, lw=1.0, marker="o", ms=2.8, label="Welch", zorder=4)
+    unit = welch.unit if welch.unit.isalpha() else f"({welch.unit})"
+    _label(ax, "Frequency (Hz)", f"Power ({unit}²/Hz)")
+    ax.set_title("Spectrum, logarithmic" if log else "Spectrum, linear")
+    if log:
+        ax.set(xscale="log", yscale="log")
+        ax.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        ax.xaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:g}"))
+        ax.xaxis.set_minor_formatter(NullFormatter())
+    else:
+        ax.set_xlim(left=0, auto=None)
+        ax.set_ylim(bottom=0, auto=None)
+    legend(ax, "lower left" if log else "upper right")
+
+
+def _label(ax: Axes, x: str, y: str) -> None:
+    ax.set_xlabel(x)
+    ax.set_ylabel(y, parse_math=False)

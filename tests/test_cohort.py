@@ -1,0 +1,203 @@
+"""Cohorts: many targets at once are each what a fit alone gives, differences of groups have honest intervals."""
+
+import functools
+
+import jax
+import matplotlib.pyplot as plt
+import numpy as np
+import pytest
+import scipy.stats
+from test_fit import true_derived
+from test_result import made_result
+from typer.testing import CliRunner
+
+import jaxmuscle as jm
+from jaxmuscle._cli import app
+
+PEOPLE, SEEDS = 6, 20
+
+
+def person(number):
+    """Two groups that differ in the rhythm's frequency; within a group its frequency and the damping vary."""
+    rng = np.random.default_rng(number)
+    old = number % 2
+    return jm.Isometric().replace(
+        c_w=60 * np.exp(0.1 * rng.normal()), harmonic_frequency=4.5 + 2 * old + 0.2 * rng.normal(), harmonic_amplitude=0.012
+    )
+
+
+@functools.cache
+def people():
+    """Absolute spectra averaged over seeds of the nonlinear simulator; six Welch segments of each."""
+    targets = []
+    for number in range(PEOPLE):
+        runs = jm.ensemble(jm.settled(person(number)), jax.random.key(100 + number), seeds=SEEDS, dt=2.5e-3, control=False)
+        power = np.asarray(runs.spectrum().mean().proportional)
+        targets.append(jm.Target(f"person{number}", power, segments=(6,) * SEEDS, mvc_fraction=0.1 + 0.1 * (number // 2)))
+    return targets
+
+
+GROUPS = {f"person{n}": "old" if n % 2 else "young" for n in range(PEOPLE)}
+
+
+@functools.cache
+def cohort():
+    return jm.fit_cohort(people(), groups=GROUPS)
+
+
+@pytest.mark.slow
+def test_what_the_data_determine_is_recovered():
+    found = cohort()
+    assert found.success and list(found.results) == [t.name for t in people()]
+    deviations = []
+    for number, result in enumerate(found.results.values()):
+        with jax.enable_x64(True):
+            truth = true_derived(person(number))
+        assert abs(result.derived["harmonic_frequency"].value - truth["harmonic_frequency"]) < 0.25 * 0.390625
+        for name in ("corner_frequency", "harmonic_share", "high_frequency_floor"):
+            estimate = result.derived[name]
+            assert estimate.stderr is not None
+            deviations.append((estimate.value - truth[name]) / estimate.stderr)
+    # Šidák bound at 1 % for 18 comparisons, and their spread: its square is a mean of 18, correlated within a person.
+    assert np.abs(deviations).max() < 3.45
+    assert np.sqrt(np.mean(np.square(deviations))) < 1.8
+
+
+@pytest.mark.slow
+def test_each_target_is_fitted_as_if_alone():
+    alone = jm.fit(jm.task_for(people()[3]), people()[3], starts=32, check_seeds=32)
+    together = cohort().results["person3"]
+    for name, estimate in alone.derived.items():
+        if estimate.stderr is not None:
+            # Alone, the nonlinear correction moves the answer, and it settles within a thousandth of the cost.
+            assert abs(together.derived[name].value - estimate.value) < 0.2 * estimate.stderr, name
+            # the simulated seeds of a fit alone are part of its error
+            assert together.derived[name].stderr == pytest.approx(estimate.stderr, rel=0.2), name
+
+
+@pytest.mark.slow
+def test_groups_differ_by_what_they_were_given():
+    found = {d.quantity: d for d in cohort().differences()}
+    d = found["harmonic_frequency"]
+    assert (d.a, d.b, d.unit, d.basis, d.members) == ("young", "old", "Hz", "people", (3, 3))
+    assert 1.0 < d.low < d.difference < d.high < 3.0
+    values = [
+        [r.derived["harmonic_frequency"].value for n, r in cohort().results.items() if GROUPS[n] == g] for g in (d.b, d.a)
+    ]
+    interval = scipy.stats.ttest_ind(*values, equal_var=False).confidence_interval(0.95)
+    np.testing.assert_allclose((d.low, d.high), (interval.low, interval.high), rtol=1e-12)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("by", ["person", "group", "level"])
+def test_the_figure(by):
+    figure = cohort().plot(by)
+    try:
+        assert {ax.get_ylabel() for ax in figure.axes} >= {"harmonic frequency (Hz)", "corner frequency (Hz)"}
+    finally:
+        plt.close(figure)
+
+
+def made_cohort(**groups):
+    result = made_result()
+    return jm.CohortResult({name: result for name in groups}, {name: g for name, g in groups.items() if g}, {})
+
+
+def test_tables_hold_every_quantity_of_every_target():
+    found = made_cohort(a="one", b="two", c="")
+    rows = found.table()
+    quantities = {row["quantity"] for row in rows}
+    assert len(rows) == 3 * len(quantities)
+    assert {row["group"] for row in rows} == {"one", "two", ""}
+    data = found.to_xarray()
+    assert dict(data.sizes) == {"target": 3, "quantity": len(quantities)}
+    for row in rows:
+        here = data.sel(target=row["target"], quantity=row["quantity"])
+        assert float(here["value"]) == row["value"] and str(here["unit"].item()) == row["unit"]
+        assert np.isnan(here["stderr"]) if row["stderr"] is None else float(here["stderr"]) == row["stderr"]
+
+
+def test_single_members_are_compared_by_their_standard_errors():
+    found = made_cohort(a="one", b="two")
+    differences = found.differences()
+    assert differences
+    for d in differences:
+        error = next(r["stderr"] for r in found.table() if r["quantity"] == d.quantity)
+        assert (d.basis, d.difference, d.members) == ("fits", 0.0, (1, 1))
+        np.testing.assert_allclose((d.low, d.high), np.array([-1, 1]) * 1.959964 * np.sqrt(2) * error, rtol=1e-6)
+
+
+def test_one_bad_target_does_not_stop_the_rest(tmp_path):
+    few = jm.Target("few", np.array([0.5, 0.3, 0.2]), bins=np.array([1, 2, 3]), segments=12)
+    good = jm.load_target("fdi-abduction-45mvc")
+    found = jm.fit_cohort([tmp_path / "none.csv", few, good], starts=8)
+    assert list(found.results) == [good.name] and not found.success
+    assert "no such file" in found.failed[str(tmp_path / "none.csv")]
+    assert "3 bins cannot determine 8 free parameters" in found.failed["few"]
+
+
+@pytest.mark.parametrize(
+    ("targets", "options", "message"),
+    [
+        ([], {}, "no targets: give at least one"),
+        (["fdi-abduction-45mvc"] * 2, {}, "two targets are called 'fdi-abduction-45mvc'"),
+        (["fdi-abduction-45mvc"], {"groups": {"x": "y"}}, "groups: no target is called x"),
+    ],
+)
+def test_bad_arguments(targets, options, message):
+    with pytest.raises(ValueError, match=message):
+        jm.fit_cohort(targets, **options)
+
+
+def test_a_figure_needs_a_known_way_and_levels():
+    found = made_cohort(a="", b="")
+    with pytest.raises(ValueError, match="by = 'age': choose one of person, group, level"):
+        found.plot("age")
+
+
+def command(*arguments):
+    result = CliRunner().invoke(app, ["fit", *map(str, arguments)], env={"COLUMNS": "200"})
+    assert result.exception is None or isinstance(result.exception, SystemExit), repr(result.exception)
+    return result
+
+
+@pytest.mark.slow
+def test_the_command_writes_a_folder_for_each_and_the_table(tmp_path):
+    groups = tmp_path / "groups.csv"
+    groups.write_text("target,group\nvastus-lateralis-26mvc,knee\nfdi-abduction-45mvc,finger\n")
+    out = tmp_path / "out"
+    result = command("vastus-lateralis-26mvc", "fdi-abduction-45mvc", tmp_path / "none.csv", "--groups", groups,
+                     "--starts", 16, "--out", out)  # fmt: skip
+    assert result.exit_code == 2 and "none.csv: no such file" in result.stderr
+    for name in ("vastus-lateralis-26mvc", "fdi-abduction-45mvc"):
+        assert jm.load_result(out / name / "fit.json").success
+        assert (out / name / "fit.png").stat().st_size > 0
+    rows = (out / "cohort.csv").read_text().splitlines()
+    assert rows[0].startswith("target,group,quantity,value,stderr,unit,determined")
+    assert (out / "differences.csv").read_text().startswith("quantity,a,b,difference,low,high,unit,basis")
+    assert (out / "cohort.png").stat().st_size > 0
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("person,group\na,b\n", "needs a header with the columns target and group"),
+        ("target,group\n", "needs a header with the columns target and group, and a line per target"),
+        ("target,group\na,\n", "line 2: give a target and its group"),
+        ("target,group\na,b\na,c\n", "line 3: a is in group b already"),
+        ("target,group\nsomebody,b\n", "no target is called somebody"),
+    ],
+)
+def test_bad_groups(text, message, tmp_path):
+    path = tmp_path / "groups.csv"
+    path.write_text(text)
+    result = command("vastus-lateralis-26mvc", "fdi-abduction-45mvc", "--groups", path, "--out", tmp_path / "out")
+    assert result.exit_code == 2 and message in result.stderr
+
+
+def test_groups_and_seeds_do_not_go_with_everything(tmp_path):
+    path = tmp_path / "groups.csv"
+    path.write_text("target,group\na,b\n")
+    assert "--groups needs several targets" in command("fdi-abduction-45mvc", "--groups", path).stderr
+    both = command("fdi-abduction-45mvc", "vastus-lateralis-26mvc", "--seeds", 8)
+    assert both.exit_code == 2 and "leave out --method and --seeds" in both.stderr
