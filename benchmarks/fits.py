@@ -23,7 +23,8 @@ TARGETS = ("vastus-lateralis-26mvc", "fdi-abduction-45mvc")
 NOISES = ("band-limited", "ornstein-uhlenbeck")
 STARTS, MAX_STEPS, SEEDS = 100, 40, 32
 NEAR = 1e-3
-CHI2, SEARCH, FOUND_AGAIN, COLD, WARM = 1.2, 6.0, 10, 45.0, 15.0
+CHI2, SEARCH, FOUND_AGAIN, COLD, WARM, COHORT = 1.2, 6.0, 10, 45.0, 15.0, 30.0
+PEOPLE, SEGMENTS = 50, 12
 
 
 def fits() -> list[Row]:
@@ -76,6 +77,25 @@ def starts(repetitions: int) -> list[Row]:
             Row(f"{STARTS} starts, {name}: within {100 * NEAR:g} % of the best cost", again, "starts", target=FOUND_AGAIN),
         ]
     return found
+
+
+def cohort() -> list[Row]:
+    """Fifty targets drawn about the expected spectra of different people, fitted together; warm."""
+    rng, targets = np.random.default_rng(0), []
+    for number in range(PEOPLE):
+        person = jm.Isometric().replace(c_w=60 * np.exp(0.2 * rng.normal()), harmonic_frequency=5 + 0.3 * rng.normal(),
+                                        harmonic_amplitude=0.01)  # fmt: skip
+        spectrum = jm.expected_spectrum(person)
+        nu = spectrum.settings.degrees_of_freedom(SEGMENTS)
+        power = np.asarray(spectrum.power) * rng.chisquare(nu, len(spectrum.power)) / nu
+        targets.append(jm.Target(f"person {number}", power, segments=SEGMENTS))
+    jm.fit_cohort(targets)
+    start = time.perf_counter()
+    found = jm.fit_cohort(targets)
+    wall = time.perf_counter() - start
+    converged = sum(result.success for result in found.results.values())
+    return [Row(f"cohort of {PEOPLE}: warm wall time", wall, "s", target=COHORT, at_most=True),
+            Row(f"cohort of {PEOPLE}: converged", converged, "fits")]  # fmt: skip
 
 
 def cold() -> list[Row]:

@@ -31,6 +31,7 @@ SECTIONS: dict[str, Callable[[int], list[Row]]] = {
     "gradient": usage.gradients,
     "fit": lambda n: fits.fits(),
     "starts": fits.starts,
+    "cohort": lambda n: fits.cohort(),
     "alternative": lambda n: alternative.rows(),
     "cold": lambda n: fits.cold(),
 }

@@ -16,7 +16,7 @@ from test_result import assert_equal, failed_result, made_result
 from typer.testing import CliRunner
 
 import jaxmuscle as jm
-from jaxmuscle import _fit
+from jaxmuscle import _cohort, _fit
 from jaxmuscle._cache import keep_compiled_programs
 from jaxmuscle._cli import app
 
@@ -116,7 +116,7 @@ OPTIONS = {
     "no seeds": (["{csv}", "--seeds", "0"], "--seeds"),
     "no segments": (["{csv}", "--segments", "0"], "--segments"),
     "unknown quantity": (["{csv}", "--quantity", "forces"], "unknown quantity 'forces'; did you mean 'force'"),
-    "same name twice": (["{csv}", "{csv}"], "two targets have the same name"),
+    "same name twice": (["{csv}", "{csv}"], "two targets are called 'spectrum'"),
     "no target": ([], "Missing argument"),
     "unknown option": (["{csv}", "--start", "3"], "No such option"),
 }
@@ -286,16 +286,17 @@ def test_what_was_fitted_can_be_simulated(fitted, tmp_path):
 def test_several_targets_have_a_folder_each(tmp_path, monkeypatch):
     seen = []
 
-    def fake(task, target, **options):
-        seen.append((type(task), options["noise"]))
-        return made_result(target=target) if target.name == "a" else failed_result()
+    def fake(targets, *, task, noise, **options):
+        seen.append((task, noise))
+        a, b = targets
+        return jm.CohortResult({a.name: made_result(target=a), b.name: failed_result()}, {}, {})
 
-    monkeypatch.setattr(_fit, "fit", fake)
+    monkeypatch.setattr(_cohort, "fit_cohort", fake)
     paths = [csv_file(tmp_path, name=f"{name}.csv") for name in "ab"]
     arguments = ("--task", "prescribed-force", "--noise", "ornstein-uhlenbeck", "--out", tmp_path / "out")
     outcome = run("fit", *paths, *arguments)
     assert outcome.exit_code == 1  # one of the two failed
-    assert seen == [(jm.PrescribedForce, "ornstein-uhlenbeck")] * 2
+    assert seen == [(jm.PrescribedForce, "ornstein-uhlenbeck")]
     assert jm.load_result(tmp_path / "out" / "a" / "fit.json").success
     assert not jm.load_result(tmp_path / "out" / "b" / "fit.json").success
 

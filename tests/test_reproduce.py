@@ -1,0 +1,238 @@
+"""`jaxmuscle reproduce`: every row of the table on its numbers, the three readings, the figures, the page."""
+
+import json
+import re
+from html.parser import HTMLParser
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+import typer
+from typer.testing import CliRunner
+
+from jaxmuscle._cli_reproduce import reproduce as command
+from jaxmuscle._plot_reproduce import FIGURES
+from jaxmuscle._recording import Recording
+from jaxmuscle._reproduce import experiment, given_recordings, reproduce
+from jaxmuscle._reproduce_claims import AGREES, CLAIMS, DIFFERS, GRID, UNCHECKED, check
+from jaxmuscle._reproduce_readings import conclusion, fast_share
+
+EXACT = 1e-9  # arithmetic, bins and what is put in
+LINEAR = 2e-3  # closed forms; the presets hold four digits
+RUNS = 0.15  # means over 16 to 32 fixed seeds; single precision draws may differ between machines
+ONE = 0.3  # one run
+
+# key: verdict, then value and relative tolerance of each number
+EXPECTED = {
+    "levels": (AGREES, (0.05, EXACT), (0.95, EXACT)),
+    "window": (AGREES, (5.0, EXACT), (15.0, EXACT), (10.0, EXACT)),
+    "max-124": (GRID, (3 * 100 / 256, EXACT), (3 * 100 / 256, EXACT)),
+    "varies": (AGREES, (0.1102, 0.02)),
+    "max-7": (GRID, (18 * 100 / 256, EXACT), (7.015, LINEAR)),
+    "max-7-only": (DIFFERS, (18 * 100 / 256, EXACT), (7.015, LINEAR)),
+    "largest": (AGREES, (0.95, EXACT), (0.017 * 2.757, LINEAR), (0.017 * 2.608, LINEAR)),
+    "smallest": (GRID, (0.35, EXACT), (0.017 * 1.0126, LINEAR)),
+    "comparison": (AGREES, (0.27, 0.1), (1.47, RUNS), (1.59, 0.05)),
+    "entropy": (UNCHECKED, (1.47, RUNS)),
+    "low": (AGREES, (100 / 256, EXACT)),
+    "high": (GRID, (11 * 100 / 256, EXACT), (4.249, LINEAR), (1, EXACT), (0.75, ONE)),
+    "series": (DIFFERS, (1.9e-5, 0.1), (0.8815, LINEAR), (0.39, RUNS)),
+    "displacement": (AGREES, (100 / 256, EXACT), (11 * 100 / 256, EXACT), (0.0095, 0.02)),
+    "amplitudes": (AGREES, (0.0016, EXACT), (0.0016, EXACT), (0.0001, EXACT), (0.0001, EXACT)),
+    "variation": (DIFFERS, (5.868e-4, LINEAR), (6.814e-4, LINEAR), (1.8e-3, RUNS)),
+    "people": (AGREES, (0.017 * 1.0126, LINEAR), (0.017 * 2.757, LINEAR)),
+    "smaller": (AGREES, (4.989e-4, EXACT), (7.459e-4, EXACT)),
+    "smoother": (AGREES, (0.0156, RUNS), (0.39, RUNS)),
+    "changing": (AGREES, (9.1e-4, RUNS), (4.3e-4, RUNS)),
+    "dominated": (AGREES, (100 / 256, EXACT), (0.5853, 0.02), (0, EXACT)),
+    "recordings": (AGREES, (3, EXACT), (60, EXACT), (120, EXACT)),
+    "fft-grid": (AGREES, (1 / 60, EXACT)),
+    "welch-grid": (GRID, (100 / 256, EXACT), (0.46875, EXACT), (120 / 307, EXACT)),
+    "rho-welch": (AGREES, (0.998, 0.005), (0.998, 0.005), (0.998, 0.005)),
+    "rho-fft": (AGREES, (0.89, 0.05), (0.89, 0.05), (0.89, 0.05)),
+    "rho-tuned": (DIFFERS, (0.89, 0.1), (0.92, 0.1), (0.23, 0.5), (0.27, 0.5)),
+    "grid-1.24": (GRID, (3 * 100 / 256, EXACT), (4 * 100 / 256, EXACT)),
+    "grid-4.251": (GRID, (10 * 100 / 256, EXACT), (11 * 100 / 256, EXACT)),
+    "grid-7": (GRID, (17 * 100 / 256, EXACT), (18 * 100 / 256, EXACT)),
+    "taylor": (AGREES, (0.3, EXACT), (0.017, 0.02)),
+    "readings": (DIFFERS, (5, EXACT), (5, EXACT), (5, EXACT), (4, EXACT), (3, EXACT)),
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def done(tmp_path_factory):
+    """The whole command's work, once: what was found, and the folder."""
+    folder = tmp_path_factory.mktemp("reproduce")
+    return reproduce(folder), folder
+
+
+@pytest.fixture(scope="module")
+def rows(done):
+    with jax.enable_x64(True):
+        return {row.key: row for row in check(done[0])}
+
+
+def test_every_claim_has_a_row_here():
+    keys = [claim.key for claim in CLAIMS]
+    assert len(set(keys)) == len(keys)
+    assert set(keys) == set(EXPECTED)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("key", EXPECTED)
+def test_the_numbers_and_the_verdict_of_a_row(rows, key):
+    verdict, *numbers = EXPECTED[key]
+    row = rows[key]
+    assert row.verdict == verdict
+    assert len(row.numbers) == len(numbers)
+    for found, (value, tolerance) in zip(row.numbers, numbers, strict=True):
+        assert found == pytest.approx(value, rel=tolerance, abs=1e-12)
+    assert bool(row.why) == (verdict != AGREES), "whatever does not simply agree says why"
+
+
+@pytest.mark.parametrize("claim", CLAIMS, ids=lambda claim: claim.key)
+def test_a_rule_can_say_no(claim):
+    """Numbers that cannot be right are not called right."""
+    count = len(EXPECTED[claim.key]) - 1
+    wrong = (
+        [1e6 * (i + 1) for i in range(count)],
+        [-1e6 / (i + 1) for i in range(count)],
+        [1e6 / (i + 1) for i in range(count)],
+    )
+    verdicts = {claim.rule(*numbers) for numbers in (*wrong, [1e6] * count)}
+    assert verdicts & {DIFFERS, UNCHECKED} or claim.key == "max-7-only"  # says no to what it found
+
+
+@pytest.mark.slow
+def test_the_three_readings(done):
+    """A lacks the low sine, B (which has it) is not Task 1, B in Task 1 has no second maximum, C no local maximum."""
+    found = {r.key: r for r in done[0].readings}
+    missing = {key: {name for name, holds in r.facts.items() if not holds} for key, r in found.items()}
+    assert missing == {"A": {"sine"}, "B": {"task"}, "B1": {"high"}, "C1": {"high", "sine"}, "C2": {"high", "sine", "fast"}}
+    assert "No reading gives all" in conclusion(done[0].readings)
+    p = np.asarray(found["C1"].spectrum.power)
+    assert p[0] / p.sum() > 0.999  # the mean of the force has leaked into bin 1
+
+
+def test_first_order_response_has_no_local_maximum():
+    """(a + bw + cw²)/(w + p²), w = ω² > 0, a, c, p² > 0, has at most one turning point, a minimum."""
+    rng = np.random.default_rng(0)
+    w = np.geomspace(1e-4, 1e6, 20001)
+    for _ in range(200):
+        K, C, m, p, extra = 10.0 ** rng.uniform(-2, 3, 5)
+        density = ((K - m * w) ** 2 + C**2 * w + extra * (w + p**2)) / (w + p**2)
+        slope = np.diff(density)
+        turns = np.flatnonzero(np.diff(np.sign(slope[np.abs(slope) > 1e-12 * density[1:]])) < 0)
+        assert turns.size == 0
+
+
+def test_fast_share_of_known_signals():
+    t = np.arange(1000) / 100
+    both = 3 * np.sin(2 * np.pi * 1.0 * t) + np.sin(2 * np.pi * 20.0 * t)
+    assert fast_share(both, 100.0) == pytest.approx(0.1, rel=1e-9)
+
+
+@pytest.mark.slow
+def test_task_2_is_held_by_constant_forces_at_1_mm(done):
+    run = done[0].slifkin.displacement
+    task = run.task
+    with jax.enable_x64(True):
+        force = [float(task.P_w(t)) for t in (5.0, 10.0, 15.0)]
+    assert np.ptp(force) < 1e-4 * force[0]
+    assert np.mean(np.asarray(run.between())) == pytest.approx(1e-3, rel=0.01)
+
+
+@pytest.mark.slow
+def test_figures_and_page_are_written(done):
+    folder = done[1]
+    for name in FIGURES:
+        assert (folder / f"{name}.png").read_bytes()[:4] == b"\x89PNG"
+        assert (folder / f"{name}.pdf").read_bytes()[:4] == b"%PDF"
+    assert set(FIGURES) >= {"fig2", "fig3", "fig4a", "fig4b", "fig5", "fig6a", "fig6b", "fig7", "fig8"}
+    assert [row["key"] for row in json.loads((folder / "claims.json").read_text())] == [claim.key for claim in CLAIMS]
+    assert not list(folder.glob(".*")), "no temporary file is left"
+
+
+class _Page(HTMLParser):
+    """Links, ids and the balance of tags."""
+
+    def __init__(self):
+        HTMLParser.__init__(self)
+        self.links, self.ids, self.open, self.viewport = [], [], [], False
+
+    def handle_starttag(self, tag, attrs):
+        found = dict(attrs)
+        self.links += [found[key] for key in ("href", "src") if key in found]
+        self.ids += [found["id"]] if "id" in found else []
+        self.viewport |= found.get("name") == "viewport" and "width=device-width" in found["content"]
+        if tag not in ("meta", "img"):
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+
+@pytest.mark.slow
+def test_the_page_is_whole_and_needs_no_network(done):
+    folder = done[1]
+    text = (folder / "index.html").read_text(encoding="utf-8")
+    page = _Page()
+    page.feed(text)
+    assert page.open == [] and page.viewport
+    assert all((folder / link).is_file() for link in page.links), page.links
+    assert "http" not in text and "nan" not in re.sub(r"<[^>]*>", "", text).split()
+    assert set(EXPECTED) <= set(page.ids) and set(FIGURES) <= set(page.ids)
+    assert "Simulated, not measured" in text
+
+
+def _recordings(seconds=(60.0, 60.0, 60.0), unit="mm"):
+    """Three sums of a common slow rhythm and own noise."""
+    rng = np.random.default_rng(3)
+
+    def one(number, length):
+        t = np.arange(round(120 * length)) / 120
+        return Recording(np.sin(2 * np.pi * t) + rng.normal(size=t.size), 120.0, unit=unit, name=f"subject {number}")
+
+    return [one(i, length) for i, length in enumerate(seconds)]
+
+
+def test_own_recordings_take_the_place_of_the_simulated_ones():
+    found = experiment(given_recordings(_recordings()))
+    assert not found.simulated
+    assert [r.name for r in found.recordings] == ["subject 0", "subject 1", "subject 2"]
+    assert len(found.rho_fft) == len(found.rho_welch) == 3
+    assert np.diff(found.fft[0].frequency) == pytest.approx(1 / 60)
+    assert max(found.rho_fft) < 0.3  # white noise: bins are ranked by chance
+
+
+def test_recordings_of_different_length_are_cut_to_the_shortest():
+    found = experiment(given_recordings(_recordings((60.0, 45.0, 52.0))))
+    assert {r.duration for r in found.recordings} == {45.0}
+    assert len({s.power.size for s in found.fft}) == 1
+
+
+def test_recordings_from_files(tmp_path):
+    files = []
+    for recording in _recordings():
+        files.append(tmp_path / f"{recording.name.replace(' ', '-')}.csv")
+        files[-1].write_text("x (mm)\n" + "\n".join(f"{v:.6f}" for v in recording.samples) + "\n")
+    with pytest.raises(ValueError, match="rate"):
+        given_recordings(files)
+    np.savetxt(
+        files[0], np.c_[_recordings()[0].time, _recordings()[0].samples], delimiter=",", header="time,x (mm)", comments=""
+    )
+    assert given_recordings([files[0]] * 3)[0].unit == "mm"
+
+
+def test_wrong_recordings_are_refused(tmp_path):
+    with pytest.raises(ValueError, match="2 given, three"):
+        given_recordings(_recordings()[:2])
+    with pytest.raises(ValueError, match="same quantity"):
+        given_recordings([*_recordings()[:2], _recordings(unit="N")[0]])
+    app = typer.Typer()
+    app.command()(command)
+    missing = str(Path(tmp_path) / "none.csv")
+    answer = CliRunner().invoke(app, ["--out", str(tmp_path / "out"), *["--recording", missing] * 3])
+    assert answer.exit_code == 2
+    assert "none.csv" in answer.output
