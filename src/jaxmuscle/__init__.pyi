@@ -39,6 +39,7 @@ from ._preset import save_preset as save_preset
 from ._recording import Recording as Recording
 from ._recording_file import load_recording as load_recording
 from ._recording_summary import RecordingSummary as RecordingSummary
+from ._reproduce import reproduce as reproduce
 from ._result import Estimate as Estimate
 from ._result import FitResult as FitResult
 from ._result import load_result as load_result

@@ -9,6 +9,7 @@ from rich.table import Table
 from ._bundled import describe_presets, describe_targets
 from ._cli_analyse import analyse
 from ._cli_fit import fit
+from ._cli_reproduce import reproduce
 from ._cli_simulate import simulate
 from ._console import out, plain
 
@@ -22,6 +23,7 @@ app = typer.Typer(
 app.command()(fit)
 app.command()(simulate)
 app.command()(analyse)
+app.command()(reproduce)
 
 
 @app.command()
