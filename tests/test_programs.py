@@ -29,6 +29,29 @@ assert result.success and result.chi2_per_bin <= 1.3
     assert (tmp_path / "fit.json").exists()
 
 
+@pytest.mark.slow
+def test_own_recording(tmp_path, monkeypatch):
+    """A trial as a force sensor writes it: 2048 Hz, rest, ramp, hold of a known task, release."""
+    monkeypatch.chdir(tmp_path)
+    truth = jm.Isometric().replace(harmonic_frequency=6.0, harmonic_amplitude=0.012)
+    run = jm.simulate(jm.settled(truth), jax.random.key(5), duration=40.0, rate=1000.0)
+    held = np.interp(np.arange(40 * 2048) / 2048, run.time, np.asarray(run.output, dtype=float))
+    level = held.mean()
+    force = np.concatenate([np.zeros(4096), level * np.linspace(0, 1, 4096), held, level * np.linspace(1, 0, 2048)])
+    rows = "".join(f"{k / 2048:.6f},{f:.6f}\n" for k, f in enumerate(force))
+    (tmp_path / "trial.csv").write_text("time,force\n" + rows)
+
+    recording = jm.load_recording("trial.csv", column="force", rate=2048, units="N")
+    result = jm.fit(jm.Isometric(), recording.steady().target())
+
+    assert result.success and result.target.segments is not None
+    assert abs(result.parameters["harmonic_frequency"].value - 6.0) < 0.25 * 0.390625
+    variation = result.derived["coefficient_of_variation"]
+    expected = jm.ensemble(jm.settled(truth), jax.random.key(0), seeds=32).between()
+    spread = np.mean(np.std(np.asarray(expected), axis=1)) / np.mean(expected)
+    assert variation.stderr is not None and abs(variation.value - spread) < 3 * variation.stderr
+
+
 def test_the_papers_tasks():
     task1 = jm.load_preset("zagrodny-slifkin")
     ax = jm.simulate(task1, jax.random.key(1)).plot()
