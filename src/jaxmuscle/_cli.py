@@ -1,5 +1,6 @@
 """The `jaxmuscle` command."""
 
+import gc
 import os
 import sys
 
@@ -51,6 +52,8 @@ def presets() -> None:
 def main() -> None:
     """Entry point of the console script."""
     os.environ.setdefault("MPLBACKEND", "Agg")
+    # Tracing makes many objects that stay: a tenth of a command would go into looking for cycles among them.
+    gc.set_threshold(200_000, 10, 10)
     app(prog_name="jaxmuscle")
 
 
