@@ -5,14 +5,8 @@ reference displacements and the starting values come from an earlier search by h
 frequency are the paper's and stay fixed.
 """
 
-import argparse
-from pathlib import Path
-
-import jax
-import numpy as np
-
 import jaxmuscle as jm
-from common import load, report
+from common import arguments, distance, load, report, rounded
 from jaxmuscle import save_preset
 
 NAME = "zagrodny-fig4a"
@@ -29,29 +23,12 @@ def fit(target: jm.Target, seed: int = 0) -> jm.FitResult:
     return jm.fit(task, target, free=FREE, key=seed)
 
 
-def rounded(task: jm.AbstractTask) -> jm.AbstractTask:
-    """The fitted values to four significant digits."""
-    return task.replace(**{name: float(f"{float(task[name]):.4g}") for name in FREE})
-
-
-def distance(task: jm.AbstractTask, target: jm.Target) -> float:
-    """Root mean square of the log ratio between the mean spectrum of 200 seeds and a target."""
-    power = jm.ensemble(task, jax.random.key(1), seeds=200).spectrum().mean().proportional
-    return float(np.std(np.log(np.asarray(power)) - np.log(target.proportional_power)))
-
-
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("csv", nargs="?", help="your own digitised spectrum (two columns: Hz, proportional power)")
-    parser.add_argument("--segments", type=int, help="Welch segments behind that spectrum")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--out", type=Path, default=None, help="default: out/fitting/NAME")
-    parser.add_argument("--preset", type=Path, help="write the preset to this file")
-    options = parser.parse_args()
+    options = arguments((__doc__ or "").splitlines()[0], csv=True, preset=True)
     target = load(NAME, options)
     result = fit(target, options.seed)
     report(result, NAME, options.out)
-    task = rounded(result.task)
+    task = rounded(result.task, FREE)
     near, far = distance(task, target), distance(task, jm.load_target(OTHER))
     print(f"rms log distance of the preset: {near:.3f} to {NAME}, {far:.3f} to {OTHER}")
     if options.preset:

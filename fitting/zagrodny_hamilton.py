@@ -7,14 +7,8 @@ form and times, the range of linearity x_ref_w. K_z0 is that of `zagrodny-slifki
 3/s, so that the input's rise is forgotten when the analysed window begins, that on the harmonic keeps it smaller.
 """
 
-import argparse
-from pathlib import Path
-
-import jax
-import numpy as np
-
 import jaxmuscle as jm
-from common import load, report
+from common import arguments, distance, load, report, rounded
 from jaxmuscle import save_preset
 
 NAME = "hamilton-2004"
@@ -31,29 +25,12 @@ def fit(target: jm.Target, seed: int = 0) -> jm.FitResult:
     return jm.fit(task.replace(**START), target, free=FREE, bounds=BOUNDS, key=seed)
 
 
-def rounded(task: jm.AbstractTask) -> jm.AbstractTask:
-    """The fitted values to four significant digits."""
-    return task.replace(**{name: float(f"{float(task[name]):.4g}") for name in FREE})
-
-
-def distance(task: jm.AbstractTask, target: jm.Target) -> float:
-    """Root mean square of the log ratio between the mean spectrum of 200 seeds and a target."""
-    power = jm.ensemble(task, jax.random.key(1), seeds=200).spectrum().mean().proportional
-    return float(np.std(np.log(np.asarray(power)) - np.log(target.proportional_power)))
-
-
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("csv", nargs="?", help="your own digitised spectrum (two columns: Hz, proportional power)")
-    parser.add_argument("--segments", type=int, help="Welch segments behind that spectrum")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--out", type=Path, default=None, help="default: out/fitting/zagrodny-hamilton")
-    parser.add_argument("--preset", type=Path, help="write the preset to this file")
-    options = parser.parse_args()
+    options = arguments((__doc__ or "").splitlines()[0], csv=True, preset=True)
     target = load(NAME, options)
     result = fit(target, options.seed)
     report(result, "zagrodny-hamilton", options.out)
-    task = rounded(result.task)
+    task = rounded(result.task, FREE)
     ratio = float(task["harmonic_amplitude"] / jm.load_preset(BESIDE)["harmonic_amplitude"])
     near = distance(task, target)
     print(f"rms log distance of the preset: {near:.3f} to {NAME}; harmonic {ratio:.2f} times that of {BESIDE}")

@@ -10,7 +10,7 @@ import jax
 import numpy as np
 import scipy.stats
 
-from ._fit import _teller, planned, task_for, with_noise
+from ._fit import planned, task_for, teller, with_noise
 from ._noise import AbstractNoise
 from ._parameter import as_numbers
 from ._result import FitResult
@@ -178,7 +178,7 @@ def fit_cohort(
     unknown = set(groups or {}) - set(loaded) - set(failed)
     if unknown:
         raise ValueError(f"groups: no target is called {', '.join(sorted(unknown))}; there are {', '.join(loaded)}")
-    tell = _teller(progress)
+    tell = teller(progress)
     results: dict[str, FitResult] = {}
     with jax.enable_x64(True):
         batches: dict[Any, dict[str, Plan]] = {}

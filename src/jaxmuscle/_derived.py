@@ -54,10 +54,9 @@ def derived(task: Any, moments: Moments) -> dict[str, Any]:
 def observed(moments: Moments) -> dict[str, Any]:
     """Those derived quantities that follow from simulated moments."""
     upper = moments.power.shape[0] // 3
-    proportional = moments.power / moments.power.sum()
     return {
         "harmonic_share": moments.line.sum() / moments.power.sum(),
-        "high_frequency_floor": proportional[-upper:].mean(),
+        "high_frequency_floor": moments.proportional[-upper:].mean(),
         "coefficient_of_variation": moments.variation,
         "mean": moments.mean,
     }

@@ -32,9 +32,9 @@ class Moments(NamedTuple):
     variance: Float[Array | np.ndarray, ""]
 
     @property
-    def proportional(self) -> Float[Array, " bins"]:
+    def proportional(self) -> Float[Array | np.ndarray, " bins"]:
         """Proportional power on the compared bins."""
-        return jnp.asarray(self.power) / jnp.sum(self.power)
+        return self.power / self.power.sum()
 
     @property
     def variation(self) -> Scalar:

@@ -160,7 +160,7 @@ def planned(
     prior = np.array([0.0 if sds[n] is None else 1.0 for n in names])
     extra = (target_variation(target) if coefficient_of_variation else None, mean_force)
     seed, key = (key, jax.random.key(key)) if isinstance(key, int) else (None, key)
-    setup = Setup(task, target, coordinates, prior, extra, residual, method, dt, key, seeds, control, _teller(progress))
+    setup = Setup(task, target, coordinates, prior, extra, residual, method, dt, key, seeds, control, teller(progress))
     settings["steps_per_sample"] = setup.steps_per_sample
     return Plan(setup, starts, max_steps, check_seeds, settings, seed)
 
@@ -191,7 +191,7 @@ def _check_names(argument: str, names: Iterable[str], known: Iterable[str]) -> N
             raise ValueError(f"{argument}: unknown or not free parameter {name!r}: {choices(name, known)}")
 
 
-def _teller(progress: bool | Callable[[str, float], None]) -> Callable[[str, float], None]:
+def teller(progress: bool | Callable[[str, float], None]) -> Callable[[str, float], None]:
     if callable(progress):
         return progress
     if not progress:

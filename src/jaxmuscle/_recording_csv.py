@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ._recording_table import Table, time_name, unit_in
+from ._store import text_of
 
 MISSING = ("", "nan", "-nan", "na", "n/a", "null", "none")
 
@@ -20,7 +21,7 @@ def read_csv(data: bytes, file: str) -> Table:
 
     **Raises:** `ValueError` naming file and line.
     """
-    lines = _decoded(data, file).replace("\r\n", "\n").replace("\r", "\n").split("\n")
+    lines = text_of(data, file).replace("\r\n", "\n").replace("\r", "\n").split("\n")
     parts = [line.partition("#") for line in lines]
     rows = [(number, body) for number, (body, _, _) in enumerate(parts, 1) if body.strip()]
     if not rows:
@@ -56,18 +57,6 @@ def _table(
         columns[name or str(index)] = functools.partial(_column, file, name, cells, index, lines, delimiter)
     units = {name: unit for name in columns if (unit := unit_in(name)) is not None}
     return Table(file, columns, names is not None, {}, units, lines)
-
-
-def _decoded(data: bytes, file: str) -> str:
-    if not data.strip():
-        raise ValueError(f"{file}: is empty")
-    try:
-        text = data.decode("utf-8-sig")
-    except UnicodeDecodeError:
-        text = "\0"
-    if "\0" in text:
-        raise ValueError(f"{file}: is not UTF-8 text (a binary file, or saved with another encoding)")
-    return text
 
 
 def _delimiter(bodies: list[str]) -> str | None:

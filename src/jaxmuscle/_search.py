@@ -7,8 +7,8 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from ._check import Stage, controlled_moments
-from ._descend import BATCH, Descent, descend, seen_at
+from ._check import Stage, controlled_moments, seen_best
+from ._descend import BATCH, Descent, descend
 from ._expected import Moments
 from ._linear import settled
 from ._parameter import as_arrays, as_numbers
@@ -188,6 +188,5 @@ def _montecarlo(setup: Setup, points: np.ndarray, max_steps: int, stages: list[S
 
 def _share(problem: Problem, descent: Descent) -> Float[np.ndarray, " bins"]:
     """Share of the harmonic's line in each bin at the best point."""
-    moments = seen_at(problem, np.asarray(problem.theta(descent.s))).moments
-    share = moments.line[descent.best] / moments.power[descent.best]
-    return np.clip(np.nan_to_num(share), 0.0, 1.0)
+    moments = seen_best(problem, descent).moments
+    return np.clip(np.nan_to_num(moments.line / moments.power), 0.0, 1.0)

@@ -1,4 +1,4 @@
-"""Files that are either whole or not there: write beside the target, then rename."""
+"""Files: written whole or not at all (beside the target, then renamed), and text that is read."""
 
 import contextlib
 import json
@@ -25,6 +25,19 @@ def replacing(path: str | Path) -> Iterator[Path]:
         os.replace(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def text_of(data: bytes, file: str, error: type[ValueError] = ValueError) -> str:
+    """The UTF-8 text of a file's bytes. Raises `error`, naming the file, where there is none or it is something else."""
+    if not data.strip():
+        raise error(f"{file}: is empty")
+    try:
+        text = data.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        text = "\0"
+    if "\0" in text:
+        raise error(f"{file}: is not UTF-8 text (a binary file, or saved with another encoding)")
+    return text
 
 
 def write_text(path: str | Path, text: str) -> None:

@@ -12,6 +12,7 @@ from jaxtyping import Float
 from ._bundled import TargetError, bundled_text, choices, list_targets
 from ._digitised import AXES, Points, columns_of, read_datasets, read_project, read_tar
 from ._spectrum import SpectrumSettings
+from ._store import text_of
 from ._target_check import CHECKS, GRID_TOLERANCE, Columns, check_columns, is_number, metadata
 from ._target_csv import merge_duplicates, read_csv
 
@@ -81,19 +82,7 @@ def _read(name_or_path: str | os.PathLike[str]) -> tuple[str, str, str]:
     if kind not in (".toml", ".csv", ".json"):
         problem = f"{path}: a target is a .toml or .csv file, not {kind or 'one without ending'}"
         raise TargetError(f"{problem}; a WebPlotDigitizer project ends in .json or .tar")
-    return str(path), kind, _decoded(data, path)
-
-
-def _decoded(data: bytes, path: Path) -> str:
-    if not data.strip():
-        raise TargetError(f"{path}: is empty")
-    try:
-        text = data.decode("utf-8-sig")
-    except UnicodeDecodeError:
-        text = "\0"
-    if "\0" in text:
-        raise TargetError(f"{path}: is not UTF-8 text (a binary file, or saved with another encoding)")
-    return text
+    return str(path), kind, text_of(data, str(path), TargetError)
 
 
 def _parse_csv(text: str, file: str, axis: str) -> Raw:
