@@ -89,10 +89,30 @@ def test_groups_differ_by_what_they_were_given():
 
 
 @pytest.mark.slow
+def test_a_member_says_what_was_not_done():
+    member = cohort().results["person0"]
+    assert (member.settings["seeds"], member.settings["check_seeds"]) == (0, 0)
+    assert any(notice.startswith("fitted together with other targets") for notice in member.notices)
+    figure = member.plot()
+    try:
+        said = {text.get_text() for ax in figure.axes for text in ax.texts}
+        assert "not simulated: fitted together with others" in said and "no finite simulation" not in said
+    finally:
+        plt.close(figure)
+
+
+def test_a_cohort_has_one_method():
+    with pytest.raises(TypeError, match="method"):
+        jm.fit_cohort(["vastus-lateralis-26mvc"], method="montecarlo")
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("by", ["person", "group", "level"])
 def test_the_figure(by):
     figure = cohort().plot(by)
     try:
+        if by == "person":
+            assert {ax.get_xlim() for ax in figure.axes if ax.get_ylabel()} == {(-0.5, PEOPLE - 0.5)}
         assert {ax.get_ylabel() for ax in figure.axes} >= {"harmonic frequency (Hz)", "corner frequency (Hz)"}
     finally:
         plt.close(figure)

@@ -170,9 +170,11 @@ def fit_cohort(
     (by default what each measured); `noise`, `fix`, and other options (`free`, `residual`, `bounds`, `priors`, `key`,
     `max_steps`, `coefficient_of_variation`) as in `fit`; `starts` for each target.
 
-    **Returns:** a `CohortResult`. A target that cannot be read or fitted is listed in `failed` and does not stop the rest.
+    **Returns:** a `CohortResult`. A target that cannot be read, or not be fitted with these options, is
+    listed in `failed` with the reason and does not stop the rest.
 
-    **Raises:** `ValueError` for no targets, equal names, a group of an unknown target, and bad options.
+    **Raises:** `ValueError` for no targets, equal names and a group of an unknown target; `TypeError` for an option that
+    is not one of those above.
     """
     loaded, failed = _loaded(targets)
     unknown = set(groups or {}) - set(loaded) - set(failed)
@@ -186,7 +188,7 @@ def fit_cohort(
             model = task_for(target) if task is None else task(settings=target.settings)
             model = with_noise(model, noise, fix)
             try:
-                plan = planned(model, target, fix=fix, counts=(starts, None, None), **options)
+                plan = planned(model, target, fix=fix, method="linear", counts=(starts, None, None), **options)
             except ValueError as error:
                 failed[name] = str(error)
                 continue

@@ -62,7 +62,9 @@ def _panel(ax: Axes, rows: list[dict[str, Any]], people: list[str], groups: list
         ax.set_xlim(-0.6, len(groups) - 0.4)
     elif by == "level":
         ax.set_xlabel("level (% MVC)")
-    elif len(people) <= LABELLED:
-        ax.set_xticks(range(len(people)), people, rotation=35, ha="right", rotation_mode="anchor")
     else:
-        ax.set_xlabel("target number")
+        ax.set_xlim(-0.5, len(people) - 0.5)
+        if len(people) <= LABELLED:
+            ax.set_xticks(range(len(people)), people, rotation=35, ha="right", rotation_mode="anchor")
+        else:
+            ax.set_xlabel("target number")

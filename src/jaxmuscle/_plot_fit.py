@@ -186,6 +186,9 @@ def _stretch(ax: Axes, result: Any) -> None:
     time, output = map(np.asarray, result.stretch or ((), ()))
     ax.set(xlabel="Time (s)", ylabel=output_label(task.output_name, task.output_unit))
     ax.set_title("Simulated output, one noise path")
+    if result.settings.get("check_seeds") == 0:
+        _say(ax, "not simulated: fitted together with others", color=GREY)
+        return
     if output.size < 2 or not np.isfinite(output).all():
         _say(ax, "no finite simulation")
         return
@@ -207,10 +210,10 @@ def _profile(ax: Axes, result: Any) -> None:
     ax.set(xlabel="Frequency (Hz)", ylabel="Δχ²", xlim=(0, frequency[-1] + frequency[0]), ylim=(0, 1.05 * top))
 
 
-def _say(ax: Axes, message: str) -> None:
+def _say(ax: Axes, message: str, color: str = VERMILLION) -> None:
     """A panel that has nothing to show."""
     ax.set(xticks=[], yticks=[])
-    style: dict[str, Any] = {"ha": "center", "va": "bottom", "color": VERMILLION, "weight": "bold"}
+    style: dict[str, Any] = {"ha": "center", "va": "bottom", "color": color, "weight": "bold"}
     ax.text(0.5, 0.52, message, transform=ax.transAxes, **style)
 
 

@@ -48,6 +48,10 @@ from ._uncertainty import (
 )
 
 STRETCH = 5.0
+TOGETHER = (
+    "fitted together with other targets, in linear response and without simulation: fit it alone for the nonlinear "
+    "correction, the check on simulated seeds, and the harmonic's profile and p-value"
+)
 
 
 def report_fit(
@@ -104,6 +108,9 @@ def report_fit(
         parameters, found = without_error("harmonic_frequency", parameters), without_error("harmonic_frequency", found)
     check = {} if expected is None else linear_check(np.asarray(each.power), expected, statistics)
     check |= polish_check(setup, stages, found)
+    notices = notices_of(setup.target, statistics, rivals, check, unsettled(setup, task))
+    if not check_seeds:
+        notices = (*notices, TOGETHER)
     line_test = None if interrupted or not check_seeds else harmonic_test(setup, final)
     return FitResult(
         success=success,
@@ -124,7 +131,7 @@ def report_fit(
         profile=None if line_test is None else (line_test.frequency, line_test.rise),
         harmonic_p_value=None if line_test is None else line_test.p_value,
         check=check,
-        notices=notices_of(setup.target, statistics, rivals, check, unsettled(setup, task)),
+        notices=notices,
         **common,
     )
 

@@ -84,7 +84,8 @@ def search_together(plans: list[Plan], tell: Callable[[str, float], None]) -> li
     second = _together(problems, best, plans[0].max_steps, "linear response", tell, (0.7, 0.8))
     results = []
     for plan, *stages in zip(plans, first, second, strict=True):
-        results.append(_reported(plan, stages, 0))
+        unused = plan.settings | {"seeds": 0, "check_seeds": 0}
+        results.append(_reported(plan._replace(settings=unused), stages, 0))
         tell(f"reporting {plan.setup.target.name}", 0.8 + 0.2 * len(results) / len(plans))
     return results
 
