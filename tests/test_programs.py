@@ -101,3 +101,22 @@ def test_a_users_own_muscle_has_noise_spectra_and_gradients():
         return moved.spectrum().power[10]
 
     assert np.isfinite(jax.grad(floor)(300.0))
+
+
+@pytest.mark.slow
+def test_how_sure_and_which_noise():
+    program = """
+import jax, jaxmuscle as jm
+target = jm.load_target("vastus-lateralis-26mvc")
+result = jm.fit(jm.task_for(target), target)
+found = jm.posterior(result, target, key=jax.random.key(2)); summary = found.summary()
+comparison = jm.compare_noise(jm.Isometric(), target)
+assert "white" in comparison.left_out
+assert found.divergences == 0
+for name, derived in result.derived.items():
+    if derived.stderr is not None:  # the least-squares estimate lies in the bulk of the posterior
+        assert summary[name]["low"] < derived.value < summary[name]["high"], name
+        assert summary[name]["r_hat"] <= 1.01, name
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr

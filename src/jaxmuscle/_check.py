@@ -50,7 +50,7 @@ def controlled_moments(runs: Trajectory, settings: SpectrumSettings, window: Win
     return Moments(power, line, held.mean(axis=1), variance), expected
 
 
-def seen_best(problem: Problem, descent: Descent) -> Seen:
+def seen_best(problem: Any, descent: Descent) -> Seen:
     """What the model gives at the best point."""
     seen = seen_at(problem, np.asarray(problem.theta(descent.s)))
     return jax.tree.map(lambda x: x[descent.best], seen)

@@ -9,7 +9,9 @@ from rich.table import Table
 
 from ._bundled import describe_presets, describe_targets
 from ._cli_analyse import analyse
+from ._cli_compare import compare
 from ._cli_fit import fit
+from ._cli_posterior import posterior
 from ._cli_reproduce import reproduce
 from ._cli_simulate import simulate
 from ._console import out, plain
@@ -24,6 +26,8 @@ app = typer.Typer(
 app.command()(fit)
 app.command()(simulate)
 app.command()(analyse)
+app.command()(posterior)
+app.command()(compare)
 app.command()(reproduce)
 
 

@@ -32,6 +32,7 @@ class NoiseName(StrEnum):
     white = "white"
     band_limited = "band-limited"
     ornstein_uhlenbeck = "ornstein-uhlenbeck"
+    pink = "pink"
 
 
 class AxisName(StrEnum):
@@ -104,7 +105,7 @@ def fit(
         from ._target import load_target
 
         keep_compiled_programs()
-        fixed = _fixed(fix or [])
+        fixed = fixed_values(fix or [])
         names = None if free is None else [name.strip() for name in free.split(",") if name.strip()]
         read = {"quantity": quantity, "segments": segments, "dataset": dataset, "axis": str(axis)}
         options = {
@@ -150,7 +151,7 @@ def _fit_one(target: Any, task: TaskName | None, folder: Path, options: dict[str
     return result.success
 
 
-def _fixed(pairs: list[str]) -> dict[str, float]:
+def fixed_values(pairs: list[str]) -> dict[str, float]:
     fixed: dict[str, float] = {}
     for pair in pairs:
         name, equals, value = pair.partition("=")

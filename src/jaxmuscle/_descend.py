@@ -1,5 +1,6 @@
 """Levenberg-Marquardt from many starts at once, one optimistix step at a time, so that it can be watched and stopped."""
 
+import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -57,6 +58,7 @@ def _moments_and_slopes(problem: Any, theta: Float[Array | np.ndarray, "points f
     return jax.vmap(one)(theta)
 
 
+@functools.singledispatch
 def seen_at(problem: Any, theta: Float[np.ndarray, "points free"]) -> Seen:
     """The problem's moments and their slopes at every θ, as numbers.
 

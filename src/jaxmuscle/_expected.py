@@ -8,15 +8,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.signal
-from jaxtyping import Array, Complex, Float
+from jaxtyping import Array, Float
 
 from ._law import Scalar
+from ._line import bin_rows, harmonic_line
 from ._linear import Linearisation, check_equilibrium, linearise
-from ._muscle import Perturbation
 from ._noise import ShapingFilter
 from ._parameter import as_arrays, is_concrete
-from ._signal import Constant
-from ._spectrum import Spectrum, SpectrumSettings, spectrum_of
+from ._spectrum import Spectrum, SpectrumSettings
 from ._task import AbstractTask
 
 TAIL = 1e-13
@@ -69,13 +68,13 @@ def _covariances(task: AbstractTask, system: Linearisation) -> _Covariances:
     A, C, n, size, k = system.A, system.C, len(system.A), len(F), d.shape[0]
     seen = d[:, None] * H + e[:, None] * (H @ F if size else H)
     if size:
-        own = _sylvester(F, F, jnp.outer(G, G))
-        drive = jnp.einsum("nk,s->kns", b, own @ H + G * L)
+        own = _sylvester(F, F, G @ G.T)
+        drive = jnp.einsum("nk,s->kns", b, own @ H + G @ L)
         cross = _sylvester(A, F, drive)
         fed = jnp.einsum("kns,s,mk->nm", cross, H, b)
     else:
         own, cross, fed = jnp.zeros((0, 0), b.dtype), jnp.zeros((k, n, 0), b.dtype), jnp.zeros((n, n), b.dtype)
-    inner = _sylvester(A, A, fed + fed.T + L**2 * b @ b.T)
+    inner = _sylvester(A, A, fed + fed.T + (L @ L) * b @ b.T)
     start_y = inner @ C + jnp.einsum("kns,ks->n", cross, seen)
     start_q = jnp.einsum("kns,n->ks", cross, C) + seen @ own
     top = jnp.concatenate([A, jnp.einsum("nk,s->nks", b, H).reshape(n, k * size)], axis=1)
@@ -148,29 +147,13 @@ def _autocovariance(system: _Covariances, interval: float, lags: int, sampling: 
 
 
 @functools.cache
-def _bin_rows(settings: SpectrumSettings) -> Complex[np.ndarray, "bins length"]:
-    """Detrending, taper and transform of a segment as one matrix: X_k = Σ_m a_km x_m, scaled so that power is |X_k|²."""
-    n, m = settings.length, np.arange(settings.length)
-    k = np.arange(settings.first_bin, settings.last_bin + 1)
-    sides = np.where((k == 0) | (2 * k == n), 1.0, 2.0)
-    rows = settings.taper * np.exp(-2j * np.pi * np.outer(k, m) / n)
-    rows = rows * np.sqrt(sides / (settings.rate * np.sum(settings.taper**2)))[:, None]
-    if settings.detrend != "none":
-        rows = rows - rows.mean(axis=1, keepdims=True)
-    if settings.detrend == "linear":
-        line = m - m.mean()
-        rows = rows - np.outer(rows @ line, line) / (line @ line)
-    return rows
-
-
-@functools.cache
 def covariance_operator(settings: SpectrumSettings) -> Float[np.ndarray, "bins lags"]:
     """M with expected Welch power `E_k = Σ_l M_kl r(l Δ)`: low-pass, detrending, taper and transform.
 
     The low-pass turns r into `r * ρ`, ρ the autocorrelation of its impulse response; a bin is `Σ_l α_k(l) r(l)`, α_k the
-    autocorrelation of its row of `_bin_rows`. Both are folded onto lags l >= 0.
+    autocorrelation of its row of `bin_rows`. Both are folded onto lags l >= 0.
     """
-    rows, reach = _bin_rows(settings), 1
+    rows, reach = bin_rows(settings), 1
     spread = np.ones(1)
     if settings.sections is not None:
         impulse = scipy.signal.sosfilt(settings.sections, np.eye(1, 64 * settings.length)[0])
@@ -188,111 +171,23 @@ def covariance_operator(settings: SpectrumSettings) -> Float[np.ndarray, "bins l
     return folded
 
 
-def _turn(angle: Float[Array, "*any"]) -> Complex[Array, "*any"]:
-    """exp(i angle)."""
-    return jax.lax.complex(jnp.cos(angle), jnp.sin(angle))
-
-
-def _times_i(x: Float[Array, "*any"]) -> Complex[Array, "*any"]:
-    return jax.lax.complex(jnp.zeros_like(x), x)
-
-
-def _transfer(system: Linearisation, base: Perturbation, omega: Float[Array, ""]) -> Complex[Array, ""]:
-    """Response of the output to the harmonic on all its channels, `C (s - A)⁻¹ B + D + s E` times base, s = iω."""
-    s = _times_i(omega)
-    A, B, C = (x.astype(s.dtype) for x in (system.A, system.B @ base, system.C))
-    inside = jnp.linalg.solve(s * jnp.eye(len(A), dtype=s.dtype) - A, B)
-    return C @ inside + jax.lax.complex(system.D @ base, omega * (system.E @ base))
-
-
-def _low_pass(settings: SpectrumSettings, turn: Complex[Array, ""]) -> Complex[Array, ""]:
-    """Frequency response of the digital low-pass at z = `turn`."""
-    if settings.sections is None:
-        return jnp.ones_like(turn)
-    back = jnp.stack([jnp.ones_like(turn), 1 / turn, 1 / turn**2])
-    sections = jnp.asarray(settings.sections, turn.dtype)
-    gain = jnp.prod((sections[:, :3] @ back) / (sections[:, 3:] @ back))
-    return gain * jnp.conj(gain) if settings.filter_direction == "both" else gain
-
-
-def _sample_mean(angle: Float[Array, ""], sampling: str) -> Complex[Array, ""]:
-    """What averaging over the sampling interval before each sample does to a line that turns by `angle` in it."""
-    return (1 - _turn(-angle)) / _times_i(angle) if sampling == "average" else jnp.ones_like(_turn(angle))
-
-
-def _line(
-    task: AbstractTask, system: Linearisation, settings: SpectrumSettings, window: tuple[float, float]
-) -> tuple[Float[Array, " bins"], Float[Array, ""]]:
-    """Welch power of the harmonic's response, phase and leakage included, and its variance in the window."""
-    harmonic = task.harmonic
-    if not isinstance(harmonic.envelope, Constant):
-        return _enveloped_line(task, system, settings, window)
-    dtype = system.A.dtype
-    omega = 2 * jnp.pi * jnp.asarray(harmonic.frequency, dtype)
-    angle = omega / settings.rate
-    turn = _turn(angle)
-    size = jnp.asarray(harmonic.amplitude, dtype) * jnp.asarray(harmonic.envelope.level, dtype)
-    reply = (
-        size.astype(turn.dtype) * _turn(jnp.asarray(harmonic.phase, dtype)) * _transfer(system, task.harmonic_base(), omega)
-    )
-    reply = reply * _sample_mean(angle, settings.sampling)
-    start, stop = (round(edge * settings.rate) for edge in window)
-    begins = start + settings.step * np.arange(settings.segments(stop - start))
-    rows = jnp.asarray(_bin_rows(settings), turn.dtype)
-    spin = _turn(angle * np.arange(settings.length, dtype=dtype))
-    ahead, behind = rows @ spin, rows @ jnp.conj(spin)
-    here = reply * _low_pass(settings, turn) * _turn(angle * begins.astype(dtype))[:, None]
-    power = jnp.mean(jnp.abs(0.5 * (here * ahead - jnp.conj(here) * behind)) ** 2, axis=0)
-    return power, jnp.var(jnp.imag(reply * _turn(angle * np.arange(start, stop, dtype=dtype))))
-
-
-def _enveloped_line(
-    task: AbstractTask, system: Linearisation, settings: SpectrumSettings, window: tuple[float, float]
-) -> tuple[Float[Array, " bins"], Float[Array, ""]]:
-    """The same for an envelope that changes: the deterministic response, slow in the frame that turns with the harmonic.
-
-    `Y' = (A - iω) Y + B b a(t)` for y = Im(Y e^{i(ωt + φ)}) is stepped exactly for an envelope a linear between samples,
-    from the steady state of its value at t = 0.
-    """
-    harmonic, base, dtype = task.harmonic, task.harmonic_base(), system.A.dtype
-    omega, interval = 2 * jnp.pi * jnp.asarray(harmonic.frequency, dtype), 1 / settings.rate
-    start, stop = (round(edge * settings.rate) for edge in window)
-    time = jnp.arange(stop, dtype=dtype) * interval
-    level, slope = jax.vmap(lambda t: jax.jvp(harmonic.envelope, (t,), (jnp.ones_like(t),)))(time)
-    whirl = _times_i(omega)
-    n, drive = len(system.A), (system.B @ base).astype(whirl.dtype)
-    turning = system.A.astype(whirl.dtype) - whirl * jnp.eye(n, dtype=whirl.dtype)
-    blocks = jnp.zeros((n + 2, n + 2), whirl.dtype)
-    blocks = blocks.at[:n, :n].set(turning * interval).at[:n, n].set(drive * interval).at[n, n + 1].set(1.0)
-    whole = jax.scipy.linalg.expm(blocks)
-    step, held, ramp = whole[:n, :n], whole[:n, n], whole[:n, n + 1]
-
-    def advance(Y, pair):
-        Y = step @ Y + held * pair[0] + ramp * (pair[1] - pair[0])
-        return Y, Y
-
-    pairs = jnp.stack([level[:-1], level[1:]], axis=1).astype(whirl.dtype)
-    first = -jnp.linalg.solve(turning, drive * pairs[0, 0])
-    _, later = jax.lax.scan(advance, first, pairs)
-    Y = jnp.concatenate([first[None], later])
-    around = _turn(omega * time + jnp.asarray(harmonic.phase, dtype)) * _sample_mean(omega * interval, settings.sampling)
-    through, ahead = system.D @ base, system.E @ base
-    direct = jax.lax.complex(through * level + ahead * slope, ahead * omega * level)
-    z = jnp.asarray(harmonic.amplitude, dtype) * jnp.imag((Y @ system.C.astype(Y.dtype) + direct) * around)
-    return jnp.asarray(spectrum_of(z, settings, window).power), jnp.var(z[start:stop])
-
-
-def response(task: AbstractTask, settings: SpectrumSettings, window: tuple[float, float]) -> tuple[Moments, Linearisation]:
-    """Expected moments of the linearised task in the window, and the linearisation. Not finite where it is unstable."""
+def noise_response(
+    task: AbstractTask, settings: SpectrumSettings, window: tuple[float, float]
+) -> tuple[Float[Array, " bins"], Float[Array, ""], Linearisation]:
+    """Expected Welch power and variance in the window without the harmonic, and the linearisation."""
     system = linearise(task)
     samples = round(window[1] * settings.rate) - round(window[0] * settings.rate)
     operator = covariance_operator(settings)
     lags = operator.shape[1]
     r = _autocovariance(_covariances(task, system), 1 / settings.rate, max(lags, samples), settings.sampling)
-    noise = jnp.asarray(operator, r.zero.dtype) @ r.lagged(lags)
-    line, swing = _line(task, system, settings, window)
-    variance = r.zero - r.mean_variance(samples) + swing
-    return Moments(noise + line, line, system.rest, variance), system
+    return jnp.asarray(operator, r.zero.dtype) @ r.lagged(lags), r.zero - r.mean_variance(samples), system
+
+
+def response(task: AbstractTask, settings: SpectrumSettings, window: tuple[float, float]) -> tuple[Moments, Linearisation]:
+    """Expected moments of the linearised task in the window, and the linearisation. Not finite where it is unstable."""
+    noise, variance, system = noise_response(task, settings, window)
+    line, swing = harmonic_line(task, system, settings, window)
+    return Moments(noise + line, line, system.rest, variance + swing), system
 
 
 @eqx.filter_jit

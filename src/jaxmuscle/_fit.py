@@ -14,6 +14,7 @@ from ._linear import has_response
 from ._noise import AbstractNoise, BandLimitedNoise, OrnsteinUhlenbeckNoise, WhiteNoise
 from ._objective import Coordinates
 from ._parameter import CHANNELS, DEFAULT_FREE, PARAMETERS, as_numbers
+from ._pink import PinkNoise
 from ._problem import Setup
 from ._result import FitResult
 from ._search import FitInterrupted as FitInterrupted
@@ -27,6 +28,7 @@ NOISES: dict[str, type[AbstractNoise]] = {
     "white": WhiteNoise,
     "band-limited": BandLimitedNoise,
     "ornstein-uhlenbeck": OrnsteinUhlenbeckNoise,
+    "pink": PinkNoise,
 }
 METHODS = ("linear", "montecarlo")
 DT = 2.5e-3
@@ -151,7 +153,8 @@ def planned(
     starts, seeds, check_seeds = (given or default for given, default in zip(counts, usual, strict=True))
     settings = {
         "free": list(names), "residual": residual, "starts": starts, "seeds": seeds, "dt": dt, "max_steps": max_steps,
-        "check_seeds": check_seeds, "prior_sd": sds, "bounds": {n: list(b) for n, b in (bounds or {}).items()},
+        "check_seeds": check_seeds, "prior_centre": {n: float(task[n]) for n in names}, "prior_sd": sds,
+        "bounds": {n: list(b) for n, b in (bounds or {}).items()},
         "coefficient_of_variation": coefficient_of_variation and target.coefficient_of_variation is not None,
         "mean_force": None if mean_force is None else list(mean_force), "spectrum": target.settings.to_dict(),
     }  # fmt: skip

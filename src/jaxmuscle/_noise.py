@@ -28,12 +28,12 @@ class Realisation(eqx.Module):
 
 
 class ShapingFilter(eqx.Module):
-    """A unit noise as a filtered white noise w of density 1: `q' = F q + G w`, `N = H q + L w`."""
+    """A unit noise as filtered independent white noises w of density 1: `q' = F q + G w`, `N = H q + L w`."""
 
     F: Float[Array, "states states"]
-    G: Float[Array, " states"]
+    G: Float[Array, "states inputs"]
     H: Float[Array, " states"]
-    L: Float[Array, ""]
+    L: Float[Array, " inputs"]
 
 
 class AbstractNoise(eqx.Module):
@@ -86,7 +86,7 @@ class AbstractNoise(eqx.Module):
         return 1 if self.shared else len(CHANNELS)
 
 
-def _amplitude(value: Amplitude) -> Scalar:
+def as_amplitude(value: Amplitude) -> Scalar:
     """The paper's structure by default; a number for all, four in order, or a mapping by coefficient."""
     if value is None:
         return np.array([default(f"noise_{c}") for c in CHANNELS])
@@ -102,7 +102,7 @@ def _amplitude(value: Amplitude) -> Scalar:
     return value
 
 
-def _normals(key: PRNGKeyArray, shape: tuple[int, ...]) -> Float[Array, "..."]:
+def standard_normals(key: PRNGKeyArray, shape: tuple[int, ...]) -> Float[Array, "..."]:
     """Standard normals of single precision in either precision: seed i is the same path in both, and cheaper to draw."""
     return jax.random.normal(key, shape, jnp.float32).astype(jnp.result_type(float))
 
@@ -111,7 +111,7 @@ def _any_jax(values: tuple | list) -> bool:
     return any(isinstance(v, jax.Array) for v in values)
 
 
-def _check_amplitude(noise: AbstractNoise) -> None:
+def check_amplitude(noise: AbstractNoise) -> None:
     if np.shape(noise.amplitude) not in ((), (len(CHANNELS),)):
         raise ValueError(f"noise amplitude has shape {np.shape(noise.amplitude)}: give one number or four")
     require(jnp.all(jnp.asarray(noise.amplitude) >= 0), f"noise amplitude {noise.amplitude} must not be negative")
@@ -126,28 +126,28 @@ class WhiteNoise(AbstractNoise):
     **Arguments:** `amplitude` (see `AbstractNoise`), `rate` [Hz] > 0, `relative`, `shared`.
     """
 
-    amplitude: Scalar = eqx.field(converter=_amplitude, default=None)
+    amplitude: Scalar = eqx.field(converter=as_amplitude, default=None)
     rate: Scalar = 100.0
     relative: bool = eqx.field(static=True, default=True)
     shared: bool = eqx.field(static=True, default=False)
     smoothness: ClassVar[int] = 0
 
     def __check_init__(self):
-        _check_amplitude(self)
+        check_amplitude(self)
         require(self.rate > 0, f"noise rate = {self.rate} Hz must be positive")
 
     def density(self, f: Scalar) -> Scalar:
         return jnp.ones_like(f) / self.rate
 
     def draw(self, key: PRNGKeyArray, steps: int) -> Float[Array, "..."]:
-        return _normals(key, (steps, self.channels))
+        return standard_normals(key, (steps, self.channels))
 
     def realise(self, normals: Float[Array, "..."], dt: Scalar) -> Realisation:
         return Realisation(increments=normals * jnp.sqrt(dt / self.rate))
 
     def shaping_filter(self) -> ShapingFilter:
-        nothing = jnp.zeros(0)
-        return ShapingFilter(jnp.zeros((0, 0)), nothing, nothing, 1 / jnp.sqrt(jnp.asarray(self.rate)))
+        direct = 1 / jnp.sqrt(jnp.asarray(self.rate))
+        return ShapingFilter(jnp.zeros((0, 0)), jnp.zeros((0, 1)), jnp.zeros(0), direct[None])
 
     def check_step(self, dt: float) -> None:
         pass
@@ -163,7 +163,7 @@ class BandLimitedNoise(AbstractNoise):
     has when sampled at `rate`), `rate` [Hz], `cutoff` [Hz], `relative`, `shared`.
     """
 
-    amplitude: Scalar = eqx.field(converter=_amplitude, default=None)
+    amplitude: Scalar = eqx.field(converter=as_amplitude, default=None)
     rate: Scalar = 100.0
     cutoff: Scalar = default("noise_cutoff")
     relative: bool = eqx.field(static=True, default=True)
@@ -171,7 +171,7 @@ class BandLimitedNoise(AbstractNoise):
     smoothness: ClassVar[int] = 2
 
     def __check_init__(self):
-        _check_amplitude(self)
+        check_amplitude(self)
         require(self.rate > 0, f"noise rate = {self.rate} Hz must be positive")
         require(self.cutoff > 0, f"noise_cutoff = {self.cutoff} Hz must be positive")
 
@@ -179,7 +179,7 @@ class BandLimitedNoise(AbstractNoise):
         return 1 / self.rate / (1 + (f / self.cutoff) ** 4)
 
     def draw(self, key: PRNGKeyArray, steps: int) -> Float[Array, "..."]:
-        flat = _normals(key, (steps + 1, 2 * self.channels))  # XLA draws two axes three times faster than three
+        flat = standard_normals(key, (steps + 1, 2 * self.channels))  # XLA draws two axes three times faster than three
         return flat.reshape(steps + 1, 2, self.channels)
 
     def realise(self, normals: Float[Array, "..."], dt: Scalar) -> Realisation:
@@ -207,7 +207,8 @@ class BandLimitedNoise(AbstractNoise):
         # States (N, N'/ω), so that both have the same scale.
         omega = 2 * jnp.pi * jnp.asarray(self.cutoff)
         F = omega * jnp.array([[0.0, 1.0], [-1.0, -np.sqrt(2)]])
-        return ShapingFilter(F, jnp.stack([0 * omega, omega]) / jnp.sqrt(self.rate), jnp.array([1.0, 0.0]), jnp.zeros(()))
+        G = jnp.stack([0 * omega, omega])[:, None] / jnp.sqrt(self.rate)
+        return ShapingFilter(F, G, jnp.array([1.0, 0.0]), jnp.zeros(1))
 
     def check_step(self, dt: float) -> None:
         require(
@@ -223,7 +224,7 @@ class OrnsteinUhlenbeckNoise(AbstractNoise):
     `correlation_time` τ [s] > 0, `relative`, `shared`.
     """
 
-    amplitude: Scalar = eqx.field(converter=_amplitude)
+    amplitude: Scalar = eqx.field(converter=as_amplitude)
     correlation_time: Scalar
     relative: bool = eqx.field(static=True)
     shared: bool = eqx.field(static=True)
@@ -241,14 +242,14 @@ class OrnsteinUhlenbeckNoise(AbstractNoise):
         self.relative, self.shared = relative, shared
 
     def __check_init__(self):
-        _check_amplitude(self)
+        check_amplitude(self)
         require(self.correlation_time > 0, f"noise_correlation_time = {self.correlation_time} s must be positive")
 
     def density(self, f: Scalar) -> Scalar:
         return 2 * self.correlation_time / (1 + (2 * jnp.pi * f * self.correlation_time) ** 2)
 
     def draw(self, key: PRNGKeyArray, steps: int) -> Float[Array, "..."]:
-        return _normals(key, (steps + 1, self.channels))
+        return standard_normals(key, (steps + 1, self.channels))
 
     def realise(self, normals: Float[Array, "..."], dt: Scalar) -> Realisation:
         x = dt / self.correlation_time
@@ -263,7 +264,7 @@ class OrnsteinUhlenbeckNoise(AbstractNoise):
 
     def shaping_filter(self) -> ShapingFilter:
         rate = 1 / jnp.asarray(self.correlation_time)
-        return ShapingFilter(-rate[None, None], jnp.sqrt(2 * rate)[None], jnp.ones(1), jnp.zeros(()))
+        return ShapingFilter(-rate[None, None], jnp.sqrt(2 * rate)[None, None], jnp.ones(1), jnp.zeros(1))
 
     def check_step(self, dt: float) -> None:
         require(

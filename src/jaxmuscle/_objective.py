@@ -65,6 +65,12 @@ class Coordinates(eqx.Module):
         low, high = xp.where(bounded, self.low, 0.0), xp.where(bounded, self.high, 1.0)
         return xp.where(bounded, low + (high - low) * sigmoid(s), s)
 
+    def stretch(self, s: Float[np.ndarray, "*batch free"]) -> Float[np.ndarray, "*batch free"]:
+        """dθ/ds."""
+        bounded = np.isfinite(self.low)
+        share = expit(s)
+        return np.where(bounded, np.where(bounded, self.high - self.low, 1.0) * share * (1 - share), 1.0)
+
     def _library(self, given: Any) -> tuple[Any, Any]:
         """NumPy for numbers, which needs no compilation, else JAX; with its sigmoid."""
         return (np, expit) if isinstance(given, np.ndarray) and isinstance(self.low, np.ndarray) else (jnp, jax.nn.sigmoid)
@@ -82,6 +88,11 @@ class Coordinates(eqx.Module):
         step = self.sd * theta
         natural = xp.where(self.positive, self.centre * xp.exp(xp.where(self.positive, step, 0.0)), self.centre + step)
         return dict(zip(self.names, natural, strict=True))
+
+    def values_of(self, theta: Float[np.ndarray, "rows free"]) -> Float[np.ndarray, "rows free"]:
+        """Natural values of many θ, in the order of `names`."""
+        step = self.sd * theta
+        return np.where(self.positive, self.centre * np.exp(np.where(self.positive, step, 0.0)), self.centre + step)
 
     def theta_of(self, name: str, values: Float[np.ndarray, "*values"] | float) -> Float[np.ndarray, "*values"]:
         """θ of one positive parameter at natural values."""

@@ -10,7 +10,7 @@ import equinox as eqx
 import numpy as np
 import tomli_w
 
-from . import _harmonic, _law, _muscle, _noise, _signal, _task
+from . import _harmonic, _law, _muscle, _noise, _pink, _signal, _task
 from ._bundled import bundled_text, choices, list_presets
 from ._parameter import as_numbers
 from ._spectrum import SpectrumSettings
@@ -19,7 +19,7 @@ from ._task import TASKS, AbstractTask
 
 _KINDS: dict[str, type] = {
     kind.__name__: kind
-    for module in (_harmonic, _law, _muscle, _noise, _signal, _task)
+    for module in (_harmonic, _law, _muscle, _noise, _pink, _signal, _task)
     for kind in vars(module).values()
     if isinstance(kind, type) and issubclass(kind, eqx.Module) and not kind.__name__.startswith("Abstract")
 }
@@ -76,7 +76,7 @@ def _build(kind: type, table: dict[str, Any], where: str) -> Any:
         values[key] = _from_table(key, value, f"{where}.{key}")
         if not _fits(fields[key].type, values[key]):
             raise PresetError(f"{where}.{key} = {value!r} is of the wrong kind")
-    if kind is _noise.OrnsteinUhlenbeckNoise:
+    if kind in (_noise.OrnsteinUhlenbeckNoise, _pink.PinkNoise):
         values["std"] = values.pop("amplitude", None)
     try:
         return kind(**values)

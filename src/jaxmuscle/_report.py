@@ -90,10 +90,10 @@ def report_fit(
     power, share = np.mean(each.power, axis=0), moments.line / moments.power
     each = each._replace(line=np.tile(np.minimum(moments.line, power), (len(each.mean), 1)))
     values = quantities | observed(Moments(*(np.mean(x, axis=0) for x in each)))
-    scatter = _residual_covariance(setup, problem, share)
+    scatter = residual_covariance(setup, problem, share)
     scaled = jacobian / np.sqrt(np.maximum(np.diag(scatter), 1.0))[:, None]
     known = identifiability(scaled)
-    success, message = _verdict(final, residuals, jacobian, setup.prior, theta, known, starts, max_steps)
+    success, message = verdict(final, residuals, jacobian, setup.prior, theta, known, starts, max_steps)
     if interrupted:
         success, message = False, f"interrupted after {int(final.steps.max())} steps; this is what had been reached"
     covariance = parameter_covariance(jacobian, scatter, setup.prior)
@@ -166,7 +166,7 @@ def _failed(setup: Setup, common: dict[str, Any], reason: str) -> FitResult:
     )  # fmt: skip
 
 
-def _verdict(
+def verdict(
     final: Descent,
     residuals: np.ndarray,
     jacobian: np.ndarray,
@@ -194,7 +194,7 @@ def _verdict(
                    f"raise max_steps or give more starts")  # fmt: skip
 
 
-def _residual_covariance(setup: Setup, problem: Problem, share: np.ndarray) -> np.ndarray:
+def residual_covariance(setup: Setup, problem: Problem, share: np.ndarray) -> np.ndarray:
     """Covariance of the data residuals: scatter of the target and of the simulated mean."""
     target = setup.target
     start, stop = WINDOW

@@ -137,7 +137,9 @@ def _linear(setup: Setup, points: np.ndarray, max_steps: int, stages: list[Stage
     found = descend(problem, best, max_steps, report=show)
     correction = None
     for turn in range(POLISHES):
-        new = _correction(setup, found)
+        if not np.isfinite(found.cost[found.best]):
+            return
+        new = correction_at(setup, np.asarray(setup.coordinates.theta(found.s[found.best])))
         if new is None:
             return
         change = np.inf if correction is None else np.max(np.abs(np.log(new.power / correction.power)))
@@ -148,11 +150,9 @@ def _linear(setup: Setup, points: np.ndarray, max_steps: int, stages: list[Stage
         found = descend(problem, found.s, max_steps, report=show)
 
 
-def _correction(setup: Setup, found: Descent) -> Moments | None:
-    """Moments of the nonlinear model over those of the linear response at the best point; None if it cannot be simulated."""
-    if not np.isfinite(found.cost[found.best]):
-        return None
-    values = setup.coordinates.values(setup.coordinates.theta(found.s[found.best]))
+def correction_at(setup: Setup, theta: Float[np.ndarray, " free"]) -> Moments | None:
+    """Moments of the nonlinear model over those of the linear response at θ; None if it cannot be simulated."""
+    values = setup.coordinates.values(theta)
     task = setup.task.replace(**{name: float(v) for name, v in values.items()})
     try:
         runs = ensemble(as_numbers(settled(as_arrays(task))), jax.random.fold_in(setup.key, 2), seeds=setup.seeds)

@@ -15,43 +15,55 @@ def starting_points(coordinates: Coordinates, target: Target, count: int) -> Flo
 
     The first start has all other parameters at their default, the others at half a prior standard deviation about it.
     """
-    size = len(coordinates.names)
+    theta = space_filling(len(coordinates.names), count)
+    for name in frequency_names(coordinates):
+        theta[:, coordinates.names.index(name)] = coordinates.theta_of(name, candidate_frequencies(target, count))
+    return coordinates.from_theta(theta)
+
+
+def space_filling(size: int, count: int) -> Float[np.ndarray, "count size"]:
+    """θ = 0, then a Halton design with half a prior standard deviation about it."""
     cube = qmc.Halton(size, rng=0).random(count)
     theta = 0.5 * ndtri(np.clip(cube, 0.02, 0.98))
     theta[0] = 0.0
-    if "harmonic_frequency" in coordinates.names:
-        column = coordinates.names.index("harmonic_frequency")
-        frequencies = _candidate_frequencies(target, count)
-        theta[:, column] = coordinates.theta_of("harmonic_frequency", frequencies)
-    return coordinates.from_theta(theta)
+    return theta
+
+
+def frequency_names(coordinates: Coordinates) -> list[str]:
+    """The free harmonic frequencies; in a joint fit targets may have one each, called "harmonic_frequency@target"."""
+    return [name for name in coordinates.names if name.partition("@")[0] == "harmonic_frequency"]
 
 
 def contenders(coordinates: Coordinates, target: Target, descent: Descent, margin: float) -> list[int]:
     """The best start, then those whose cost is at most `margin` above it at another harmonic frequency, best first.
 
-    Frequencies differ when no nearer than one bin: a Welch peak is two bins wide, so these are different minima.
+    Frequencies differ when no nearer than one bin: a Welch peak is two bins wide, so these are different minima. Where
+    several are free, one that differs is enough.
     """
     costs = np.where(np.isfinite(descent.cost), descent.cost, np.inf)
     chosen = [descent.best]
-    if "harmonic_frequency" not in coordinates.names:
+    names = frequency_names(coordinates)
+    if not names:
         return chosen
-    frequency = harmonic_frequencies(coordinates, descent)
+    frequency = np.stack([harmonic_frequencies(coordinates, descent, name) for name in names], axis=1)
     width = target.settings.rate / target.settings.length
     for i in np.argsort(costs, kind="stable"):
-        near = np.min(np.abs(frequency[i] - frequency[chosen])) < width
+        near = np.min(np.max(np.abs(frequency[i] - frequency[chosen]), axis=1)) < width
         if costs[i] <= costs[descent.best] + margin and not near:
             chosen.append(int(i))
     return chosen
 
 
-def harmonic_frequencies(coordinates: Coordinates, descent: Descent) -> Float[np.ndarray, " starts"]:
+def harmonic_frequencies(
+    coordinates: Coordinates, descent: Descent, name: str = "harmonic_frequency"
+) -> Float[np.ndarray, " starts"]:
     """Harmonic frequency that each start reached [Hz]."""
     theta = np.asarray(coordinates.theta(descent.s))
-    column = coordinates.names.index("harmonic_frequency")
+    column = coordinates.names.index(name)
     return coordinates.centre[column] * np.exp(coordinates.sd[column] * theta[:, column])
 
 
-def _candidate_frequencies(target: Target, count: int) -> Float[np.ndarray, " starts"]:
+def candidate_frequencies(target: Target, count: int) -> Float[np.ndarray, " starts"]:
     """The target's local maxima, highest above their neighbours first, and a quarter bin beside each; then the band.
 
     A maximum is the vertex of the parabola through the log powers of three bins: a line that is narrower than a bin is

@@ -150,22 +150,27 @@ SCALES = (
 
 
 def undetermined_directions(names: tuple[str, ...], found: Identifiability) -> tuple[str, ...]:
-    """Sentences that name the directions along which the parameters can move without being noticed."""
+    """Sentences that name the directions along which the parameters can move without being noticed.
+
+    Of a joint fit, where "name@target" belongs to one target, each target's own scales and those that are shared.
+    """
     basis = found.directions[~found.determined]
     sentences = []
-    for sentence, members in SCALES:
-        pattern = np.array([name in members for name in names], dtype=float)
-        if pattern.sum() < 2 or not len(basis):
-            continue
-        pattern /= np.linalg.norm(pattern)
-        inside = basis.T @ (basis @ pattern)
-        steepness = np.linalg.norm(found.singular_values * (found.directions @ pattern))
-        if steepness < DETERMINED and inside @ inside >= 0.5:
-            sentences.append(sentence)
-            inside /= np.linalg.norm(inside)
-            basis = basis - np.outer(basis @ inside, inside)
-            _, size, rows = np.linalg.svd(basis, full_matrices=False)
-            basis = rows[size > 0.5]
+    split = [name.partition("@") for name in names]
+    for target in dict.fromkeys(of for _, _, of in split):
+        for sentence, members in SCALES:
+            pattern = np.array([base in members and of in ("", target) for base, _, of in split], dtype=float)
+            if pattern.sum() < 2 or not len(basis):
+                continue
+            pattern /= np.linalg.norm(pattern)
+            inside = basis.T @ (basis @ pattern)
+            steepness = np.linalg.norm(found.singular_values * (found.directions @ pattern))
+            if steepness < DETERMINED and inside @ inside >= 0.5:
+                sentences.append(sentence + (f" ({target})" if target else ""))
+                inside /= np.linalg.norm(inside)
+                basis = basis - np.outer(basis @ inside, inside)
+                _, size, rows = np.linalg.svd(basis, full_matrices=False)
+                basis = rows[size > 0.5]
     return (*sentences, *(_in_words(names, direction) for direction in basis))
 
 

@@ -1,0 +1,146 @@
+"""NUTS chains of a whitened density: all chains in one program, step size and metric adapted on all of them together."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+Density = Any  # has `size`, `centre`, `scale` that whiten, and `log_density` of whitened coordinates
+BLOCK = 50
+ADAPTATIONS = (2, 3, 5)  # blocks of warm-up; the metric is learnt after each but the last
+TARGET_ACCEPTANCE = 0.9
+DOUBLINGS = 7
+SPREAD = 1.5
+SHRINK = 20  # draws that the old metric counts for when a new one is learnt
+
+
+class Chains(NamedTuple):
+    """Draws of the unbounded coordinates and the offset, and how each was made; leading axes chain, draw."""
+
+    s: Float[np.ndarray, "chains draws sampled"]
+    log_density: Float[np.ndarray, "chains draws"]
+    acceptance: Float[np.ndarray, "chains draws"]
+    steps: Int[np.ndarray, "chains draws"]
+    diverging: Bool[np.ndarray, "chains draws"]
+    step_size: float
+
+
+class _State(NamedTuple):
+    chains: Any
+    adaptation: Any
+
+
+def _tools() -> tuple[Any, Any]:
+    try:
+        import blackjax
+        from blackjax.adaptation.step_size import dual_averaging_adaptation
+    except ImportError as error:
+        raise ImportError("posterior needs blackjax and arviz-stats: pip install 'jaxmuscle[posterior]'") from error
+    return blackjax.nuts, dual_averaging_adaptation(TARGET_ACCEPTANCE)
+
+
+def _strong(tree: Any) -> Any:
+    """Without weak types, with which every block would be compiled anew."""
+    return jax.tree.map(lambda x: jnp.asarray(x, dtype=jnp.result_type(x)), tree)
+
+
+@eqx.filter_jit
+def _first(marginal: Density, positions: Array) -> Any:
+    nuts, (start, _, _) = _tools()
+    made = _State(jax.vmap(lambda x: nuts.init(x, marginal.log_density))(positions), start(jnp.asarray(0.5)))
+    return _strong(made)
+
+
+@eqx.filter_jit
+def _block(marginal: Density, key: Array, state: Any, adapting: Array) -> tuple[Any, Any]:
+    """`BLOCK` draws of every chain; while `adapting` the step size follows the mean acceptance of all chains."""
+    nuts, (_, update, final) = _tools()
+    kernel = nuts.build_kernel()
+    settled = final(state.adaptation)
+
+    def one(state, key):
+        size = jnp.where(adapting, jnp.exp(state.adaptation.log_step_size), settled)
+        keys = jax.random.split(key, len(state.chains.logdensity))
+        metric = jnp.ones(marginal.size)
+        chains, info = jax.vmap(
+            lambda key, chain: kernel(key, chain, marginal.log_density, size, metric, max_num_doublings=DOUBLINGS)
+        )(keys, state.chains)
+        learnt = update(state.adaptation, jnp.mean(info.acceptance_rate))
+        adaptation = jax.tree.map(lambda new, old: jnp.where(adapting, new, old), learnt, state.adaptation)
+        made = chains.position, chains.logdensity, info.acceptance_rate, info.num_integration_steps, info.is_divergent
+        return _State(chains, adaptation), (*made, size)
+
+    state, made = jax.lax.scan(one, state, jax.random.split(key, BLOCK))
+    return _strong(state), made
+
+
+def _learnt(marginal: Density, white: np.ndarray) -> Density:
+    """Whitened anew by the covariance of draws, the old metric counting as `SHRINK` of them."""
+    count = len(white)
+    covariance = (count * np.cov(white.T, bias=True) + SHRINK * np.eye(white.shape[1])) / (count + SHRINK)
+    scale = np.asarray(marginal.scale) @ np.linalg.cholesky(covariance)
+    centre = np.asarray(marginal.centre) + np.asarray(marginal.scale) @ white.mean(axis=0)
+    return eqx.tree_at(lambda m: (m.centre, m.scale), marginal, (centre, scale))
+
+
+def _moved(old: Density, new: Density, white: Array) -> np.ndarray:
+    both = np.asarray(old.centre) + np.asarray(white) @ np.asarray(old.scale).T
+    return np.linalg.solve(np.asarray(new.scale), (both - np.asarray(new.centre)).T).T
+
+
+def sample(
+    marginal: Density, key: Array, chains: int, draws: int, warmup: int, tell: Callable[[str, float], None]
+) -> tuple[Chains, Density]:
+    """Chains from dispersed starts, and the density whitened as they were drawn.
+
+    `warmup` is rounded up to blocks. Needs double precision. Raises `ValueError` if no start has a finite density.
+    """
+    with jax.numpy_dtype_promotion("standard"):
+        return _sample(marginal, key, chains, draws, warmup, tell)
+
+
+def _sample(
+    marginal: Density, key: Array, chains: int, draws: int, warmup: int, tell: Callable[[str, float], None]
+) -> tuple[Chains, Density]:
+    tell("compiling the sampler", 0.0)
+    blocks = max(len(ADAPTATIONS), -(-warmup // BLOCK))
+    shares = np.cumsum(ADAPTATIONS) / sum(ADAPTATIONS)
+    renewals = {max(1, round(blocks * share)) for share in shares[:-1]}
+    total = blocks + -(-draws // BLOCK)
+    state = _first(marginal, _dispersed(marginal, jax.random.fold_in(key, 0), chains))
+    recent: list[np.ndarray] = []
+    kept: list[Any] = []
+    for number in range(total):
+        adapting = number < blocks
+        state, made = _block(marginal, jax.random.fold_in(key, number + 1), state, jnp.asarray(adapting))
+        white = np.asarray(made[0])
+        if not adapting:
+            both = np.asarray(marginal.centre) + white @ np.asarray(marginal.scale).T
+            kept.append((both, *map(np.asarray, made[1:])))
+        elif number + 1 in renewals:
+            recent.append(white)
+            new = _learnt(marginal, np.concatenate(recent[-2:]).reshape(-1, white.shape[-1]))
+            state = _first(new, jnp.asarray(_moved(marginal, new, state.chains.position)))
+            marginal, recent = new, []
+        else:
+            recent.append(white)
+        text = "warming up" if adapting else f"drawing, block {number + 1 - blocks} of {total - blocks}"
+        tell(text, (number + 1) / total)
+    parts = [np.concatenate([part[i] for part in kept])[:draws] for i in range(6)]
+    s, density, acceptance, steps, diverging = (np.swapaxes(part, 0, 1) for part in parts[:5])
+    return Chains(s, density, acceptance, steps, diverging, float(parts[5][-1])), marginal
+
+
+def _dispersed(marginal: Density, key: Array, chains: int) -> Array:
+    """Starts about the maximum, wider than the posterior; nearer where the density is not finite."""
+    away = SPREAD * jax.random.normal(key, (chains, marginal.size))
+    for _ in range(6):
+        height = _first(marginal, away).chains.logdensity
+        if bool(jnp.all(jnp.isfinite(height))):
+            return away
+        away = jnp.where(jnp.isfinite(height)[:, None], away, 0.5 * away)
+    raise ValueError("the posterior density is not finite about its maximum: the fitted task is at the edge of stability")

@@ -1,0 +1,287 @@
+"""The posterior of a fit's parameters: NUTS chains, what they say, and whether they may be believed."""
+
+from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ._again import taken_up, theta_of
+from ._chains import Chains, sample
+from ._climb import quantities
+from ._derived import DERIVED, UNITS, unit_of
+from ._descend import seen_at
+from ._fit import teller
+from ._likelihood import Likelihood
+from ._marginal import Marginal, edges_of, marginal_of
+from ._mixing import diagnosed, modes_of, verdict
+from ._problem import Setup
+from ._replicate import Replicates, replicates
+from ._result import FitResult
+from ._store import write_json
+from ._target import Target
+from ._task import AbstractTask
+from ._trajectory import versions
+
+if TYPE_CHECKING:
+    import xarray
+    from matplotlib.figure import Figure
+
+ROWS = 256
+CREDIBLE = (0.025, 0.975)
+
+
+class NotMixedError(RuntimeError):
+    """Chains that did not mix have no summary; the message says what to do."""
+
+
+class Posterior(eqx.Module):
+    """Draws from the posterior of a fit; arrays have leading axes (chain, draw).
+
+    `success` and `message`: whether the chains mixed, or why not; `samples` of the free parameters and `derived` quantities
+    in natural units; `diagnostics` {name: (R-hat, effective size of the bulk, of the tails)}; `determined`, the names that
+    the data determine; `replicates`, what spectra the posterior predicts; `chains`, how it was drawn; `modes` of the
+    harmonic's frequency [(Hz, Hz, Hz, probability)] as (from, median, to, share).
+    """
+
+    success: bool
+    message: str
+    task: AbstractTask
+    target: Target
+    samples: dict[str, Float[np.ndarray, "chains draws"]]
+    derived: dict[str, Float[np.ndarray, "chains draws"]]
+    diagnostics: dict[str, tuple[float, float, float]]
+    determined: tuple[str, ...]
+    modes: tuple[tuple[float, float, float, float], ...]
+    replicates: Replicates
+    chains: Chains
+    settings: dict[str, Any]
+    seed: int | None
+    versions: dict[str, str]
+
+    @property
+    def divergences(self) -> int:
+        """How many draws were divergent."""
+        return int(self.chains.diverging.sum())
+
+    @property
+    def quantities(self) -> dict[str, Float[np.ndarray, "chains draws"]]:
+        """Parameters, then derived quantities."""
+        return self.samples | self.derived
+
+    def summary(self) -> "Summary":
+        """Mean, sd, median and 95 % interval of every quantity. Raises `NotMixedError` if the chains did not mix."""
+        if not self.success:
+            raise NotMixedError(f"{self.target.name}: {self.message}")
+        rows = {}
+        for name, draws in self.quantities.items():
+            low, middle, high = np.quantile(draws, (CREDIBLE[0], 0.5, CREDIBLE[1]))
+            rows[name] = (float(draws.mean()), float(draws.std(ddof=1)), float(middle), float(low), float(high))
+        return Summary(rows, self.diagnostics, self.determined, {n: self.unit(n) for n in rows}, str(self))
+
+    def unit(self, name: str) -> str:
+        """Unit of a parameter or derived quantity."""
+        return self.task.output_unit if name == "mean" else UNITS.get(name, unit_of(name) or "1")
+
+    def task_of(self, chain: int, draw: int) -> AbstractTask:
+        """The task with the parameters of one draw."""
+        return self.task.replace(**{name: float(draws[chain, draw]) for name, draws in self.samples.items()})
+
+    def to_datatree(self) -> "xarray.DataTree":
+        """ArviZ's groups posterior, posterior_predictive, sample_stats, observed_data, over chain, draw, frequency."""
+        from ._posterior_store import datatree
+
+        return datatree(self)
+
+    def save(self, path: str | Path) -> None:
+        """Write the draws as netCDF, or a summary as JSON if the name ends in .json; replaces a file in one step."""
+        from ._posterior_store import summary_table, write_netcdf
+
+        if Path(path).suffix == ".json":
+            write_json(path, summary_table(self))
+        else:
+            write_netcdf(path, self)
+
+    def plot(self) -> "Figure":
+        """Corner figure of what the data determine. Raises `NotMixedError` if the chains did not mix."""
+        from ._plot_posterior import corner
+
+        return corner(self)
+
+    def plot_chains(self) -> "Figure":
+        """Traces of the chains, also of those that did not mix."""
+        from ._plot_posterior import traces
+
+        return traces(self)
+
+    def plot_predictive(self, ax: Any = None) -> Any:
+        """The target among the spectra that the posterior predicts. Returns the axes."""
+        from ._plot_posterior import predictive
+
+        return predictive(self, ax)
+
+    def __str__(self) -> str:
+        count, draws = self.chains.log_density.shape
+        lines = [f"{'posterior' if self.success else 'NO POSTERIOR'}: {self.target.name}, {type(self.task).__name__}, "
+                 f"{type(self.task.noise).__name__}", f"  {self.message}",
+                 f"  {count} chains of {draws} draws, {self.divergences} divergences"]  # fmt: skip
+        if self.success:
+            lines.append(f"  posterior-predictive chi2: p = {self.replicates.p_value:.2g}")
+            if len(self.modes) > 1:
+                told = ", ".join(f"{middle:.2f} Hz ({100 * share:.0f} %)" for _, middle, _, share in self.modes)
+                lines.append(f"  harmonic_frequency has several modes: {told}")
+        return "\n".join(lines)
+
+
+class Summary(eqx.Module):
+    """Table of a posterior: `rows` {name: (mean, sd, median, 2.5 %, 97.5 %)}; prints itself."""
+
+    rows: dict[str, tuple[float, float, float, float, float]]
+    diagnostics: dict[str, tuple[float, float, float]]
+    determined: tuple[str, ...]
+    units: dict[str, str]
+    title: str
+
+    def __getitem__(self, name: str) -> dict[str, float]:
+        keys = ("mean", "sd", "median", "low", "high", "r_hat", "ess_bulk", "ess_tail")
+        return dict(zip(keys, (*self.rows[name], *self.diagnostics[name]), strict=True))
+
+    def __str__(self) -> str:
+        lines = [self.title, f"  {'':<24}{'median':>10}{'2.5 %':>10}{'97.5 %':>10}{'R-hat':>7}{'ESS':>6}  unit"]
+        for name, (_, _, middle, low, high) in self.rows.items():
+            r_hat, bulk, tail = self.diagnostics[name]
+            mark = "" if name in self.determined else "*"
+            unit = "" if self.units[name] == "1" else self.units[name]
+            spread = f"{middle:>10.4g}{low:>10.4g}{high:>10.4g}"
+            lines.append(f"  {name + mark:<24}{spread}{r_hat:>7.3f}{min(bulk, tail):>6.0f}  {unit}")
+        if any(name not in self.determined for name in self.rows):
+            lines.append("  * the data do not determine it: the prior keeps it where it is")
+        return "\n".join(lines)
+
+
+def posterior(
+    result: FitResult,
+    target: Target | None = None,
+    *,
+    key: Array | int = 0,
+    chains: int = 4,
+    draws: int = 1000,
+    warmup: int = 500,
+    free: Iterable[str] | None = None,
+    priors: Mapping[str, float | tuple[float, float | None] | None] | None = None,
+    bounds: Mapping[str, tuple[float, float]] | None = None,
+    progress: bool | Callable[[str, float], None] = False,
+) -> Posterior:
+    """Draw from the posterior of a fit's parameters in linear response, by NUTS from dispersed starts.
+
+        p(θ | data) ∝ L(θ) Π_j exp(-θ_j² / 2)
+
+    L is the likelihood of `log_likelihood`: gamma-distributed, correlated Welch bins, their unknown total sampled along; or
+    Gaussian where the target states a sigma. θ are the free parameters' distances from the prior's centre in prior standard
+    deviations (logarithms for positive ones; the parameter table has them). The harmonic's frequency, which has many modes,
+    is summed over a grid while the chains run, and drawn for every state of theirs afterwards: no mode can be missed by
+    chains that do not cross.
+
+    **Arguments:** `result` of `fit` (prior, bounds and free parameters are the fit's unless given) and its `target`;
+    `key`, a `jax.random` key or a seed number; `chains`, `draws` of each, `warmup` steps before; `free`, names;
+    `priors` {name: sd, or (centre, sd)}; `bounds` {name: (low, high)}; `progress`, True or a function of (text, share).
+
+    **Returns:** a `Posterior`; check `success` or call `summary()`.
+
+    **Raises:** `ValueError` for a target without spread information, a prior outside its bounds or improper, a fit that
+    failed, a task without linear response; `ImportError` without blackjax (extra `posterior`).
+
+    **Source:** Hoffman & Gelman 2014 (NUTS); Vehtari et al. 2021, doi:10.1214/20-BA1221 (R-hat, effective sample size).
+    """
+    for name, count, least in (("chains", chains, 2), ("draws", draws, 100), ("warmup", warmup, 1)):
+        if count < least:
+            raise ValueError(f"{name} = {count} must be at least {least}")
+    tell = teller(progress)
+    with jax.enable_x64(True):
+        setup = taken_up(result, target, free=free, priors=priors, bounds=bounds, key=key)
+        likelihood = Likelihood.of(setup)
+        tell("climbing to the maximum", 0.0)
+        marginal, _, _ = marginal_of(setup, likelihood, theta_of(setup, result.task))
+        found, marginal = sample(marginal, jax.random.fold_in(setup.key, 5), chains, draws, warmup, tell)
+        return _reported(setup, marginal, found, result, key, warmup)
+
+
+def _reported(
+    setup: Setup, marginal: Marginal, found: Chains, result: FitResult, key: Array | int, warmup: int
+) -> Posterior:
+    shape = found.log_density.shape
+    theta = _thetas(setup, marginal, found)
+    flat = theta.reshape(-1, theta.shape[-1])
+    derived, moments = _consequences(marginal.likelihood.problem, flat)
+    values = setup.coordinates.values_of(flat)
+    samples = {name: values[:, i].reshape(shape) for i, name in enumerate(setup.coordinates.names)}
+    known = {name: derived[name].reshape(shape) for name in DERIVED if name not in samples}
+    determined = tuple(name for name in (*samples, *known)
+                       if (name in result.derived and result.derived[name].stderr is not None)
+                       or (name in result.parameters and result.parameters[name].stderr is not None
+                           and result.parameters[name].free))  # fmt: skip
+    diagnostics = {name: diagnosed(x) for name, x in (samples | known).items()}
+    success, message = verdict(found, diagnostics, determined)
+    settings = {
+        "free": list(setup.coordinates.names), "chains": shape[0], "draws": shape[1], "warmup": warmup,
+        "prior_centre": dict(zip(setup.coordinates.names, map(float, setup.coordinates.centre), strict=True)),
+        "prior_sd": {n: float(sd) if p else None for n, sd, p in
+                     zip(setup.coordinates.names, setup.coordinates.sd, setup.prior, strict=True)},
+        "frequencies": len(np.unique(marginal.frequency)), "step_size": found.step_size,
+        "residual": setup.residual, "spectrum": setup.target.settings.to_dict(),
+    }  # fmt: skip
+    modes = modes_of(samples["harmonic_frequency"].ravel()) if "harmonic_frequency" in samples else ()
+    drawn = replicates(marginal.likelihood, setup.target, moments, shape, jax.random.fold_in(setup.key, 7))
+    task = setup.task.replace(**{name: float(np.median(x)) for name, x in samples.items()})
+    return Posterior(success, message, task, setup.target, samples, known, diagnostics, determined, modes, drawn, found,
+                     settings, key if isinstance(key, int) else None, versions())  # fmt: skip
+
+
+def _thetas(setup: Setup, marginal: Marginal, found: Chains) -> Float[np.ndarray, "chains draws free"]:
+    """θ of every draw, the harmonic's frequency drawn from its grid given the rest, anywhere in its cell."""
+    coordinates, names = setup.coordinates, setup.coordinates.names
+    columns = list(marginal.columns)
+    both = found.s.reshape(-1, found.s.shape[-1])
+    s = np.tile(np.asarray(marginal.point), (len(both), 1))
+    s[:, columns] = both[:, : len(columns)]
+    theta = np.asarray(coordinates.theta(s))
+    if marginal.table is not None:
+        white = np.linalg.solve(np.asarray(marginal.scale), (both - np.asarray(marginal.centre)).T).T
+        heights = _heights(marginal, white)
+        keys = jax.random.split(jax.random.fold_in(setup.key, 6))
+        chosen = np.asarray(jax.random.categorical(keys[0], jnp.asarray(heights)))
+        place = np.asarray(jax.random.uniform(keys[1], (len(both),)))
+        edges = edges_of(np.asarray(marginal.frequency))
+        frequency = edges[chosen] + place * (edges[chosen + 1] - edges[chosen])
+        theta[:, names.index("harmonic_frequency")] = coordinates.theta_of("harmonic_frequency", frequency)
+    return theta.reshape(*found.log_density.shape, -1)
+
+
+@eqx.filter_jit
+def _frequencies(marginal: Marginal, white: Array) -> Array:
+    return jax.lax.map(marginal.at_frequencies, white, batch_size=16)
+
+
+def _heights(marginal: Marginal, white: np.ndarray) -> np.ndarray:
+    parts = [_frequencies(marginal, jnp.asarray(part)) for part in _filled(white)]
+    return np.concatenate(parts)[: len(white)]
+
+
+def _filled(rows: np.ndarray) -> list[np.ndarray]:
+    """Parts of `ROWS` rows, the last filled up, so that one program serves them all."""
+    fill = np.broadcast_to(rows[-1], (-len(rows) % ROWS, *rows.shape[1:]))
+    whole = np.concatenate([rows, fill])
+    return np.split(whole, len(whole) // ROWS)
+
+
+def _consequences(problem: Any, theta: np.ndarray) -> tuple[dict[str, np.ndarray], Any]:
+    """Derived quantities and moments at every θ."""
+    parts = []
+    for part in _filled(theta):
+        seen = seen_at(problem, part)
+        parts.append((quantities(problem, seen)[0], seen.moments))
+    return jax.tree.map(lambda *x: np.concatenate(x)[: len(theta)], *parts)

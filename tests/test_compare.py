@@ -1,0 +1,436 @@
+"""Which noise: the right one wins where colours differ, none where they do not, and every number against another way."""
+
+import csv
+import functools
+import itertools
+import json
+import sys
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import matplotlib.pyplot as plt
+import numpy as np
+import pytest
+import scipy.integrate
+import scipy.optimize
+import scipy.stats
+from typer.testing import CliRunner
+
+import jaxmuscle as jm
+from jaxmuscle import _compare
+from jaxmuscle._cli import app
+from jaxmuscle._colours import Folds, Model, effective_parameters, without_harmonic
+from jaxmuscle._comparison import COLUMNS, Evidence, decided
+from jaxmuscle._fit import planned, with_noise
+from jaxmuscle._likelihood import log_density, log_likelihood, measured_bins
+
+FREE = ("c_w", "noise_K_z", "harmonic_amplitude", "harmonic_frequency", "noise_correlation_time")
+COLOURS = ("band-limited", "ornstein-uhlenbeck", "pink")
+SEGMENTS = 45
+GROUPS = 10
+
+
+def true_task(colour, **values):
+    """A muscle whose own corner is far from that of the noise."""
+    return with_noise(jm.Isometric(), colour).replace(noise_K_z=0.005, **values)
+
+
+def target_of(task, seed=None, segments=SEGMENTS, quantity="force"):
+    """The expected spectrum, exact or scattering as Welch powers do."""
+    spectrum = jm.expected_spectrum(task)
+    power = np.asarray(spectrum.power)
+    if seed is not None:
+        nu = spectrum.settings.degrees_of_freedom(segments)
+        power = power * np.random.default_rng(seed).chisquare(nu, power.size) / nu
+    return jm.Target("made", power, segments=segments, quantity=quantity, settings=spectrum.settings)
+
+
+@functools.cache
+def compared(colour, seed, harmonic):
+    task = true_task(colour, harmonic_amplitude=0.02 if harmonic else 0.0, harmonic_frequency=5.3)
+    return jm.compare_noise(jm.Isometric(), target_of(task, seed), noises=COLOURS, free=FREE, groups=GROUPS)
+
+
+# --- what it decides
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("colour", ["ornstein-uhlenbeck", "pink"])
+def test_colours_that_differ_are_told_apart(colour):
+    found = compared(colour, 1, True)
+    assert found.success and found.best.noise == colour
+    for other in COLOURS:
+        # Band-limited noise is flat in the band, the others fall from below a hertz on; pink noise has no corner there.
+        if other != colour:
+            assert found.between(colour, other).winner == colour
+            assert found.between(other, colour).winner == colour
+    assert found.harmonic.winner == "a harmonic"
+    assert found.tasks[colour, True]["harmonic_frequency"] == pytest.approx(5.3, abs=0.1)
+    assert any(f"{colour} rather than band-limited" in sentence for sentence in found.verdict)
+
+
+@pytest.mark.slow
+def test_a_noise_and_its_limit_are_not_told_apart():
+    """Ornstein-Uhlenbeck noise of short correlation time is as flat in the band as band-limited noise."""
+    found = compared("band-limited", 2, True)
+    assert found.between("band-limited", "ornstein-uhlenbeck").winner is None
+    assert found.between("band-limited", "pink").winner == "band-limited"
+    assert found.tasks["ornstein-uhlenbeck", True]["noise_correlation_time"] < 0.02
+
+
+@pytest.mark.slow
+def test_no_harmonic_is_shown_where_there_is_none():
+    assert compared("pink", 3, False).harmonic.winner is None
+
+
+@pytest.mark.slow
+def test_white_and_band_limited_noise_differ_only_above_the_band():
+    task = with_noise(jm.PrescribedForce(), "white")
+    target = target_of(task, seed=4, quantity="displacement")
+    found = jm.compare_noise(jm.PrescribedForce(), target, noises=("white", "band-limited"), free=("c_w", "noise_K_z"))
+    assert found.left_out == {} and found.success
+    decision = found.between("white", "band-limited")
+    assert decision.winner is None and abs(decision.aic_gain) < 1
+    assert any(
+        "white and band-limited cannot be told apart" in s or "band-limited and white cannot" in s for s in found.verdict
+    )
+
+
+# --- its numbers
+
+
+@pytest.mark.slow
+def test_likelihood_and_criterion_against_another_way(x64):
+    """p by the numerical Hessian of the likelihood, which is the Fisher information where the model fits exactly."""
+    target = target_of(true_task("band-limited", harmonic_amplitude=0.0), segments=4000)
+    found = jm.compare_noise(jm.Isometric(), target, noises=("band-limited", "pink"), free=FREE)
+    row = next(r for r in found.rows if (r.noise, r.harmonic) == ("band-limited", False))
+    fitted = found.tasks["band-limited", False]
+    names, h = ("c_w", "noise_K_z"), 1e-3
+
+    def at(*theta):
+        moved = fitted.replace(**{n: float(fitted[n]) * np.exp(t) for n, t in zip(names, theta, strict=True)})
+        return float(log_likelihood(moved, target))
+
+    assert row.log_likelihood == pytest.approx(at(0.0, 0.0), abs=1e-6)
+    hessian = np.array(
+        [
+            [
+                -sum(a * b * at(*(h * (a * np.eye(2)[i] + b * np.eye(2)[j]))) for a in (1, -1) for b in (1, -1)) / (4 * h**2)
+                for j in range(2)
+            ]
+            for i in range(2)
+        ]
+    )
+    direct = np.trace(hessian @ np.linalg.inv(hessian + np.eye(2)))
+    # The information takes the bins' covariance for that of normal logarithms: off by the order 1/ν, here a thousandth.
+    assert row.parameters == pytest.approx(direct, rel=5e-3)
+    assert 1.0 < direct < 2.0
+    assert row.aic == -2 * row.log_likelihood + 2 * row.parameters
+    np.testing.assert_allclose(
+        found.fitted["band-limited", False], jm.expected_spectrum(fitted).proportional[:30], rtol=1e-6
+    )
+
+
+def test_effective_parameters_of_a_ridge_regression():
+    """tr of the hat matrix of `y = X θ + constant` with prior precision Λ, the constant free."""
+    rng = np.random.default_rng(0)
+    X, prior = rng.normal(size=(2, 30, 4)), np.array([1.0, 4.0, 0.0, 0.5])
+    X[:, :, 3] *= 0.01
+    wide = np.concatenate([X, np.ones((2, 30, 1))], axis=2)
+    curvature = np.swapaxes(wide, 1, 2) @ wide + np.diag(np.append(prior, 0.0))
+    moving = np.array([[1.0, 1.0, 1.0, 1.0], [1.0, 0.0, 1.0, 0.0]])
+    expected = []
+    for x, moves in zip(X, moving, strict=True):
+        centred = (x - x.mean(axis=0))[:, moves > 0]
+        hat = centred @ np.linalg.inv(centred.T @ centred + np.diag(prior[moves > 0])) @ centred.T
+        expected.append(np.trace(hat))
+    np.testing.assert_allclose(effective_parameters(curvature, prior, moving), expected, rtol=1e-10)
+    without_offset = curvature.copy()
+    without_offset[:, -1] = without_offset[:, :, -1] = 0.0
+    hat = X[0] @ np.linalg.inv(X[0].T @ X[0] + np.diag(prior)) @ X[0].T
+    np.testing.assert_allclose(effective_parameters(without_offset, prior, np.ones((2, 4)))[0], np.trace(hat), rtol=1e-10)
+
+
+@pytest.mark.slow
+def test_a_bin_that_was_left_out_against_a_fit_by_scipy(x64):
+    """Refitted without its group by Nelder and Mead on the likelihood that was integrated over the offset by quadrature."""
+    found = compared("pink", 3, False)
+    target, (k, names) = found.target, (17, ("c_w", "noise_K_z"))
+    start = found.tasks["pink", False]
+    kept = (np.arange(30) % GROUPS != k % GROUPS).astype(float)
+    moments = jax.jit(lambda task: jm.expected_spectrum(task).power)
+
+    def marginal(bins, power):
+        line = jnp.zeros(30)
+        density = jax.jit(lambda u: log_density(bins, power, line, u))
+        top = scipy.optimize.minimize_scalar(lambda u: -float(density(u)), bracket=(-0.1, 0.1))
+        area = scipy.integrate.quad(lambda u: np.exp(float(density(u)) + top.fun), top.x - 0.6, top.x + 0.6, points=[top.x])[
+            0
+        ]
+        return np.log(area) - top.fun
+
+    prior = with_noise(jm.Isometric(), "pink")
+
+    def task_at(theta):
+        return start.replace(**{n: float(prior[n]) * np.exp(t) for n, t in zip(names, theta, strict=True)})
+
+    bins = jax.tree.map(jnp.asarray, measured_bins(target, kept))
+
+    def cost(theta):
+        return -marginal(bins, moments(task_at(theta))) + 0.5 * np.sum(np.square(theta))
+
+    begin = [np.log(float(start[n]) / float(prior[n])) for n in names]
+    best = scipy.optimize.minimize(cost, begin, method="Nelder-Mead", options={"xatol": 1e-3, "fatol": 1e-4})
+    more = jax.tree.map(jnp.asarray, measured_bins(target, kept + np.eye(30)[k]))
+    power = moments(task_at(best.x))
+    score = next(r for r in found.rows if (r.noise, r.harmonic) == ("pink", False)).scores[k]
+    # Both stop within 1e-3 of the maximum: θ within √0.002 of a standard deviation, and so the score within 0.05.
+    assert score == pytest.approx(marginal(more, power) - marginal(bins, power), abs=0.05)
+
+
+def test_every_bin_is_left_out_once_and_put_back_alone():
+    target = target_of(true_task("pink"))
+    folds = Folds.of([target, target], GROUPS)
+    assert folds.kept.mask.shape == (2, GROUPS, 30) and folds.more.mask.shape == (2, 30, 30)
+    np.testing.assert_array_equal((1 - folds.kept.mask[0]).sum(axis=0), 1)
+    added = folds.more.mask[1] - folds.kept.mask[1][folds.group]
+    np.testing.assert_array_equal(added, np.eye(30))
+
+
+def test_without_harmonic_its_power_is_zero(x64):
+    target = target_of(true_task("band-limited"))
+    setup = planned(true_task("band-limited"), target, free=("c_w", "harmonic_amplitude", "harmonic_frequency")).setup
+    c = without_harmonic(setup).coordinates
+    assert c.values(np.array([0.3, 2.0, -1.0]))["harmonic_amplitude"] == 0.0
+    assert c.values(np.zeros(3))["c_w"] == 60.0
+    fixed = planned(true_task("band-limited"), target, free=("c_w",)).setup
+    assert float(without_harmonic(fixed).task["harmonic_amplitude"]) == 0.0
+    starts = Model.of(setup, harmonic=False).starts
+    assert np.all(starts[:, 1:] == 0) and np.ptp(starts[:, 0]) > 0
+    assert len(Model.of(setup, harmonic=True).starts) >= 32
+
+
+# --- its words
+
+
+SCORES = np.linspace(-1.0, 1.0, 30)
+
+
+def made(*, disagree=False, sigma=False, success=True):
+    """Three noises: pink better than band-limited by 8, than Ornstein-Uhlenbeck by 3."""
+    target = target_of(true_task("pink"))
+    found = {}
+    for i, (noise, harmonic) in enumerate(itertools.product(COLOURS, (True, False))):
+        aic = {"band-limited": 8.0, "ornstein-uhlenbeck": 3.0, "pink": 0.0}[noise] + 1.5 * (not harmonic)
+        lift = (aic if disagree else -aic) / 30
+        found[noise, harmonic] = {
+            "log_likelihood": 100.0 - aic / 2,
+            "parameters": 4.0,
+            "aic": aic - 192.0,
+            "scores": None if sigma else lift + 0.1 * np.roll(SCORES, i),
+            "chi2_per_bin": 0.7,
+            "success": success,
+        }
+    rows = _compare._rows(found)
+    tasks = {(row.noise, row.harmonic): true_task(row.noise) for row in rows}
+    fitted = {model: target.proportional_power for model in tasks}
+    return jm.Comparison(target, rows, {"white": "WhiteNoise on K_z cannot"}, tasks, fitted, 12.8, GROUPS, 0)
+
+
+def test_differences_and_weights():
+    found = made()
+    by = {(row.noise, row.harmonic): row for row in found.rows}
+    assert (
+        found.best.noise == "pink" and found.best.harmonic and found.noises == ("pink", "ornstein-uhlenbeck", "band-limited")
+    )
+    delta = np.array([row.delta_aic for row in found.rows])
+    np.testing.assert_allclose(delta, [8.0, 9.5, 3.0, 4.5, 0.0, 1.5])
+    np.testing.assert_allclose([row.weight for row in found.rows], np.exp(-delta / 2) / np.exp(-delta / 2).sum())
+    difference = by["band-limited", False].scores - by["pink", True].scores
+    assert by["band-limited", False].score_difference == pytest.approx(difference.sum())
+    # The standard error of a sum of 30 is 30 times that of their mean.
+    assert by["band-limited", False].score_stderr == pytest.approx(30 * scipy.stats.sem(difference))
+    assert by["pink", True].score_difference == 0.0 == by["pink", True].score_stderr
+
+
+def test_six_and_the_same_sign_are_needed():
+    up, down = np.full(5, 0.1), np.zeros(5)
+    assert decided(("a", "b"), Evidence(0.0, up), Evidence(6.0, down)).winner == "a"
+    assert decided(("a", "b"), Evidence(6.0, down), Evidence(0.0, up)).winner == "b"
+    assert decided(("a", "b"), Evidence(0.0, up), Evidence(5.99, down)).winner is None
+    assert decided(("a", "b"), Evidence(0.0, down), Evidence(6.0, up)).winner is None
+    assert decided(("a", "b"), Evidence(0.0, up), Evidence(6.0, down), needed=12.8).winner is None
+    assert decided(("a", "b"), Evidence(0.0, None), Evidence(6.0, None)).winner == "a"
+    assert decided(("a", "b"), Evidence(np.nan, up), Evidence(6.0, down)).winner is None
+
+
+def test_verdict_in_words():
+    said = made().verdict
+    assert said[0].startswith(
+        "pink and ornstein-uhlenbeck cannot be told apart: AIC lower by 3.0, held-out score higher by 3.0"
+    )
+    assert said[1].startswith("pink rather than band-limited: AIC lower by 8.0, held-out score higher by 8.0")
+    assert said[2].startswith("a harmonic and no harmonic cannot be told apart") and said[2].endswith(
+        "12.8 in AIC is needed"
+    )
+    assert "the two measures disagree, AIC lower by 8.0, held-out score lower by 8.0" in made(disagree=True).verdict[1]
+    alone = made(sigma=True)
+    assert alone.verdict[-1] == "the target states no segments: nothing was held out, the AIC decides alone"
+    assert alone.between("pink", "band-limited").winner == "pink"
+    with pytest.raises(ValueError, match="noise = 'white': not compared"):
+        alone.between("pink", "white")
+
+
+@pytest.mark.parametrize("sigma", [False, True])
+def test_tables_files_and_figure(sigma, tmp_path):
+    found = made(sigma=sigma)
+    assert all(len(line) <= 80 for line in str(found).splitlines()) and "left out: white: WhiteNoise on K_z" in str(found)
+    rows, data = found.table(), found.to_xarray()
+    assert list(rows[0]) == list(COLUMNS) and dict(data.sizes) == {"noise": 3, "harmonic": 2, "frequency": 30}
+    for row in rows:
+        here = data.sel(noise=row["noise"], harmonic=row["harmonic"])
+        assert float(here["aic"]) == row["aic"]
+        assert np.isnan(here["score"]) if sigma else float(here["score"]) == row["score"]
+    found.save(tmp_path / "compare.json")
+    table = json.loads((tmp_path / "compare.json").read_text())
+    assert [row["aic"] for row in table["rows"]] == [row["aic"] for row in rows]
+    assert table["verdict"] == list(found.verdict) and len(table["models"][0]["fitted"]) == 30
+    assert [p.name for p in tmp_path.iterdir()] == ["compare.json"]
+    figure = found.plot()
+    try:
+        said = " ".join(text.get_text() for part in [figure, *figure.subfigs] for text in part.texts)
+        assert "pink and ornstein-uhlenbeck cannot" in said and "left out: white" in said
+        shown = [label.get_text() for label in figure.axes[1].get_yticklabels()]
+        assert shown == [
+            n for n in ("pink", "pink", "ornstein-uhlenbeck", "ornstein-uhlenbeck", "band-limited", "band-limited")
+        ]
+        dots = [line.get_xdata()[0] for line in figure.axes[1].lines if len(line.get_xdata()) == 1]
+        np.testing.assert_allclose(dots, [0.0, 1.5, 3.0, 4.5, 8.0, 9.5])
+    finally:
+        plt.close(figure)
+
+
+# --- what it refuses
+
+
+def test_what_a_task_cannot_carry_is_left_out_with_its_own_reason():
+    carried, left_out = _compare._carried(jm.Isometric(), ("white", *COLOURS), {})
+    assert tuple(carried) == COLOURS
+    with pytest.raises(ValueError) as own:
+        with_noise(jm.Isometric(), "white")
+    assert left_out == {"white": str(own.value)} and "where white noise has no value" in left_out["white"]
+    carried, left_out = _compare._carried(jm.Isometric(), ("white", *COLOURS), {"noise_K_z": 0.0, "noise_C_z": 0.0})
+    assert tuple(carried) == ("white", *COLOURS) and left_out == {}
+    mine = jm.Isometric(noise=jm.BandLimitedNoise(cutoff=20.0))
+    assert float(_compare._carried(mine, COLOURS, {})[0]["band-limited"]["noise_cutoff"]) == 20.0
+
+
+FORCE = "fdi-abduction-45mvc"
+BAD = {
+    "one": (jm.Isometric, {"noises": ("pink",)}, "noises: at least two are needed for a comparison, 1 can be used"),
+    "left out": (jm.Isometric, {"noises": ("white", "pink")}, r"1 can be used; white: WhiteNoise on K_z cannot be used"),
+    "rough": (jm.PrescribedMotion, {}, "pink: PinkNoise on K_z cannot be used in PrescribedMotion"),
+    "unknown": (jm.Isometric, {"noises": ("brown", "pink")}, "noises: 'brown'"),
+    "free": (jm.Isometric, {"free": ("c_w", "k_x")}, "free: unknown parameter 'k_x'"),
+    "fix": (jm.Isometric, {"fix": {"k_x": 1.0}}, "fix: unknown parameter 'k_x'"),
+    "priors": (jm.Isometric, {"priors": {"k_x": 1.0}}, "priors: unknown parameter 'k_x'"),
+    "groups": (jm.Isometric, {"groups": 31}, "groups = 31: give a number from 2 to that of the target's bins, 30"),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_arguments(case):
+    task, options, message = BAD[case]
+    with pytest.raises(ValueError, match=message):
+        jm.compare_noise(task(), jm.load_target(FORCE), **options)
+
+
+def test_a_target_has_to_say_how_much_it_scatters():
+    target = jm.Target("mine", 1 / np.arange(1, 31))
+    with pytest.raises(ValueError, match="mine: states neither segments nor sigma"):
+        jm.compare_noise(jm.Isometric(), target)
+
+
+@pytest.mark.slow
+def test_with_a_sigma_alone_nothing_is_held_out():
+    exact = target_of(true_task("ornstein-uhlenbeck", harmonic_amplitude=0.0))
+    target = jm.Target("mine", exact.proportional_power, sigma=0.1 * exact.proportional_power)
+    found = jm.compare_noise(jm.Isometric(), target, noises=("ornstein-uhlenbeck", "pink"), free=FREE)
+    assert all(row.score is None for row in found.rows) and found.verdict[-1].endswith("the AIC decides alone")
+    assert found.between("ornstein-uhlenbeck", "pink").winner == "ornstein-uhlenbeck"
+    plt.close(found.plot())
+
+
+# --- the command
+
+
+def command(*arguments):
+    result = CliRunner().invoke(app, ["compare", *map(str, arguments)], env={"COLUMNS": "200"})
+    assert result.exception is None or isinstance(result.exception, SystemExit), repr(result.exception)
+    return result
+
+
+@pytest.fixture
+def keep_cache():
+    before = jax.config.jax_compilation_cache_dir
+    yield
+    jax.config.update("jax_compilation_cache_dir", before)
+
+
+@pytest.mark.parametrize("success", [True, False])
+def test_the_command_writes_its_files(success, tmp_path, monkeypatch, keep_cache):
+    asked = {}
+
+    def compare_noise(task, target, **options):
+        asked.update(options, task=task, target=target)
+        return made(success=success)
+
+    monkeypatch.setattr(_compare, "compare_noise", compare_noise)
+    result = command(FORCE, "--free", "c_w, noise_K_z", "--fix", "k_w=4e5", "--seed", 3, "--segments", 9, "--out", tmp_path)
+    assert result.exit_code == (0 if success else 1)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["compare.csv", "compare.json", "compare.png"]
+    rows = list(csv.DictReader((tmp_path / "compare.csv").read_text().splitlines()))
+    assert list(rows[0]) == list(COLUMNS) and [float(row["aic"]) for row in rows] == [row["aic"] for row in made().table()]
+    assert "pink and ornstein-uhlenbeck cannot be told apart" in result.stdout and "left out: white" in result.stdout
+    assert isinstance(asked["task"], jm.Isometric) and asked["target"].segments == (9,)
+    assert (asked["free"], asked["fix"], asked["key"]) == (["c_w", "noise_K_z"], {"k_w": 4e5}, 3)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["nobody"], "nobody"),
+        ([FORCE, "--fix", "k_w"], "--fix 'k_w': write NAME=VALUE"),
+        ([FORCE, "--free", "k_x"], "free: unknown parameter 'k_x'"),
+        ([FORCE, "--task", "prescribed-motion"], "noises: at least two are needed"),
+    ],
+)
+def test_a_users_mistake_is_one_line(arguments, message, tmp_path, keep_cache):
+    result = command(*arguments, "--out", tmp_path / "out")
+    assert result.exit_code == 2 and message in result.stderr and "Traceback" not in result.output
+
+
+# --- how often it is wrong
+
+
+@pytest.mark.slow
+def test_a_few_recordings_of_the_calibration():
+    """Of 3 recordings of 60 s of each colour, the muscle known, no more wrong verdicts than 5 % make likely."""
+    sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
+    try:
+        import colours
+    finally:
+        sys.path.pop(0)
+    found = {}
+    with jax.enable_x64(True):
+        for colour in COLOURS:
+            batch = [colours.recorded(colour, number, 60.0, harmonic=True) for number in range(3)]
+            each = {c: colours.examined(batch, c, muscle_free=False) for c in COLOURS}
+            found |= {f"{colour}|{i}|True|muscle fixed": {c: each[c][i] for c in COLOURS} for i in range(3)}
+    rows = [row for row in colours.verdicts({"found": found}) if sum(row[k] for k in ("right", "wrong", "open"))]
+    assert sum(row["right"] + row["wrong"] + row["open"] for row in rows) == 18
+    assert sum(row["wrong"] for row in rows) <= scipy.stats.binom.ppf(0.999, 18, 0.05)
+    # What is not open: pink against the two others, and Ornstein-Uhlenbeck noise against both.
+    assert sum(row["right"] for row in rows) >= 9

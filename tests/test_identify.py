@@ -1,0 +1,480 @@
+"""Identifiability reports: Fisher information against differences, draws and fits; designs keep what they promise."""
+
+import dataclasses
+import functools
+import itertools
+import json
+from typing import Any
+
+import equinox as eqx
+import jax
+import matplotlib.pyplot as plt
+import numpy as np
+import pytest
+import scipy.linalg
+import scipy.stats
+from scipy.special import gammaincinv, ndtr
+from test_result import made_result
+
+import jaxmuscle as jm
+from jaxmuscle._again import taken_up, theta_of
+from jaxmuscle._climb import climb, quantities
+from jaxmuscle._descend import descend, seen_at
+from jaxmuscle._expected import expected_moments
+from jaxmuscle._identify_designs import design_information, information_of, seen_here, without_offset
+from jaxmuscle._joint import planned_jointly
+from jaxmuscle._likelihood import Likelihood, welch_law
+from jaxmuscle._operating import equilibrium
+from jaxmuscle._parameter import DEFAULT_FREE, PARAMETERS, as_arrays
+from jaxmuscle._trajectory import WINDOW
+from jaxmuscle._uncertainty import bin_statistics
+
+TRUTH = jm.Isometric().replace(harmonic_amplitude=0.012, harmonic_frequency=5.0)
+LOADED = TRUTH.as_task(jm.PrescribedForce, P_w=0.0)
+SEGMENTS = 24
+AMPLITUDES = ("noise_K_w", "noise_K_z", "harmonic_amplitude")
+# Central differences with this step of a logarithm: truncation and rounding leave five digits of a slope.
+STEP, DIGITS = 2e-5, 1e-5
+DOUBTFUL = 1e-3  # chance of a test to fail by scatter alone, over all it compares
+
+
+def fitted(task=TRUTH, free=DEFAULT_FREE, settings: dict[str, Any] | None = None, **target: Any) -> jm.FitResult:
+    """What a fit would give that found `task`, its target being the expected spectrum; nothing is fitted."""
+    power = np.asarray(jm.expected_spectrum(task).proportional)
+    quantity = "displacement" if task.output_unit == "m" else "force"
+    made = jm.Target("made", power, quantity=quantity, **({"segments": SEGMENTS} | target))
+    table = {
+        "free": list(free), "residual": "log", "mean_force": None, "bounds": {}, "starts": 1,
+        "prior_centre": {n: float(task[n]) for n in free}, "prior_sd": {n: PARAMETERS[n].prior_sd for n in free},
+        "coefficient_of_variation": made.coefficient_of_variation is not None,
+    }  # fmt: skip
+    return made_result(task=task, target=made, fitted=power, settings=table | (settings or {}), notices=())
+
+
+def moments_of(task):
+    with jax.enable_x64(True):
+        found = expected_moments(as_arrays(task), task.settings, WINDOW)[0]
+        return type(found)(*(np.asarray(x) for x in found))
+
+
+def slopes(task, read, free=DEFAULT_FREE, step=STEP):
+    """d read / d ln parameter by central differences."""
+    columns = []
+    for name in free:
+        up, down = (task.replace(**{name: float(task[name]) * np.exp(side * step)}) for side in (1, -1))
+        columns.append((read(moments_of(up)) - read(moments_of(down))) / (2 * step))
+    return np.stack(columns, axis=-1)
+
+
+def proportional_information(task, segments, free=DEFAULT_FREE):
+    """Fisher information of proportional powers by contrasts of their logarithms, which know nothing of the total."""
+    moments = moments_of(task)
+    law = welch_law(task.settings, np.arange(1, 31), segments)
+    keep = 1 - (moments.line / moments.power) ** 2
+    sd = np.sqrt(2 / law.degrees * keep)
+    covariance = law.correlation * np.outer(sd, sd)
+    contrasts = scipy.linalg.helmert(30)
+    rows = contrasts @ slopes(task, lambda m: np.log(m.power), free)
+    return rows.T @ np.linalg.solve(contrasts @ covariance @ contrasts.T, rows)
+
+
+def setup_at(result, target=None):
+    """Setup with the fitted task, and θ. Needs float64."""
+    setup = taken_up(result, target)
+    return dataclasses.replace(setup, task=result.task), theta_of(setup, result.task)
+
+
+def same_information(found, expected):
+    """Equal to the digits of a difference, relative to the roots of the diagonal."""
+    size = np.sqrt(np.diag(expected))
+    np.testing.assert_allclose(found / np.outer(size, size), expected / np.outer(size, size), atol=DIGITS)
+
+
+# --- the information of the data
+
+
+def test_the_information_is_that_of_log_contrasts(x64):
+    setup, theta = setup_at(fitted())
+    same_information(information_of(setup, seen_here(setup, theta)), proportional_information(TRUTH, (SEGMENTS,)))
+
+
+def test_a_coefficient_of_variation_adds_its_gradient(x64):
+    result = fitted(coefficient_of_variation=0.015)
+    setup, theta = setup_at(result)
+    row = slopes(TRUTH, lambda m: 0.5 * np.log(m.variance) - np.log(m.mean), step=0.2 * STEP) / setup.extra[0][1]
+    expected = proportional_information(TRUTH, (SEGMENTS,)) + np.outer(row, row)
+    same_information(information_of(setup, seen_here(setup, theta)), expected)
+
+
+def test_eliminating_the_offset_is_inverting_with_it():
+    root = np.random.default_rng(0).standard_normal((5, 9))
+    whole = root @ root.T
+    np.testing.assert_allclose(np.linalg.inv(without_offset(whole)), np.linalg.inv(whole)[:-1, :-1])
+    whole[-1], whole[:, -1] = 0, 0
+    np.testing.assert_array_equal(without_offset(whole), whole[:-1, :-1])
+
+
+def drawn(task, segments, count, seed):
+    """Proportional powers drawn from the bins' law about the expected spectrum of a task. Needs float64."""
+    moments, law = moments_of(task), welch_law(task.settings, np.arange(1, 31), segments)
+    a = law.degrees / 2 / (1 - (moments.line / moments.power) ** 2)
+    normal = np.random.default_rng(seed).multivariate_normal(np.zeros(30), law.correlation, size=count)
+    power = moments.power * gammaincinv(a, ndtr(normal)) / a
+    return power / power.sum(axis=1, keepdims=True)
+
+
+def highest_posteriors(result, count):
+    """Derived quantities at the posterior's maxima for spectra drawn at the fit, and those of the fit with their slopes."""
+    setup, theta = setup_at(result)
+    likelihood = Likelihood.of(setup)
+    powers = drawn(result.task, result.target.segments, count, 3)
+    bins = jax.tree.map(lambda x: np.broadcast_to(x, (count, *np.shape(x))), likelihood.bins)
+    bins = bins._replace(log_power=np.log(powers))
+    peak = climb(likelihood, np.tile(theta, (count, 1)), setup.prior, bins=bins)
+    assert peak.settled.mean() > 0.97
+    problem = dataclasses.replace(setup, extra=(None, None)).linear()
+    read = functools.partial(jax.tree.map, np.asarray)
+    values, _ = read(quantities(problem, seen_at(problem, peak.theta)))
+    truth, gradients = read(quantities(problem, seen_at(problem, theta[None])))
+    return peak, values, {n: float(v[0]) for n, v in truth.items()}, {n: g[0] for n, g in gradients.items()}
+
+
+@pytest.mark.slow
+def test_where_all_is_determined_maxima_scatter_by_the_inverse_information(x64):
+    """Four parameters that a spectrum determines; the whole covariance, by its Wishart law."""
+    free = ("c_w", "noise_K_z", "harmonic_amplitude", "harmonic_frequency")
+    result = fitted(free=free, segments=6 * SEGMENTS)
+    report = jm.identifiability(result, designs=())
+    assert report.present.determined == 4 and not report.present.undetermined
+    count = 400
+    peak, *_ = highest_posteriors(result, count)
+    information = proportional_information(TRUTH, (6 * SEGMENTS,), free)
+    gain = np.linalg.inv(information + np.eye(4))
+    predicted = gain @ information @ gain  # about one truth, the prior's centre, which pulls but does not scatter
+    off = peak.theta - peak.theta.mean(axis=0)
+    scatter = np.linalg.solve(np.linalg.cholesky(predicted), off.T)
+    eigenvalues = np.linalg.eigvalsh(scatter @ scatter.T / (count - 1))
+    # Outermost eigenvalues of a white Wishart matrix by simulation.
+    rng = np.random.default_rng(1)
+    white = np.array([np.linalg.eigvalsh(np.cov(rng.standard_normal((4, count))))[[0, -1]] for _ in range(20_000)])
+    low, high = np.quantile(white[:, 0], DOUBTFUL / 2), np.quantile(white[:, 1], 1 - DOUBTFUL / 2)
+    assert low < eigenvalues[0] and eigenvalues[-1] < high
+    for i, name in enumerate(free):
+        known = report.present.quantities[name]
+        np.testing.assert_allclose(known.left, np.sqrt(gain[i, i]), rtol=DIGITS)
+
+
+@pytest.mark.slow
+def test_determined_quantities_scatter_as_the_report_says(x64):
+    """All eight parameters: four directions are open, and the maxima go far along them."""
+    result, count = fitted(), 300
+    present = jm.identifiability(result, designs=()).present
+    _, values, truth, gradients = highest_posteriors(result, count)
+    information = proportional_information(TRUTH, (SEGMENTS,))
+    gain = np.linalg.inv(information + np.eye(8))
+    determined = [n for n, k in present.quantities.items() if k.determined and n in values]
+    assert {"corner_frequency", "harmonic_share", "harmonic_frequency", "high_frequency_floor"} <= set(determined)
+    for name in determined:
+        g, found = gradients[name], values[name]
+        known = present.quantities[name]
+        np.testing.assert_allclose(known.stderr, np.sqrt(g @ gain @ g), rtol=1e-3)
+        expected = g @ gain @ information @ gain @ g
+        assert expected <= known.stderr**2 * (1 + 1e-9)
+        centred = found - found.mean()
+        scatter = np.sqrt((np.mean(centred**4) / np.mean(centred**2) ** 2 - 1) / count)  # of the variance, relative
+        bound = scipy.stats.norm.ppf(1 - DOUBTFUL / 2 / len(determined)) * scatter
+        # The corner frequency is curved along what is open: its errors are a fifth larger than to first order.
+        curved = 0.45 if name == "corner_frequency" else 0.0
+        assert -bound < np.mean(centred**2) / expected - 1 < bound + curved, name
+        assert abs(found.mean() - truth[name]) < 0.5 * known.stderr
+
+
+# --- what designs add
+
+
+def test_a_longer_recording_multiplies_the_information():
+    report = jm.identifiability(fitted(), designs=[jm.Design("more", segments=9 * SEGMENTS)])
+    degrees = [jm.SpectrumSettings().degrees_of_freedom(k) for k in (SEGMENTS, 9 * SEGMENTS)]
+    shown = report.present.singular_values > 1e-2  # below, rounding
+    ratio = report.designs[0].singular_values[shown] / report.present.singular_values[shown]
+    # The law of bins knows of leakage into the lowest ones, the equivalent degrees of freedom do not.
+    np.testing.assert_allclose(ratio, np.sqrt(sum(degrees) / degrees[0]), rtol=2e-3)
+
+
+@pytest.mark.parametrize("what", ["variation", "mean"])
+def test_a_single_number_adds_one_row(x64, what):
+    setup, theta = setup_at(fitted())
+    given = {"coefficient_of_variation": True} if what == "variation" else {"mean": 0.03}
+    found = design_information(setup, theta, jm.Design("one number", segments=0, **given))
+    power = moments_of(TRUTH).power
+    p = power / power.sum()
+    if what == "variation":
+        # The variance in the window ripples with the frequency.
+        row = slopes(TRUTH, lambda m: 0.5 * np.log(m.variance) - np.log(m.mean), step=0.2 * STEP)
+        sd = 0.5 * np.sqrt(p @ bin_statistics(setup.target).covariance @ p)
+    else:
+        row, sd = slopes(TRUTH, lambda m: np.log(m.mean)), 0.03
+    expected = np.outer(row, row) / sd**2
+    np.testing.assert_allclose(found, expected, atol=DIGITS * np.abs(expected).max())
+    assert np.linalg.matrix_rank(found, tol=1e-6 * np.abs(found).max()) == 1
+
+
+def test_a_known_mean_is_known_as_well_as_it_was_measured():
+    report = jm.identifiability(fitted(), designs=[jm.Design("the mean", segments=0, mean=0.02)])
+    mean = report.designs[0].quantities["mean"]
+    # The prior adds next to nothing: its own error is 79 %.
+    assert mean.stderr / mean.value == pytest.approx(0.02, rel=1e-3) and "mean" in report.designs[0].gained
+
+
+def test_a_design_at_other_values_knows_the_factors(x64):
+    """Information about θ at the design's own values, as if its task had been fitted."""
+    stronger = jm.at_level(TRUTH, 0.5)
+    assert float(stronger["k_w"]) > 1.5 * float(TRUTH["k_w"])
+    setup, theta = setup_at(fitted())
+    found = design_information(setup, theta, jm.Design("half of the maximum", stronger, 12))
+    same_information(found, proportional_information(stronger, (12,)))
+
+
+def test_separate_parameters_are_eliminated_with_their_prior(x64):
+    setup, theta = setup_at(fitted())
+    task = TRUTH.replace(P_w=10.0)
+    present = information_of(setup, seen_here(setup, theta))
+    tied = design_information(setup, theta, jm.Design("tied", task))
+    loose = design_information(setup, theta, jm.Design("loose", task, separate=AMPLITUDES))
+    own = [DEFAULT_FREE.index(n) for n in AMPLITUDES]
+    where = np.arange(8)
+    where[own] = 8 + np.arange(3)
+    whole = np.eye(11)  # the prior of all
+    whole[:8, :8] += present
+    whole[np.ix_(where, where)] += tied
+    expected = np.linalg.inv(whole)[:8, :8]
+    np.testing.assert_allclose(np.linalg.inv(present + loose + np.eye(8)), expected, rtol=1e-6, atol=1e-9)
+
+
+def test_the_load_keeps_the_operating_point(x64):
+    result = fitted()
+    design = next(d for d in jm.standard_designs(result) if "displacement" in d.name)
+    assert isinstance(design.task, jm.PrescribedForce)
+    held, moving = np.asarray(equilibrium(TRUTH)), np.asarray(equilibrium(design.task))
+    np.testing.assert_allclose(moving, [held[0], 0, 0, 0], atol=1e-9)
+    for name in DEFAULT_FREE:
+        assert float(design.task[name]) == float(TRUTH[name])
+
+
+@pytest.mark.parametrize(
+    ("result", "names"),
+    [
+        (lambda: fitted(), ["the coefficient of variation", "the mean force, known to 2 %",
+                            "the displacement under a load of 2.18 N", "a second force level at P_w = 10 N",
+                            "a second force level at P_w = 2.5 N", "a recording 10 times as long"]),
+        (lambda: fitted(coefficient_of_variation=0.016, settings={"mean_force": [2.18, 0.05]}),
+         ["the displacement under a load of 2.18 N", "a second force level at P_w = 10 N",
+          "a second force level at P_w = 2.5 N", "a recording 10 times as long"]),
+        (lambda: fitted(jm.PrescribedForce(F_ext=1.0)),
+         ["the coefficient of variation", "the mean displacement, known to 2 %", "the force with the insertion held",
+          "a second force level at P_w = 10 N", "a second force level at P_w = 2.5 N", "a recording 10 times as long"]),
+        pytest.param(lambda: fitted(jm.PrescribedMotion(F_ext=8.0)),
+         ["the coefficient of variation", "the mean force, known to 2 %", "a second force level at F_ext = 16 N",
+          "a second force level at F_ext = 4 N", "a recording 10 times as long"], marks=pytest.mark.slow),
+    ],
+    ids=["isometric", "all numbers known", "force", "motion"],
+)  # fmt: skip
+def test_the_usual_designs(result, names):
+    designs = jm.standard_designs(result())
+    assert [design.name for design in designs] == names
+    for design in designs:
+        assert (design.separate == AMPLITUDES) is design.name.startswith("a second force level")
+
+
+# --- the report
+
+
+@functools.cache
+def report() -> jm.IdentifiabilityReport:
+    return jm.identifiability(fitted(coefficient_of_variation=0.016))
+
+
+def test_the_report_agrees_with_itself():
+    found = report()
+    assert found.present.determined == np.sum(found.present.singular_values >= 3) == 5
+    assert len(found.pairs) == len(found.designs) * (len(found.designs) - 1) // 2
+    for outlook in (found.present, *found.designs, *found.pairs):
+        assert outlook.determined + len(outlook.undetermined) == 8
+        for name, known in outlook.quantities.items():
+            assert known.determined is (known.left**2 <= 0.1), name
+            assert known.left <= found.present.quantities[name].left * (1 + 1e-9)
+        assert set(outlook.gained) == {n for n, k in outlook.quantities.items()
+                                       if k.determined and not found.present.quantities[n].determined}  # fmt: skip
+    for pair in found.pairs:
+        parts = [d for d in found.designs if d.name in pair.name.split(" together with ")]
+        assert len(parts) == 2
+        for name, known in pair.quantities.items():
+            assert known.left <= min(part.quantities[name].left for part in parts) * (1 + 1e-9)
+    gains = [len(pair.gained) for pair in found.pairs]
+    assert gains == sorted(gains, reverse=True)
+
+
+def test_what_is_proportional_is_known_alike():
+    for outlook in (report().present, *report().designs):
+        for one, other in (("k_w", "K_w0"), ("c_z", "C_z0")):
+            a, b = outlook.quantities[one], outlook.quantities[other]
+            np.testing.assert_allclose(a.stderr / a.value, b.stderr / b.value, rtol=1e-6)
+
+
+def test_the_report_in_words():
+    text = str(report())
+    lines = text.splitlines()
+    assert max(map(len, lines)) <= 80
+    assert lines[0] == "what the data of made determine"
+    displacement = report().designs[1]
+    percent = displacement.quantities["K_w0"].percent
+    said = " ".join(text.split())
+    assert "the displacement under a load of 2.18 N would determine" in said and f"K_w0 to {percent}" in said
+    assert "noise_K_w, noise_K_z, harmonic_amplitude of its own" in said
+    assert "k_w to" not in said  # K_w0 says it
+    assert "stays open" in said[-400:]
+    for sentence in report().present.undetermined:
+        assert sentence in said
+
+
+def test_the_numbers_in_the_table_are_those_of_the_report():
+    line = next(line for line in str(report()).splitlines() if line.split()[:1] == ["K_w0"])
+    known = [o.quantities["K_w0"] for o in (report().present, *report().designs)]
+    cells = line.split()[3:]
+    assert [cell.startswith("(") for cell in cells] == [not k.determined for k in known]
+    for cell, k in zip(cells, known, strict=True):
+        assert float(cell.strip("()")) == pytest.approx(100 * k.stderr / k.value, rel=0.06)  # two digits
+
+
+def test_the_report_as_json(tmp_path):
+    path = tmp_path / "folder" / "report.json"
+    report().save(path)
+    table = json.loads(path.read_text())
+    assert table == json.loads(json.dumps(report().to_dict()))
+    assert [p.name for p in path.parent.iterdir()] == ["report.json"]
+    assert table["present"]["determined"] == 5 and table["threshold"] == 3.0
+    known = table["designs"][1]["quantities"]["K_z0"]
+    assert known["left"] == pytest.approx(known["stderr"] / known["prior_sd"])
+    assert table["designs"][0]["data"] == "mean to 2 %"
+
+
+def test_the_figure():
+    figure = report().plot()
+    try:
+        upper, lower = figure.axes[:2]
+        names = [label.get_text() for label in lower.get_yticklabels()]
+        assert "K_w0" in names and "k_w" not in names
+        texts = [text.get_text() for text in lower.texts]
+        columns = len(texts) // len(names)
+        assert texts[names.index("K_z0") * columns + 2] == report().designs[1].quantities["K_z0"].percent
+        assert [label.get_text() for label in lower.get_xticklabels()][:3] == ["now", "A", "B"]
+        assert upper.get_xscale() == "log"
+    finally:
+        plt.close(figure)
+
+
+def test_a_design_without_equilibrium_is_impossible_and_the_rest_goes_on():
+    undamped = TRUTH.replace(c_w=0.0, c_z=0.0)
+    found = jm.identifiability(
+        fitted(), designs=[jm.Design("undamped", undamped), jm.Design("the mean", segments=0, mean=0.02)]
+    )
+    assert found.designs[0].failed is not None and "undamped" in found.designs[0].failed
+    assert found.designs[0].quantities["k_w"].stderr == found.present.quantities["k_w"].stderr
+    assert not found.pairs and "undamped is impossible" in " ".join(str(found).split())
+    figure = found.plot()
+    plt.close(figure)
+
+
+def test_a_target_with_a_sigma_only():
+    power = np.asarray(jm.expected_spectrum(TRUTH).proportional)
+    nu = jm.SpectrumSettings().degrees_of_freedom(SEGMENTS)
+    found = jm.identifiability(fitted(segments=None, sigma=power * np.sqrt(2 / nu)))
+    # Without correlation of the bins they tell more.
+    assert found.present.determined >= 4
+    assert f"{SEGMENTS * 9} segments" in found.designs[-1].data and "30 bins with a stated sigma" in found.present.data
+
+
+def test_another_target_can_be_given():
+    result = fitted()
+    longer = eqx.tree_at(lambda r: r.target, result, jm.Target("longer", result.fitted, segments=4 * SEGMENTS)).target
+    a, b = (jm.identifiability(result, target, designs=()).present for target in (None, longer))
+    assert b.quantities["harmonic_share"].stderr == pytest.approx(0.5 * a.quantities["harmonic_share"].stderr, rel=0.03)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: jm.Design("nothing", segments=0), "nothing: measures nothing: give segments"),
+        (lambda: jm.Design("few", segments=-1), "few: segments = -1 must not be negative"),
+        (lambda: jm.Design("exact", mean=0.0), "exact: mean = 0.0 must be a positive relative standard error"),
+        (lambda: jm.identifiability(fitted(), designs=[jm.Design("a"), jm.Design("a")]), "two are called 'a'"),
+        (lambda: jm.identifiability(fitted(), designs=[jm.Design("a", separate=("m_w",))]),
+         "a: separate: 'm_w' is not free in the fit; free are k_w, "),
+        (lambda: jm.identifiability(fitted(), designs=[jm.Design("x", LOADED, mean=0.1)]), "x: the mean of its output is"),
+        (lambda: jm.identifiability(fitted(segments=None)), "states neither segments nor sigma"),
+        (lambda: jm.identifiability(made_result(fitted=np.full(30, np.nan))), "the fit of made failed"),
+    ],
+)  # fmt: skip
+def test_bad_arguments(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()
+
+
+# --- promises
+
+
+@pytest.mark.slow
+def test_a_design_keeps_its_promise(x64):
+    """Force and displacement drawn and fitted together 200 times: the spread is the report's prediction."""
+    result, count = fitted(), 200
+    promised = next(d for d in jm.identifiability(result).designs if "displacement" in d.name)
+    assert {"K_w0", "K_z0", "C_w0", "C_z0"} <= set(promised.gained)
+    held = next(d.task for d in jm.standard_designs(result) if "displacement" in d.name)
+    tasks = {"force": TRUTH, "displacement": held}
+    targets = {name: jm.Target(name, np.asarray(jm.expected_spectrum(task).proportional), segments=SEGMENTS,
+                               quantity=name) for name, task in tasks.items()}  # fmt: skip
+    setup = planned_jointly(targets, tasks=tasks).setup
+    theta = np.zeros(len(setup.coordinates.names))
+    seen = seen_at(setup.linear(), theta[None])
+    problem = setup.linear([np.asarray(m.line / m.power)[0] for m in seen.moments])
+    drawings = [drawn(task, (SEGMENTS,), count, seed) for seed, task in enumerate(tasks.values())]
+    data = tuple(
+        eqx.tree_at(lambda d: d.target, jax.tree.map(lambda x: np.broadcast_to(x, (count, *np.shape(x))), one), powers)
+        for one, powers in zip(problem.data, drawings, strict=True)
+    )
+    found = descend(problem, np.tile(setup.coordinates.from_theta(theta), (count, 1)), 40, data=data)
+    assert found.settled.mean() > 0.97
+    reached = np.asarray(problem.theta(found.s))
+    kept = [n for n in setup.coordinates.names if promised.quantities[n].determined]
+    assert {"k_w", "k_z", "c_w", "c_z"} <= set(kept)
+    chance = DOUBTFUL / 2 / len(kept)
+    low, high = np.sqrt(scipy.stats.chi2.ppf([chance, 1 - chance], count - 1) / (count - 1))
+    for name in kept:
+        spread = reached[:, setup.coordinates.names.index(name)].std(ddof=1)
+        # Least squares of log powers scatters more than the information allows: ν/2 ψ'(ν/2) = 1.03 in variance, and 1.13
+        # for not weighing the correlation; the prior takes a tenth of the variance at most.
+        assert 0.95 * low < spread / promised.quantities[name].left < 1.1 * high, name
+
+
+@pytest.mark.slow
+def test_a_joint_fit_reports_the_promised_errors():
+    result = fitted()
+    promised = next(d for d in jm.identifiability(result).designs if "displacement" in d.name)
+    held = next(d.task for d in jm.standard_designs(result) if "displacement" in d.name)
+    power = np.asarray(jm.expected_spectrum(held).proportional)
+    targets = {"force": result.target, "displacement": jm.Target("x", power, segments=SEGMENTS, quantity="displacement")}
+    joint = jm.fit_joint(targets, tasks={"force": TRUTH, "displacement": held}, starts=4, seeds=0)
+    for name in ("K_w0", "K_z0", "C_w0", "C_z0"):
+        assert joint.derived[name].stderr == pytest.approx(promised.quantities[name].stderr, rel=0.1)
+
+
+def test_pairs_add_up(x64):
+    """A pair's information is the sum of its parts'."""
+    setup, theta = setup_at(fitted())
+    designs = [jm.Design("the mean", segments=0, mean=0.02), jm.Design("longer", segments=100)]
+    found = jm.identifiability(fitted(), designs=designs).pairs
+    present = information_of(setup, seen_here(setup, theta))
+    both = present + sum(design_information(setup, theta, d) for d in designs)
+    np.testing.assert_allclose(found[0].singular_values**2, np.maximum(np.linalg.eigvalsh(both)[::-1], 0),
+                               atol=1e-9 * np.abs(both).max())  # fmt: skip
+    assert len(found) == len(list(itertools.combinations(designs, 2)))

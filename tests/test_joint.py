@@ -1,0 +1,419 @@
+"""Joint fits: what is shared, what two measurements of one truth determine together, and that they are single fits else."""
+
+import functools
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import matplotlib.pyplot as plt
+import numpy as np
+import pytest
+from test_fit import true_derived
+from test_result import assert_equal
+
+import jaxmuscle as jm
+from jaxmuscle._derived import derived
+from jaxmuscle._descend import seen_at
+from jaxmuscle._joint import planned_jointly
+from jaxmuscle._joint_problem import joint_names
+from jaxmuscle._joint_search import joint_starts
+from jaxmuscle._objective import at
+from jaxmuscle._parameter import DEFAULT_FREE, as_arrays
+from jaxmuscle._result import ResultError
+from jaxmuscle._uncertainty import identifiability, undetermined_directions
+
+TRUTH = jm.Isometric().replace(k_w=3.5e5, k_z=7e5, c_w=80.0, harmonic_frequency=5.0, harmonic_amplitude=0.012)
+SEEDS = 24
+BIN = 0.390625
+# Of every comparison here one in a thousand may fail by scatter, whatever the number of them.
+RARE = 1e-3
+
+
+def bound(comparisons):
+    """Šidák's, in standard errors."""
+    from scipy.stats import norm
+
+    return norm.ppf(1 - (1 - (1 - RARE) ** (1 / comparisons)) / 2)
+
+
+def simulated(task, name, seed, variation=True):
+    """A target from seeds of the nonlinear simulator; six Welch segments of each."""
+    runs = jm.ensemble(jm.settled(task), jax.random.key(seed), seeds=SEEDS, dt=2.5e-3, control=False)
+    held = np.asarray(runs.between((5.0, 15.0)))
+    cv = float(np.sqrt(held.var(axis=1).mean()) / held.mean()) if variation else None
+    quantity = "displacement" if task.output_unit == "m" else "force"
+    power = np.asarray(runs.spectrum().mean().proportional)
+    return jm.Target(name, power, segments=(6,) * SEEDS, coefficient_of_variation=cv, quantity=quantity)
+
+
+def expected(task, name="expected", **fields: Any):
+    """A target that is the expected spectrum."""
+    power = np.asarray(jm.expected_spectrum(task).proportional)
+    quantity = "displacement" if task.output_unit == "m" else "force"
+    return jm.Target(name, power, quantity=quantity, **({"segments": 24} | fields))
+
+
+def assert_near_the_truth(estimates, truth, names):
+    for name in names:
+        p = estimates[name]
+        assert p.stderr is not None, f"{name} is not determined"
+        assert abs(p.value - truth[name]) < bound(len(names)) * p.stderr, (
+            f"{name}: {p.value} ± {p.stderr}, true {truth[name]}"
+        )
+
+
+# --- recovery
+
+
+@functools.cache
+def levels():
+    """One truth at two force levels."""
+    return {name: simulated(TRUTH.replace(P_w=P_w), name, seed) for name, P_w, seed in (("low", 3.0, 1), ("high", 12.0, 2))}
+
+
+LEVELS = {"low": jm.Isometric().replace(P_w=3.0), "high": jm.Isometric().replace(P_w=12.0)}
+
+
+@functools.cache
+def two_levels():
+    return jm.fit_joint(levels(), tasks=LEVELS)
+
+
+@pytest.mark.slow
+def test_two_force_levels_tell_what_one_does_not():
+    joint = two_levels()
+    assert joint.success, joint.message
+    alone = jm.fit_cohort([levels()["low"]], fix={"P_w": 3.0}).results["low"].derived
+    more = jm.fit_cohort([levels()["high"]], fix={"P_w": 12.0}).results["high"].derived
+    assert alone["K_z0"].stderr is None and more["K_z0"].stderr is None
+    with jax.enable_x64(True):
+        low, high = (true_derived(TRUTH.replace(P_w=P_w)) for P_w in (3.0, 12.0))
+    names = ("corner_frequency", "harmonic_share", "high_frequency_floor", "coefficient_of_variation")
+    truth = {f"{n}@low": low[n] for n in names} | {f"{n}@high": high[n] for n in names} | {"K_z0": low["K_z0"]}
+    assert_near_the_truth(joint.derived, truth, list(truth))
+    assert abs(joint.parameters["harmonic_frequency"].value - 5.0) < 0.1 * BIN
+    assert set(joint.derived) >= {"K_w0", "mean@low", "mean@high"} and "K_w0@low" not in joint.derived
+    for name, part in joint.parts.items():
+        assert part.chi2_per_bin < 1 + 4 * 0.31  # its standard deviation, see test_uncertainty
+        assert float(part.task["P_w"]) == float(LEVELS[name]["P_w"])
+        assert part.nonlinearity is not None and part.nonlinearity < 0.02
+    assert joint.parameters["P_w@high"].value == 12.0 and not joint.parameters["P_w@high"].free
+
+
+@pytest.mark.slow
+def test_force_and_displacement_tell_every_stiffness_and_damping():
+    load = 3.0
+    held = TRUTH.as_task(jm.PrescribedForce, P_w=TRUTH.P_w, F_ext=load)
+    targets = {"force": simulated(TRUTH, "force", 3), "displacement": simulated(held, "displacement", 4, variation=False)}
+    tasks = {"force": jm.Isometric(), "displacement": jm.PrescribedForce(F_ext=load)}
+    joint = jm.fit_joint(targets, tasks=tasks)
+    assert joint.success, joint.message
+    alone = jm.fit_cohort([targets["force"]]).results["force"].derived
+    determined = ("K_w0", "K_z0", "C_w0", "C_z0")
+    assert all(alone[name].stderr is None for name in ("K_w0", "K_z0", "C_z0"))
+    with jax.enable_x64(True):
+        truth = dict(zip(determined, np.asarray(as_arrays(TRUTH).muscle.base()), strict=True))
+        truth["mean@force"] = true_derived(TRUTH)["mean"]
+    assert_near_the_truth(joint.derived, truth, list(truth))
+    assert joint.parameters["F_ext"].value == load  # only one task has it
+    # About a displacement near zero the coefficient of variation says nothing.
+    assert joint.derived["coefficient_of_variation@displacement"].stderr is None
+
+
+@functools.cache
+def two_people():
+    """Different harmonics, so that every target has minima of its own."""
+    other = TRUTH.replace(harmonic_frequency=7.3, c_w=50.0, noise_K_w=0.1)
+    return {"one": simulated(TRUTH, "one", 5), "other": simulated(other, "other", 6)}
+
+
+@pytest.mark.slow
+def test_with_all_parameters_separate_it_is_the_single_fits():
+    joint = jm.fit_joint(two_people(), separate=DEFAULT_FREE, seeds=0)
+    alone = jm.fit_cohort(two_people().values()).results
+    assert joint.success
+    assert set(joint.free) == {f"{n}@{t}" for t in two_people() for n in DEFAULT_FREE}
+    values = [s for result in alone.values() for s in result.singular_values]
+    np.testing.assert_allclose(joint.singular_values, sorted(values, reverse=True), rtol=0.02, atol=0.05)
+    for target, result in alone.items():
+        assert joint.parts[target].chi2_per_bin == pytest.approx(result.chi2_per_bin, rel=0.01)
+        for name, estimate in result.derived.items():
+            found = joint.derived[f"{name}@{target}"]
+            assert (found.stderr is None) is (estimate.stderr is None), name
+            if estimate.stderr is not None:
+                # Both stop within a thousandth of the cost of the minimum.
+                assert abs(found.value - estimate.value) < 0.2 * estimate.stderr, name
+                assert found.stderr == pytest.approx(estimate.stderr, rel=0.05), name
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("free", [DEFAULT_FREE, ("c_w", "noise_K_z", "harmonic_amplitude", "harmonic_frequency")])
+def test_a_second_equal_target_narrows_errors_by_the_root_of_two(free):
+    target = expected(TRUTH, coefficient_of_variation=0.016)
+    alone = jm.fit_cohort([target], free=free, starts=8).results["expected"]
+    joint = jm.fit_joint({"a": target, "b": target}, free=free, starts=8, seeds=0)
+    names = [n for n, p in alone.derived.items() if p.stderr is not None and n not in ("K_w0", "C_w0", "mean")]
+    assert len(names) >= 5
+    for name in names:
+        found = joint.derived.get(name) or joint.derived[f"{name}@a"]
+        ratio = found.stderr / alone.derived[name].stderr
+        # Where the prior holds a tenth of the variance it narrows less; what is just determined, most of all.
+        assert 0.99 < ratio * np.sqrt(2) < 1.12, name
+    # The prior pulls half as much against two targets, so that both end at slightly different points.
+    np.testing.assert_allclose(joint.singular_values, np.sqrt(2) * alone.singular_values, rtol=0.06, atol=0.05)
+
+
+# --- sharing
+
+ISOMETRIC, FORCE = jm.Isometric(), jm.PrescribedForce()
+
+
+@pytest.mark.parametrize(
+    ("free", "separate", "names"),
+    [
+        ({"a": ["k_w", "c_w"], "b": ["k_w", "c_w"]}, (), {"a": ["k_w", "c_w"], "b": ["k_w", "c_w"]}),
+        ({"a": ["k_w", "c_w"], "b": ["k_w", "c_w"]}, ("c_w",), {"a": ["k_w", "c_w@a"], "b": ["k_w", "c_w@b"]}),
+        ({"a": ["P_w"], "b": ["P_w", "F_ext"]}, (), {"a": ["P_w@a"], "b": ["P_w@b", "F_ext"]}),
+        ({"a": ["x_z"], "b": ["F_ext"]}, ("x_z",), {"a": ["x_z"], "b": ["F_ext"]}),
+        ({"a": ["k_w"], "b": ["c_w"]}, (), {"a": ["k_w@a"], "b": ["c_w@b"]}),
+    ],
+    ids=["shared", "separate", "inputs", "of one task", "free in one"],
+)
+def test_names(free, separate, names):
+    found = joint_names(free, {"a": ISOMETRIC, "b": FORCE}, separate)
+    assert {t: list(of.values()) for t, of in found.items()} == names
+
+
+def joint_plan(**options: Any):
+    load = FORCE.replace(F_ext=1.0)
+    targets = {"force": expected(ISOMETRIC), "shift": expected(load)}
+    return planned_jointly(targets, tasks={"force": ISOMETRIC, "shift": load}, **options)
+
+
+def test_the_joint_problem_is_its_parts(x64):
+    setup = joint_plan(separate=("c_w",), coefficient_of_variation=False).setup
+    assert setup.coordinates.names == ("k_w", "k_z", "c_w@force", "c_z", "harmonic_amplitude", "harmonic_frequency",
+                                       "noise_K_w", "noise_K_z", "c_w@shift")  # fmt: skip
+    problem = setup.linear()
+    theta = 0.2 * np.random.default_rng(0).standard_normal((2, 9))
+    seen = seen_at(problem, theta)
+    columns = [list(range(8)), [0, 1, 8, 3, 4, 5, 6, 7]]
+    for i, (part, own) in enumerate(zip(problem.parts, columns, strict=True)):
+        alone = seen_at(part, theta[:, own])
+        np.testing.assert_array_equal(seen.moments[i].power, alone.moments.power)
+        np.testing.assert_array_equal(seen.slopes[i].power[..., own], alone.slopes.power)
+        assert not np.any(np.delete(seen.slopes[i].power, own, axis=-1))
+    here = jax.tree.map(lambda x: x[0], seen)
+    residuals = np.asarray(problem.residuals(jnp.asarray(theta[0]), here.moments, problem.data))
+    parts = [p.data_residuals(m, p.data) for p, m in zip(problem.parts, here.moments, strict=True)]
+    np.testing.assert_allclose(residuals, np.concatenate([*parts, theta[0]]))
+
+
+def test_slopes_of_the_joint_moments_are_those_of_differences(x64):
+    problem = joint_plan(separate=("harmonic_frequency",)).setup.linear()
+    theta, step = np.full((1, 9), 0.1), 1e-5
+    seen = seen_at(problem, theta)
+    for j in range(9):
+        up, down = (seen_at(problem, theta + side * step * np.eye(9)[j]).moments for side in (1, -1))
+        for i in range(2):
+            slope = (up[i].power - down[i].power)[0] / (2 * step)
+            size = np.abs(slope).max() + 1e-6 * np.abs(seen.moments[i].power).max()
+            np.testing.assert_allclose(seen.slopes[i].power[0, :, j], slope, atol=1e-5 * size)
+
+
+def test_tasks_at_theta_have_the_shared_values(x64):
+    setup = joint_plan(separate=("c_w",)).setup
+    theta = np.linspace(-0.4, 0.4, 9)
+    tasks = setup.tasks(theta)
+    for name in ("k_w", "noise_K_z", "harmonic_frequency"):
+        assert float(tasks["force"][name]) == float(tasks["shift"][name])
+    assert float(tasks["force"]["c_w"]) == pytest.approx(60 * np.exp(theta[2]))
+    assert float(tasks["shift"]["c_w"]) == pytest.approx(60 * np.exp(theta[8]))
+    assert float(tasks["shift"]["F_ext"]) == 1.0
+
+
+def test_proportional_parameters_keep_the_ratio_of_their_tasks(x64):
+    names = ("k_w", "k_z", "c_w", "c_z", "noise_K_w", "noise_K_z", "noise_C_w", "noise_C_z", "harmonic_amplitude")
+    tasks = {f"{100 * level:g}": jm.at_level(TRUTH, level) for level in (0.15, 0.6)}
+    targets = {name: expected(task) for name, task in tasks.items()}
+    setup = planned_jointly(targets, tasks=tasks, proportional=names).setup
+    assert setup.coordinates.names == DEFAULT_FREE
+    weak, strong = setup.tasks(np.linspace(-0.5, 0.5, 8)).values()
+    for name in names:
+        ratio = float(tasks["60"][name]) / float(tasks["15"][name])
+        assert float(strong[name]) / float(weak[name]) == pytest.approx(ratio), name
+
+
+def test_starts_are_at_the_maxima_of_all_targets(x64):
+    def peaked(f):
+        return expected(ISOMETRIC.replace(harmonic_frequency=f, harmonic_amplitude=0.02), name=str(f))
+
+    for separate in ((), ("harmonic_frequency",)):
+        setup = planned_jointly({"a": peaked(4.0), "b": peaked(8.0)}, separate=separate).setup
+        c, starts = setup.coordinates, joint_starts(setup, 32)
+        for target, maximum in (("a", 4.0), ("b", 8.0)):
+            name = f"harmonic_frequency@{target}" if separate else "harmonic_frequency"
+            column = c.names.index(name)
+            frequency = c.centre[column] * np.exp(c.sd[column] * np.asarray(c.theta(starts))[:, column])
+            assert np.min(np.abs(frequency - maximum)) < 0.5 * BIN
+            assert len(np.unique(np.round(frequency, 6))) == 32
+        np.testing.assert_array_equal(np.asarray(c.theta(starts))[0, :4], 0.0)
+
+
+def test_directions_of_single_targets_are_named():
+    names = (
+        "k_w",
+        "noise_K_w@a",
+        "noise_K_z@a",
+        "harmonic_amplitude@a",
+        "noise_K_w@b",
+        "noise_K_z@b",
+        "harmonic_amplitude@b",
+    )
+    flat = np.zeros((2, 7))
+    flat[0, 1:4] = flat[1, 4:] = 1 / np.sqrt(3)
+    found = identifiability(10 * (np.eye(7) - flat.T @ flat))
+    scale = "all noise amplitudes and the harmonic's can be scaled together"
+    assert undetermined_directions(names, found) == (f"{scale} (a)", f"{scale} (b)")
+
+
+# --- results
+
+
+@pytest.fixture(scope="module")
+def quick():
+    """Four parameters, one start of each, no simulation."""
+    tasks = {"low": TRUTH.replace(P_w=4.0), "high": TRUTH.replace(P_w=8.0)}
+    targets = {name: expected(task, name, mvc_fraction=0.2) for name, task in tasks.items()}
+    free = ("c_w", "noise_K_z", "harmonic_amplitude", "harmonic_frequency", "P_w@high")
+    return jm.fit_joint(targets, tasks=tasks, free=free, separate=("harmonic_amplitude",), starts=2, seeds=0)
+
+
+def test_a_result_holds_everything(quick):
+    assert quick.success, quick.message
+    assert quick.free == ("c_w", "noise_K_z", "harmonic_amplitude@low", "harmonic_frequency", "harmonic_amplitude@high",
+                          "P_w@high")  # fmt: skip
+    assert quick.parameters["P_w@low"].value == 4.0 and not quick.parameters["P_w@low"].free
+    assert quick.parameters["k_w"].value == 3.5e5
+    assert set(quick.tasks) == set(quick.targets) == {"low", "high"}
+    for part in quick.parts.values():
+        # The target is the expected spectrum: what is left is the bias of a log power where a line holds part of a bin.
+        np.testing.assert_allclose(part.fitted, part.target.proportional_power, rtol=0.05)
+        assert part.fitted.sum() == pytest.approx(1.0) and part.chi2_per_bin < 0.05
+    assert np.array(quick.correlation["matrix"]).shape == (6, 6)
+    with jax.enable_x64(True):
+        setup = planned_jointly(quick.targets, tasks=quick.tasks, free=("c_w",), separate=("harmonic_amplitude",)).setup
+        problem = setup.linear()
+        seen = jax.tree.map(lambda x: x[0], seen_at(problem, np.zeros((1, 1))))
+        for i, target in enumerate(quick.parts):
+            part = problem.parts[i]
+            values = derived(at(part.task, part.coordinates, jnp.zeros(1)), seen.moments[i])
+            for name in ("corner_frequency", "mean", "high_frequency_floor"):
+                assert quick.derived[f"{name}@{target}"].value == pytest.approx(float(values[name]))
+    assert any(notice.startswith("in linear response") for notice in quick.notices)
+
+
+def test_a_result_in_words(quick):
+    text = str(quick)
+    assert text.startswith("fitted together: low, high\n")
+    for expected_line in ("  low: low, Isometric, BandLimitedNoise, chi2 per bin 0.0", "harmonic_amplitude@high",
+                          "corner_frequency@low", "K_w0"):  # fmt: skip
+        assert expected_line in text
+    assert max(map(len, text.splitlines())) <= 125
+
+
+def test_what_is_saved_is_read_back_equal(quick, tmp_path):
+    path = tmp_path / "new" / "joint.json"
+    quick.save(path)
+    assert_equal(jm.load_joint_result(path), quick)
+    with pytest.raises(ResultError, match=r"is not a joint result of format joint-1; write it with JointResult\.save"):
+        wrong = tmp_path / "wrong.json"
+        wrong.write_text('{"format": 1}')
+        jm.load_joint_result(wrong)
+    with pytest.raises(ResultError, match="cannot be read"):
+        jm.load_joint_result(tmp_path / "none.json")
+    with pytest.raises(ResultError, match="has no entry 'success'"):
+        wrong.write_text('{"format": "joint-1"}')
+        jm.load_joint_result(wrong)
+
+
+def test_the_figure(quick):
+    figure = quick.plot()
+    try:
+        titles = [ax.get_title(loc="left") for ax in figure.axes]
+        assert titles.count("Target above (+) or below (–) fit") == 2
+        assert "low: Isometric" in titles and "high: Isometric" in titles
+        said = {text.get_text() for ax in figure.axes for text in ax.texts}
+        assert {"Fitted parameters", "harmonic_amplitude@low", "mean@high"} <= said
+    finally:
+        plt.close(figure)
+
+
+def test_a_fit_that_fails_is_a_result(tmp_path):
+    """Noise on C does nothing at rest: no spectrum is finite."""
+    still = dict.fromkeys(("noise_K_w", "noise_K_z", "harmonic_amplitude"), 0.0) | {"noise_C_w": 0.1}
+    targets = {"a": expected(ISOMETRIC), "b": expected(ISOMETRIC.replace(P_w=9.0))}
+    joint = jm.fit_joint(targets, fix=still, free=("k_w",), starts=2)
+    assert not joint.success and "no start has a finite spectrum of every target" in joint.message
+    assert str(joint).startswith("NOT FITTED: a, b")
+    joint.save(tmp_path / "failed.json")
+    assert_equal(jm.load_joint_result(tmp_path / "failed.json"), joint)
+    plt.close(joint.plot())
+
+
+def test_equal_tasks_of_unequal_levels_are_noticed():
+    targets = {"a": expected(TRUTH, mvc_fraction=0.2), "b": expected(TRUTH, mvc_fraction=0.4)}
+    joint = jm.fit_joint(targets, free=("c_w", "harmonic_frequency"), starts=1, seeds=0)
+    assert any("different levels (a 20 % MVC, b 40 % MVC), but their tasks have the same forces" in n for n in joint.notices)
+
+
+# --- errors
+
+A, B = (jm.Target(name, 1 / np.arange(1.0, 31.0), segments=12) for name in "ab")
+SHIFT = jm.Target("shift", 1 / np.arange(1.0, 31.0), segments=12, quantity="displacement")
+
+
+@pytest.mark.parametrize(
+    ("targets", "options", "message"),
+    [
+        ({}, {}, "0 given, a joint fit needs at least two"),
+        ({"a": A}, {}, r"1 given, a joint fit needs at least two; fit\(task, target\) fits one"),
+        ({"a": A, "b@c": B}, {}, "a name must not be empty nor contain '@', as 'b@c' does"),
+        ({"a": A, "b": "vastus-lateralis-27mvc"}, {}, "vastus-lateralis-26mvc"),
+        ({"a": A, "b": B}, {"tasks": {"c": ISOMETRIC}}, "tasks: no target is called 'c'"),
+        ({"a": A, "b": B}, {"mean_force": {"c": (1.0, 0.1)}}, "mean_force: no target is called 'c'"),
+        ({"a": A, "b": B}, {"separate": ["k_q"]}, "separate: no task has a parameter 'k_q': did you mean"),
+        ({"a": A, "b": B}, {"proportional": ["F_ext"]}, "proportional: no task has a parameter 'F_ext'"),
+        ({"a": A, "b": B}, {"separate": ["k_w"], "proportional": ["k_w"]}, "k_w cannot be both separate and proportional"),
+        ({"a": A, "b": B}, {"free": ["F_ext"]}, "free: no task has a parameter 'F_ext'"),
+        ({"a": A, "b": B}, {"free": ["k_w@c"]}, "free: 'k_w@c' names no target"),
+        ({"a": A, "b": B}, {"free": ["k_w@a"]}, "free: none of these belongs to the task of target 'b'"),
+        ({"a": A, "b": SHIFT}, {"free": ["k_w", "F_ext@a"]}, "free: task 'a' has no parameter 'F_ext'"),
+        ({"a": A, "b": B}, {"fix": {"K_w": 1.0}}, "fix: no task has a parameter 'K_w'"),
+        ({"a": A, "b": B}, {"fix": {"k_w": 1e5}, "free": ["k_w"]}, "k_w cannot be both free and fixed"),
+        ({"a": A, "b": B}, {"tasks": {"b": ISOMETRIC.replace(k_w=4e5)}},
+         "k_w is 500000 in task 'a' and 400000 in 'b', yet they share it: make them equal, or list it in separate"),
+        ({"a": A, "b": B}, {"fix": {"m_w@b": 0.7}}, "m_w is 0.5 in task 'a' and 0.7 in 'b', yet they share it"),
+        ({"a": A, "b": B}, {"tasks": {"b": jm.Isometric(noise=jm.OrnsteinUhlenbeckNoise())}},
+         "the noise of task 'a' and that of 'b' are BandLimitedNoise and OrnsteinUhlenbeckNoise, so noise_K_w cannot be"),
+        ({"a": A, "b": SHIFT}, {"tasks": {"b": ISOMETRIC}},
+         "target 'b' is a displacement, but its task Isometric gives F_ext in N"),
+        ({"a": A, "b": B}, {"bounds": {"m_w": (0.1, 1.0)}}, "bounds: unknown or not free parameter 'm_w'"),
+        ({"a": A, "b": B}, {"priors": {"k_w@a": 0.1}}, "priors: unknown or not free parameter 'k_w@a'"),
+        ({"a": A, "b": B}, {"starts": 0}, "starts = 0 and max_steps = 40 must be at least 1"),
+        ({"a": A, "b": B}, {"residual": "square"}, "residual = 'square'"),
+    ],
+)  # fmt: skip
+def test_bad_arguments(targets, options, message):
+    with pytest.raises(ValueError, match=message):
+        jm.fit_joint(targets, **options)
+
+
+def test_priors_and_bounds_by_joint_or_plain_name(x64):
+    plan = planned_jointly({"a": A, "b": B}, separate=("c_w",), priors={"c_w": 0.5, "c_w@b": 0.25, "k_w": None},
+                           bounds={"c_w@a": (10.0, 200.0)})  # fmt: skip
+    c = plan.setup.coordinates
+    sd = dict(zip(c.names, c.sd, strict=True))
+    assert (sd["c_w@a"], sd["c_w@b"]) == (0.5, 0.25)
+    assert plan.setup.prior[c.names.index("k_w")] == 0 and plan.settings["prior_sd"]["k_w"] is None
+    assert np.isfinite(c.low[c.names.index("c_w@a")]) and not np.isfinite(c.low[c.names.index("c_w@b")])

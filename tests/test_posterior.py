@@ -1,0 +1,273 @@
+"""Posterior and profile: against known densities, one another, and what must be refused."""
+
+import functools
+import importlib.util
+import json
+from pathlib import Path
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import matplotlib.pyplot as plt
+import numpy as np
+import pytest
+import scipy.integrate
+import xarray
+from typer.testing import CliRunner
+
+import jaxmuscle as jm
+from jaxmuscle._again import taken_up, theta_of
+from jaxmuscle._chains import Chains, sample
+from jaxmuscle._cli import app
+from jaxmuscle._likelihood import Likelihood
+from jaxmuscle._marginal import marginal_of
+from jaxmuscle._mixing import diagnosed, modes_of, verdict
+
+FREE = ("c_w", "noise_K_z", "harmonic_amplitude", "harmonic_frequency")
+
+
+class Gaussian(eqx.Module):
+    """A density to sample: mixture of two normals `apart` standard deviations from one another."""
+
+    centre: np.ndarray
+    scale: np.ndarray
+    apart: float
+
+    @property
+    def size(self):
+        return 3
+
+    def log_density(self, white):
+        x = jnp.asarray(self.centre) + jnp.asarray(self.scale) @ white
+        shift = self.apart * jnp.array([1.0, 0.0, 0.0])
+        sd = jnp.array([1.0, 0.1, 10.0])
+        heights = [-0.5 * jnp.sum(((x - side * shift) / sd) ** 2) for side in (-0.5, 0.5)]
+        return jax.nn.logsumexp(jnp.stack(heights))
+
+
+def chains_of(apart, key=0):
+    with jax.enable_x64(True):
+        density = Gaussian(np.zeros(3), np.eye(3), apart)
+        return sample(density, jax.random.key(key), 4, 500, 400, lambda text, share: None)[0]  # pyright: ignore
+
+
+@pytest.mark.slow
+def test_chains_of_a_normal_density():
+    found = chains_of(0.0)
+    draws = found.s.reshape(-1, 3)
+    for i, sd in enumerate((1.0, 0.1, 10.0)):
+        _, bulk, _ = diagnosed(found.s[:, :, i])
+        assert abs(draws[:, i].mean()) < 4 * sd / np.sqrt(bulk)
+        assert draws[:, i].std() == pytest.approx(sd, rel=4 / np.sqrt(2 * bulk) + 0.02)
+    assert verdict(found, {str(i): diagnosed(found.s[:, :, i]) for i in range(3)}, ("0",))[0]
+
+
+@pytest.mark.slow
+def test_chains_that_do_not_mix_are_found_out():
+    found = chains_of(40.0, key=1)
+    assert len(set(np.sign(found.s[:, -1, 0]))) == 2  # with other keys all starts may lie on one side
+    success, message = verdict(found, {"x": diagnosed(found.s[:, :, 0])}, ("x",))
+    assert not success and "did not mix" in message and "longer chains" in message
+
+
+def test_divergences_are_a_failure():
+    shape = (4, 1000)
+    rng = np.random.default_rng(0)
+    draws = rng.normal(size=(*shape, 1))
+    diverging = np.zeros(shape, dtype=bool)
+    diverging[0, :9] = True
+    made = Chains(draws, np.zeros(shape), np.ones(shape), np.ones(shape, dtype=int), diverging, 0.5)
+    success, message = verdict(made, {"x": diagnosed(draws[:, :, 0])}, ("x",))
+    assert not success and message.startswith("9 of 4000 draws diverged")
+
+
+def test_modes_are_told_apart():
+    rng = np.random.default_rng(1)
+    frequency = np.exp(
+        np.concatenate([np.log(2.0) + 0.05 * rng.normal(size=3000), np.log(8.0) + 0.05 * rng.normal(size=1000)])
+    )
+    first, second = modes_of(frequency)
+    assert first[1] == pytest.approx(2.0, rel=0.02) and second[1] == pytest.approx(8.0, rel=0.02)
+    assert (first[3], second[3]) == (0.75, 0.25)
+    assert len(modes_of(np.exp(rng.normal(size=4000)))) == 1
+
+
+@functools.cache
+def well_known():
+    """Sixty recordings averaged: a strong rhythm, three more parameters, the rest fixed at the truth."""
+    truth = jm.Isometric().replace(c_w=80.0, harmonic_frequency=4.0, harmonic_amplitude=0.01, noise_K_z=0.008)
+    runs = jm.ensemble(jm.settled(truth), jax.random.key(2), seeds=60, control=False)
+    power = np.asarray(runs.spectrum().proportional).mean(axis=0)
+    target = jm.Target("well known", power, segments=(6,) * 60)
+    return truth, jm.fit(jm.Isometric(), target, free=FREE, starts=24, check_seeds=8)
+
+
+@functools.cache
+def drawn():
+    return jm.posterior(well_known()[1], key=3)
+
+
+@pytest.mark.slow
+def test_curvature_profile_and_posterior_agree_where_the_data_determine_all():
+    truth, result = well_known()
+    found = drawn()
+    assert found.success, found.message
+    summary = found.summary()
+    for name in FREE:
+        row, told = summary[name], jm.profile(result, name)
+        assert told.low is not None and told.high is not None
+        sd = result.parameters[name].stderr
+        assert sd is not None
+        # the fit weighs bins alike, the likelihood by their correlation: its errors are smaller, never by more than a third
+        assert 0.67 * sd < row["sd"] < 1.15 * sd, name
+        assert told.stderr == pytest.approx(row["sd"], rel=0.15), name
+        assert (told.high - told.low) / 3.92 == pytest.approx(row["sd"], rel=0.15), name
+        assert abs(told.value - row["mean"]) < 0.3 * row["sd"], name
+        assert abs(row["mean"] - float(truth[name])) < 3.5 * row["sd"], name
+
+
+@pytest.mark.slow
+def test_posterior_as_files_and_figures(tmp_path):
+    found = drawn()
+    found.save(tmp_path / "p.nc")
+    with xarray.open_datatree(tmp_path / "p.nc", engine="h5netcdf") as tree:
+        assert set(tree.children) == {"posterior", "posterior_predictive", "sample_stats", "observed_data"}
+        assert dict(tree["posterior"].sizes) == {"chain": 4, "draw": 1000, "frequency": 30}
+        np.testing.assert_array_equal(tree["posterior"]["c_w"].values, found.samples["c_w"])
+        assert tree["posterior"]["c_w"].attrs["units"] == "N s^3/m^3"
+    found.save(tmp_path / "p.json")
+    table = json.loads((tmp_path / "p.json").read_text())
+    assert table["success"] and table["summary"]["c_w"]["r_hat"] == found.diagnostics["c_w"][0]
+    for figure in (found.plot(), found.plot_chains(), found.plot_predictive().figure):
+        figure.canvas.draw()
+        plt.close(figure)
+    assert "95" not in str(found) and "4 chains of 1000 draws" in str(found)
+    # replicates scatter about the model as the target does: p-values are not extreme where the model is true
+    assert 0.01 < found.replicates.p_value < 0.99
+
+
+@pytest.mark.slow
+def test_the_same_key_gives_the_same_draws():
+    result = well_known()[1]
+    first, second = (jm.posterior(result, key=5, chains=2, draws=100, warmup=50) for _ in range(2))
+    np.testing.assert_array_equal(first.samples["c_w"], second.samples["c_w"])
+
+
+@pytest.mark.slow
+def test_chains_without_a_summary():
+    short = jm.posterior(well_known()[1], key=5, chains=2, draws=100, warmup=50)
+    assert not short.success  # a hundred draws have no effective size of two hundred
+    with pytest.raises(jm.NotMixedError, match="longer chains"):
+        short.summary()
+    with pytest.raises(jm.NotMixedError):
+        short.plot()
+    assert str(short).startswith("NO POSTERIOR")
+
+
+@functools.cache
+def sloppy():
+    target = jm.load_target("vastus-lateralis-26mvc")
+    return jm.fit(jm.task_for(target), target, starts=24, check_seeds=8)
+
+
+@pytest.mark.slow
+def test_what_the_data_leave_open_has_an_open_profile():
+    told = jm.profile(sloppy(), "K_z0")
+    assert told.low is None or told.high is None
+    assert "open" in str(told) or "no limits" in str(told)
+    corner = jm.profile(sloppy(), "corner_frequency")
+    assert corner.low is not None and corner.high is not None
+    assert corner.low < corner.value < corner.high
+    assert corner.rise.min() >= 0 and np.all(np.diff(corner.values) > 0)
+    plt.close(corner.plot().figure)
+
+
+@pytest.mark.slow
+def test_density_is_summed_over_the_frequency():
+    """Against adaptive quadrature of the likelihood over the frequency at a point of the other coordinates."""
+    with jax.enable_x64(True):
+        setup = taken_up(sloppy())
+        likelihood = Likelihood.of(setup)
+        marginal, _, _ = marginal_of(setup, likelihood, theta_of(setup, sloppy().task))
+        s, offset = marginal.split(jnp.full(marginal.size, 0.2))
+        found = float(jax.nn.logsumexp(marginal.heights(marginal.features(s), offset)))
+        column = setup.coordinates.names.index("harmonic_frequency")
+        theta = np.array(setup.coordinates.theta(np.asarray(s)))
+        likelihood_at = jax.jit(lambda theta: likelihood.at(likelihood.problem.moments(theta), offset))
+
+        def density(f):
+            theta[column] = setup.coordinates.theta_of("harmonic_frequency", f)
+            return np.exp(float(likelihood_at(jnp.asarray(theta))) - 0.5 * theta[column] ** 2 - np.log(f) - found)
+
+        edges = (marginal.frequency[0], marginal.frequency[-1])
+        whole, _ = scipy.integrate.quad(density, *edges, limit=200, epsrel=1e-4, points=[1.0, 4.0, 7.0, 12.0])
+        assert whole == pytest.approx(1.0, abs=0.02)
+        numeric = jax.grad(marginal.log_density)(jnp.full(marginal.size, 0.2))
+        step = 1e-5
+        for i in range(marginal.size):
+            sides = [float(marginal.log_density(jnp.full(marginal.size, 0.2).at[i].add(d))) for d in (-step, step)]
+            assert float(numeric[i]) == pytest.approx((sides[1] - sides[0]) / (2 * step), rel=1e-4, abs=1e-5)
+
+
+def bare():
+    return jm.Target("bare", np.linspace(2, 1, 30))
+
+
+@pytest.mark.slow
+def test_errors():
+    result = sloppy()
+    with pytest.raises(ValueError, match="neither segments nor sigma"):
+        jm.posterior(result, bare())
+    with pytest.raises(ValueError, match="neither segments nor sigma"):
+        jm.profile(result, "corner_frequency", bare())
+    with pytest.raises(ValueError, match="outside its bounds"):
+        jm.posterior(result, bounds={"k_w": (1.0, 2.0)})
+    with pytest.raises(ValueError, match="is not free"):
+        jm.posterior(result, priors={"m_w": 0.1})
+    with pytest.raises(ValueError, match="chains = 1"):
+        jm.posterior(result, chains=1)
+    with pytest.raises(ValueError, match="level = 2"):
+        jm.profile(result, "k_w", level=2.0)
+    with pytest.raises(ValueError, match="neither free nor derived"):
+        jm.profile(result, "m_w")
+
+
+@pytest.mark.slow
+def test_command(tmp_path):
+    spectrum = tmp_path / "bare.csv"
+    f = np.arange(1, 31) * 0.390625
+    lines = [f"{x},{1 / (1 + x)}" for x in f]
+    spectrum.write_text("frequency_hz,proportional_power\n" + "\n".join(lines))
+    run = CliRunner().invoke(app, ["posterior", str(spectrum), "--out", str(tmp_path / "a")])
+    assert run.exit_code == 2 and "--segments" in run.output
+    result = well_known()[1]
+    result.save(tmp_path / "fit.json")
+    few = ["--draws", "100", "--chains", "2", "--warmup", "50"]
+    run = CliRunner().invoke(app, ["posterior", str(tmp_path / "fit.json"), *few,
+                                   "--out", str(tmp_path / "b")])  # fmt: skip
+    assert run.exit_code == 1 and "did not mix" in run.output
+    assert {p.name for p in (tmp_path / "b").iterdir()} == {"fit.json", "posterior.nc", "posterior.json", "chains.png"}
+    assert json.loads((tmp_path / "b" / "posterior.json").read_text())["summary"] is None
+
+
+def benchmark():
+    path = Path(__file__).parents[1] / "benchmarks" / "calibration.py"
+    spec = importlib.util.spec_from_file_location("calibration", path)
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.mark.slow
+def test_calibration_on_a_subset(tmp_path):
+    """Truths from the prior, recordings of 10 s; of 6 x 4 intervals of 95 % at most 6 miss (binomial, p = 0.0001)."""
+    study = benchmark()
+    rows = study.run(list(range(6)), 10.0, tmp_path / "rows.json")
+    names = ("corner_frequency", "harmonic_share", "high_frequency_floor", "coefficient_of_variation")
+    intervals = [(*row["posterior"][name][:2], row["true"][name]) for row in rows for name in names]
+    assert len(intervals) == 24
+    assert sum(not low <= truth <= high for low, high, truth in intervals) <= 6
+    assert "| corner_frequency |" in study.report(rows)
+    again = study.run(list(range(6)), 10.0, tmp_path / "rows.json")  # nothing is left to do
+    assert [row["number"] for row in again] == [row["number"] for row in rows]
