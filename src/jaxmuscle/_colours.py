@@ -132,7 +132,7 @@ def _highest(
         reached = np.where(np.isfinite(peak.cost), peak.cost, np.inf)
         for s in np.unique(owner[rows]):
             own = np.flatnonzero(owner[rows] == s)
-            i = own[np.argmin(reached[own])]
+            i = int(own[np.argmin(reached[own])])
             settled[s] = peak.settled[i] or (np.isfinite(cost[s]) and cost[s] - reached[i] < ENOUGH)
             best[s], cost[s] = peak.row(i), reached[i]
     return Peak(*(np.concatenate(x) for x in zip(*best, strict=True))), settled

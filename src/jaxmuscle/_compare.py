@@ -4,6 +4,7 @@ from collections.abc import Callable, Iterable, Mapping
 from typing import Any, TypeVar
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
@@ -138,7 +139,7 @@ def _fitted(setup: Setup, folds: Folds | None, *, harmonic: bool) -> dict[str, A
     residual = standardised(target.proportional_power, peak.proportional[0], bin_statistics(target, peak.line[0]))
     problem = model.likelihood.problem
     return {
-        "task": as_numbers(at(problem.task, problem.coordinates, peak.theta[0])),
+        "task": as_numbers(at(problem.task, problem.coordinates, jnp.asarray(peak.theta[0]))),
         "fitted": peak.proportional[0],
         "log_likelihood": float(peak.log_likelihood[0]),
         "parameters": float(peak.parameters[0]),

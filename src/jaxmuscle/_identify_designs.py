@@ -24,6 +24,7 @@ LEVELS = (2.0, 0.5)
 INPUTS = ("P_w", "F_ext", "x_z")
 LONGER = 10
 MOST_VARIATION = 1e3
+VAGUE = 1e-6  # prior precision of what is separate
 
 
 class Design(eqx.Module):
@@ -41,7 +42,7 @@ class Design(eqx.Module):
     - `settings`: how its spectrum is estimated; as the target's by default.
     - `coefficient_of_variation`: whether that of its output is measured.
     - `mean`: relative standard error with which the mean output is measured, 0.02 say; None if it is not.
-    - `separate`: names of free parameters that have another, unknown value in this measurement.
+    - `separate`: names of free parameters that have another value in this measurement, of which nothing is known before.
 
     **Raises:** `ValueError` for a measurement of nothing, segments below 0, a `mean` that is not positive.
     """
@@ -168,7 +169,7 @@ def information_of(setup: Setup, seen: Seen) -> Float[np.ndarray, "free free"]:
 
 
 def design_information(setup: Setup, theta: Float[np.ndarray, " free"], design: Design) -> Float[np.ndarray, "free free"]:
-    """Fisher information about a fit's θ in a design; what is separate in it is eliminated, with its prior.
+    """Fisher information about a fit's θ in a design; what is separate in it is eliminated, without a prior of its own.
 
     Raises `ValueError` for a task without linear response, unknown names in `separate`, and a coefficient of variation or
     mean of an output that is zero.
@@ -188,7 +189,7 @@ def design_information(setup: Setup, theta: Float[np.ndarray, " free"], design: 
     kept = np.array([names[i] not in design.separate for i in own])
     whole = np.zeros((len(names), len(names)))
     if not np.all(kept):
-        loose, tied = found[np.ix_(~kept, ~kept)] + np.diag(local.prior[~kept]), found[np.ix_(kept, ~kept)]
+        loose, tied = found[np.ix_(~kept, ~kept)] + VAGUE * np.eye(np.sum(~kept)), found[np.ix_(kept, ~kept)]
         found = found[np.ix_(kept, kept)] - tied @ np.linalg.pinv(loose, hermitian=True) @ tied.T
     whole[np.ix_(own[kept], own[kept])] = found
     return whole
