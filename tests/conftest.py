@@ -1,5 +1,6 @@
 """What holds for every test: shapes are checked, dtypes are never mixed silently, figures need no screen."""
 
+import gc
 import os
 from pathlib import Path
 
@@ -30,12 +31,24 @@ def _keep_compiled_programs(folder: Path) -> None:
     os.environ["JAX_COMPILATION_CACHE_DIR"] = str(folder)
 
 
+MOST_MAPS = 15_000
+
 _keep_compiled_programs(Path(__file__).parents[1] / ".test-out" / "jax-cache")
 
 
 def pytest_runtest_setup(item: pytest.Item) -> None:
     if item.get_closest_marker("gpu") and jax.default_backend() != "gpu":
         pytest.skip("needs a GPU")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _forget_compiled_programs():
+    """Every compiled program takes memory maps, of which Linux allows a process 65530: thousands of tests use them up."""
+    yield
+    maps = Path("/proc/self/maps")
+    if not maps.exists() or len(maps.read_text().splitlines()) > MOST_MAPS:
+        jax.clear_caches()
+        gc.collect()
 
 
 @pytest.fixture

@@ -270,17 +270,23 @@ class Comparison(eqx.Module):
 
     def __str__(self) -> str:
         kind = type(next(iter(self.tasks.values()))).__name__
-        head = f"  {'noise':<19}{'harmonic':<9}{'ln L':>8}{'p':>5}{'AIC':>9}{'ΔAIC':>7}{'weight':>7}  held-out"
+        head = f"  {'noise':<19}{'line':<5}{'ln L':>9}{'p':>5}{'AIC':>9}{'ΔAIC':>9}{'weight':>7}  held-out"
         lines = [f"{self.target.name} ({self.target.provenance}), {kind}: which noise?", head]
         for row in sorted(self.rows, key=lambda row: row.aic):
-            held = "" if row.score is None else f"{row.score_difference:.1f} ± {row.score_stderr:.1f}"
-            line = f"  {row.noise:<19}{'yes' if row.harmonic else 'no':<9}{row.log_likelihood:>8.1f}{row.parameters:>5.1f}"
-            line += f"{row.aic:>9.1f}{row.delta_aic:>7.1f}{row.weight:>7.2f}"
+            held = "" if row.score is None else f"{_short(row.score_difference)} ± {_short(row.score_stderr)}"
+            line = (
+                f"  {row.noise:<19}{'yes' if row.harmonic else 'no':<5}{_short(row.log_likelihood):>9}{row.parameters:>5.1f}"
+            )
+            line += f"{_short(row.aic):>9}{_short(row.delta_aic):>9}{row.weight:>7.2f}"
             lines.append(f"{line}  {held if row.success else 'failed'}")
         said = [f"left out: {noise}: {why}" for noise, why in self.left_out.items()]
         for sentence in (*self.verdict, *said):
             lines += textwrap.wrap(sentence, WIDTH, initial_indent="- ", subsequent_indent="  ")
         return "\n".join(lines)
+
+
+def _short(value: Any) -> str:
+    return f"{value:.1f}" if abs(value) < 1e4 else f"{value:.3g}"
 
 
 def _number(value: Any) -> Any:
