@@ -157,7 +157,7 @@ def test_effective_parameters_of_a_ridge_regression():
 def test_a_bin_that_was_left_out_against_a_fit_by_scipy(x64):
     """Refitted without its group by Nelder and Mead on the likelihood that was integrated over the offset by quadrature."""
     found = compared("pink", 3, False)
-    target, (k, names) = found.target, (17, ("c_w", "noise_K_z"))
+    target, (k, names) = found.target, (0, ("c_w", "noise_K_z"))
     start = found.tasks["pink", False]
     kept = (np.arange(30) % GROUPS != k % GROUPS).astype(float)
     moments = jax.jit(lambda task: jm.expected_spectrum(task).power)
@@ -186,7 +186,8 @@ def test_a_bin_that_was_left_out_against_a_fit_by_scipy(x64):
     more = jax.tree.map(jnp.asarray, measured_bins(target, kept + np.eye(30)[k]))
     power = moments(task_at(best.x))
     score = next(r for r in found.rows if (r.noise, r.harmonic) == ("pink", False)).scores[k]
-    # Both stop within 1e-3 of the maximum: θ within √0.002 of a standard deviation, and so the score within 0.05.
+    # Both stop within 1e-3 of the maximum: θ within √0.002 of a standard deviation, and so the score within 0.05. The fit to
+    # all bins foretells this one better by 1.5.
     assert score == pytest.approx(marginal(more, power) - marginal(bins, power), abs=0.05)
 
 

@@ -13,7 +13,7 @@ from ._colours import Folds, Model, held_out, masked_bins, maxima
 from ._comparison import NEEDED, ComparedModel, Comparison, score_difference
 from ._fit import NOISES, planned, teller, with_noise
 from ._objective import at
-from ._parameter import as_numbers
+from ._parameter import PARAMETERS, as_numbers
 from ._problem import Setup
 from ._target import Target
 from ._task import AbstractTask
@@ -111,6 +111,7 @@ def _setups(
 ) -> dict[str, Setup]:
     """The fit of each noise; what concerns a parameter that only other noises have is left to them."""
     everywhere = {name for task in carried.values() for name in task.parameter_names}
+    everywhere |= {name for name in PARAMETERS if name.startswith("noise_")}
     chosen = None if free is None else tuple(free)
     for argument, names in (("free", chosen or ()), ("fix", fix), ("priors", priors), ("bounds", bounds)):
         for name in names:
