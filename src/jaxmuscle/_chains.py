@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float, Int
 Density = Any  # has `size`, `centre`, `scale` that whiten, and `log_density` of whitened coordinates
 BLOCK = 50
 ADAPTATIONS = (2, 3, 5)  # blocks of warm-up; the metric is learnt after each but the last
-TARGET_ACCEPTANCE = 0.9
+TARGET_ACCEPTANCE = 0.95
 DOUBLINGS = 7
 SPREAD = 1.5
 SHRINK = 20  # draws that the old metric counts for when a new one is learnt
