@@ -66,7 +66,7 @@ def filter_matrices(rate: float, cutoff: float, dt: float) -> tuple[np.ndarray, 
 
 def band_scan(
     task: AbstractTask,
-    normals: Float[Array, "points 2 4 *seeds"],
+    normals: Float[Array, "points 8 *seeds"],
     matrices: tuple[np.ndarray, np.ndarray, float],
     dt: float,
     every: int,
@@ -74,7 +74,7 @@ def band_scan(
     """Filter recursion and Heun in one scan."""
     (f, root, deviation), dtype = matrices, normals.dtype
     f, root = np.asarray(f, dtype), np.asarray(root, dtype)
-    start = jnp.zeros((4, *normals.shape[3:]), dtype)
+    start = jnp.zeros((4, *normals.shape[2:]), dtype)
     base, scale = _column(task.harmonic_base(), start), _column(task.noise_scale(), start) * deviation
 
     def slope_of(t, y, u):
@@ -82,12 +82,12 @@ def band_scan(
 
     def step(carry, x):
         (y, n, slope), (t, kick) = carry, x
-        n1 = f[0, 0] * n + f[0, 1] * slope + root[0, 0] * kick[0]
-        slope1 = f[1, 0] * n + f[1, 1] * slope + root[1, 0] * kick[0] + root[1, 1] * kick[1]
+        n1 = f[0, 0] * n + f[0, 1] * slope + root[0, 0] * kick[:4]
+        slope1 = f[1, 0] * n + f[1, 1] * slope + root[1, 0] * kick[:4] + root[1, 1] * kick[4:]
         u = base * task.harmonic(t) + scale * n, base * task.harmonic(t + dt) + scale * n1
         return _heun(slope_of, t, dt, y, u), n1, slope1
 
-    return _scan(step, (start, normals[0, 0], normals[0, 1]), normals[1:], dt, every)
+    return _scan(step, (start, normals[0, :4], normals[0, 4:]), normals[1:], dt, every)
 
 
 def stock_diffrax(task: AbstractTask, path: dfx.AbstractBrownianPath, rate: float, dt: float, steps: int, every: int) -> Any:

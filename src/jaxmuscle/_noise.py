@@ -179,8 +179,7 @@ class BandLimitedNoise(AbstractNoise):
         return 1 / self.rate / (1 + (f / self.cutoff) ** 4)
 
     def draw(self, key: PRNGKeyArray, steps: int) -> Float[Array, "..."]:
-        flat = standard_normals(key, (steps + 1, 2 * self.channels))  # XLA draws two axes three times faster than three
-        return flat.reshape(steps + 1, 2, self.channels)
+        return standard_normals(key, (steps + 1, 2 * self.channels))
 
     def realise(self, normals: Float[Array, "..."], dt: Scalar) -> Realisation:
         omega = 2 * jnp.pi * self.cutoff
@@ -194,13 +193,15 @@ class BandLimitedNoise(AbstractNoise):
 
         def advance(state, kick):
             n, slope = state
-            new = f11 * n + f12 * slope + l11 * kick[0], f21 * n + f22 * slope + l21 * kick[0] + l22 * kick[1]
+            first, second = jnp.split(kick, 2)
+            new = f11 * n + f12 * slope + l11 * first, f21 * n + f22 * slope + l21 * first + l22 * second
             return new, new
 
         # Two outputs, so that XLA leaves the slopes out where nobody asks for them.
-        _, (n, slope) = jax.lax.scan(advance, (normals[0, 0], normals[0, 1]), normals[1:])
+        start = jnp.split(normals[0], 2)
+        _, (n, slope) = jax.lax.scan(advance, (start[0], start[1]), normals[1:])
         std = jnp.sqrt(omega / (2 * np.sqrt(2) * self.rate))
-        values, slopes = jnp.concatenate([normals[:1, 0], n]), jnp.concatenate([normals[:1, 1], slope])
+        values, slopes = jnp.concatenate([start[0][None], n]), jnp.concatenate([start[1][None], slope])
         return Realisation(values=std * values, slopes=std * omega * slopes)
 
     def shaping_filter(self) -> ShapingFilter:

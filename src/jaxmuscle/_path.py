@@ -1,12 +1,13 @@
-"""The integrator: a Brownian path on the step grid and a sub-cycled Heun solver, for diffrax."""
+"""The integrator: a task on a noise path of the step grid, and a sub-cycled Heun solver, for diffrax."""
 
 import dataclasses
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import diffrax as dfx
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from ._noise import Realisation
@@ -28,34 +29,27 @@ class Grid(eqx.Module):
     reverse: bool = eqx.field(static=True, default=True)
 
 
-class GridPath(dfx.AbstractBrownianPath):
-    """Brownian motion given by its increments on the unit grid, linear in between (so sub-steps share one path)."""
+class Interval(NamedTuple):
+    """What drives the steps of one interval: an array over its steps for every coefficient.
 
-    increments: Float[Array, "steps channels"]
-    levy_area: ClassVar[Any] = dfx.BrownianIncrement
+    Where a step starts and stops, in grid steps; the perturbation (harmonic and sampled noise) at either time; and the
+    increment of white noise in the coefficients' own units, or None.
+    """
 
-    @property
-    def t0(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
-        return 0
-
-    @property
-    def t1(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
-        return self.increments.shape[0]
-
-    def evaluate(self, t0, t1=None, left=True, use_levy=False):
-        if t1 is None or use_levy:
-            raise NotImplementedError("GridPath gives increments between two times of one step, without Lévy area")
-        return self.increments[_whole(t0, self.t1 - 1)] * (t1 - t0)
+    start: Float[Array, " cycles"]
+    stop: Float[Array, " cycles"]
+    before: tuple[Float[Array, " cycles"], ...]
+    after: tuple[Float[Array, " cycles"], ...]
+    increment: tuple[Float[Array, " cycles"], ...] | None
 
 
 class SubcycledHeun(dfx.AbstractStratonovichSolver):
-    """Heun's method, `cycles` steps of size `size` in one solver step: second order in the drift.
+    """Heun's method, all steps of a `GridTerm`'s interval in one solver step: second order in the drift.
 
-    One diffrax step per saved sample keeps saving and reverse-mode checkpoints out of the inner loop.
+    One diffrax step per saved sample keeps saving, the search for the noise and reverse-mode checkpoints out of the inner
+    loop. That carries an array for each state, which under `vmap` is one vector along the seeds.
     """
 
-    cycles: int = eqx.field(static=True)
-    size: float = eqx.field(static=True)
     term_structure: ClassVar[Any] = dfx.AbstractTerm
     interpolation_cls: ClassVar[Any] = dfx.LocalLinearInterpolation
 
@@ -72,71 +66,68 @@ class SubcycledHeun(dfx.AbstractStratonovichSolver):
         return terms.vf(t0, y0, args)
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
-        def heun(y, start):
-            stop = start + self.size
-            control = terms.contr(start, stop)
-            slope = terms.vf_prod(start, y, args, control)
-            return y + 0.5 * (slope + terms.vf_prod(stop, y + slope, args, control)), None
+        def heun(y, part):
+            slope = terms.vf_prod(part.start, y, args, (part.before, part.increment))
+            moved = tuple(a + b for a, b in zip(y, slope, strict=True))
+            again = terms.vf_prod(part.stop, moved, args, (part.after, part.increment))
+            return tuple(a + 0.5 * (b + c) for a, b, c in zip(y, slope, again, strict=True)), None
 
-        # Step numbers must be whole to find their noise, but diffrax rounds t0, a fraction of the interval; and XLA
-        # rounds a product with `size`: so whole steps and parts of a step are counted in integers.
-        dtype, parts = jnp.result_type(t0), round(1 / self.size)
-        whole, part = jnp.divmod(jnp.arange(self.cycles), parts)
-        starts = jnp.round(t0) + whole.astype(dtype) + part.astype(dtype) / parts
-        y1, _ = jax.lax.scan(heun, y0, starts)
+        states, _ = jax.lax.scan(heun, tuple(y0), terms.contr(t0, t1))
+        y1 = jnp.stack(states)
         return y1, None, {"y0": y0, "y1": y1}, None, dfx.RESULTS.successful
 
 
 class GridTerm(dfx.AbstractTerm):
-    """Drift and diffusion times increment, `f Δt + (∂f/∂u) scale ΔW`, from one linearisation of the vector field.
+    """Drift and diffusion times increment of a task on a noise path, `f Δt + (∂f/∂u) scale ΔW`, by one linearisation.
 
-    What `MultiTerm(ODETerm, ControlTerm)` gives with two evaluations. Without a path it is the drift alone.
+    What `MultiTerm(ODETerm, ControlTerm)` gives with two evaluations. Its control is the `Interval` of `every` grid steps
+    from t0 on, cut into sub-steps, which share the noise of their step: values are interpolated, increments divided.
     """
 
     task: AbstractTask
-    u: Any
-    scale: Float[Array, "4"]
-    path: GridPath | None
-    dt: float = eqx.field(static=True)
+    path: Realisation
+    grid: Grid = eqx.field(static=True)
 
     def vf(self, t, y, args):
-        return self.dt * self.task.vector_field(t * self.dt, y, self.u(t))
+        task, time = self.task, t * self.grid.dt
+        return self.grid.dt * task.vector_field(time, y, _harmonic(task)(time))
 
     def contr(self, t0, t1, **kwargs):
-        return t1 - t0, None if self.path is None else self.path.evaluate(t0, t1)
+        grid, scale = self.grid, self.task.noise_scale()
+        parts, dtype = grid.substeps, jnp.result_type(t0)
+        # diffrax rounds t0, a fraction of the run; step numbers must be whole to find their noise.
+        first = jnp.clip(jnp.round(t0).astype(int), 0, grid.steps - grid.every)
+        whole, part = np.divmod(np.arange(grid.every * parts + 1), parts)
+        points = first.astype(dtype) + jnp.asarray(whole + part / parts, dtype)
+        u = jax.vmap(_harmonic(self.task))(points * grid.dt)
+        if self.path.values is not None:
+            values = jax.lax.dynamic_slice_in_dim(self.path.values, first, grid.every + 1)
+            noise = values[whole]
+            if parts > 1:
+                after = values[np.minimum(whole + 1, grid.every)]
+                noise = noise + jnp.asarray(part / parts, dtype)[:, None] * (after - noise)
+            u = u + scale * noise
+        increment = None
+        if self.path.increments is not None:
+            kicks = jax.lax.dynamic_slice_in_dim(self.path.increments, first, grid.every)
+            increment = _columns(scale / parts * kicks[whole[:-1]])
+        return Interval(points[:-1], points[1:], _columns(u[:-1]), _columns(u[1:]), increment)
 
     def prod(self, vf, control):
         raise NotImplementedError("GridTerm offers vf_prod only")
 
     def vf_prod(self, t, y, args, control):
-        steps, increment = control
+        u, increment = control
+        y, size = jnp.stack(y), self.grid.dt / self.grid.substeps
+        field = lambda u: self.task.vector_field(t * self.grid.dt, y, u)  # noqa: E731
         if increment is None:
-            return steps * self.vf(t, y, args)
-        field = lambda u: self.task.vector_field(t * self.dt, y, u)  # noqa: E731
-        drift, diffusion = jax.jvp(field, (self.u(t),), (self.scale * increment,))
-        return steps * self.dt * drift + diffusion
+            return tuple(size * slope for slope in field(jnp.stack(u)))
+        drift, diffusion = jax.jvp(field, (jnp.stack(u),), (jnp.stack(increment),))
+        return tuple(size * a + b for a, b in zip(drift, diffusion, strict=True))
 
 
-def _whole(s: Any, last: int) -> Any:
-    return jnp.clip(jnp.floor(s).astype(int), 0, last)
-
-
-def perturbation_at(task: AbstractTask, path: Realisation, grid: Grid) -> Any:
-    """The perturbation u as a function of the step number: sampled noise (interpolated in sub-steps) and harmonic."""
-    scale, harmonic = task.noise_scale(), _harmonic(task)
-
-    def u(s):
-        rhythm = harmonic(s * grid.dt)
-        if path.values is None:
-            return rhythm
-        k = _whole(s, grid.steps)
-        noise = path.values[k]
-        if grid.substeps > 1:
-            after = path.values[jnp.minimum(k + 1, grid.steps)]
-            noise = noise + (s - k.astype(s.dtype)) * (after - noise)
-        return scale * noise + rhythm
-
-    return u
+def _columns(rows: Float[Array, "cycles coefficients"]) -> tuple[Float[Array, " cycles"], ...]:
+    return tuple(rows[:, i] for i in range(rows.shape[1]))
 
 
 def _harmonic(task: AbstractTask) -> Any:
@@ -161,13 +152,11 @@ def tabulated(task: AbstractTask, grid: Grid) -> AbstractTask:
 
 def solve(task: AbstractTask, path: Realisation, grid: Grid) -> Float[Array, "samples states"]:
     """States at every `every`-th grid point, the first included; what overflows is not finite, never an exception."""
-    brownian = None
     if path.increments is not None:
-        brownian = GridPath(jnp.broadcast_to(path.increments, (grid.steps, 4)))
-    task = tabulated(task, grid)
+        path = Realisation(increments=jnp.broadcast_to(path.increments, (grid.steps, 4)))
     solution = dfx.diffeqsolve(
-        GridTerm(task, perturbation_at(task, path, grid), task.noise_scale(), brownian, grid.dt),
-        SubcycledHeun(grid.every * grid.substeps, 1 / grid.substeps),
+        GridTerm(tabulated(task, grid), path, grid),
+        SubcycledHeun(),
         t0=0.0,
         t1=float(grid.steps),
         dt0=float(grid.every),

@@ -111,8 +111,7 @@ class PinkNoise(AbstractNoise):
         return _density((self.corners, self.shares), f)
 
     def draw(self, key: PRNGKeyArray, steps: int) -> Float[Array, "..."]:
-        flat = standard_normals(key, (steps + 1, self.corners.size * self.channels))
-        return flat.reshape(steps + 1, self.corners.size, self.channels)
+        return standard_normals(key, (steps + 1, self.corners.size * self.channels))
 
     def realise(self, normals: Float[Array, "..."], dt: Scalar) -> Realisation:
         x = jnp.asarray(2 * np.pi * self.corners, normals.dtype)[:, None] * dt
@@ -120,11 +119,12 @@ class PinkNoise(AbstractNoise):
         weights = jnp.asarray(np.sqrt(self.shares), normals.dtype)[:, None]
 
         def advance(q, normal):
-            q = keep * q + kick * normal
+            q = keep * q + kick * normal.reshape(q.shape)
             return q, jnp.sum(weights * q, axis=0)
 
-        _, later = jax.lax.scan(advance, normals[0], normals[1:])
-        return Realisation(values=jnp.concatenate([jnp.sum(weights * normals[:1], axis=1), later]))
+        start = normals[0].reshape(self.corners.size, -1)
+        _, later = jax.lax.scan(advance, start, normals[1:])
+        return Realisation(values=jnp.concatenate([jnp.sum(weights * start, axis=0)[None], later]))
 
     def shaping_filter(self) -> ShapingFilter:
         dtype = jnp.result_type(float)

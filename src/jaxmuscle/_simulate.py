@@ -187,6 +187,15 @@ def draw(noise: AbstractNoise, key: PRNGKeyArray, seeds: Int[Array, " seeds"], s
     return jax.lax.map(lambda i: noise.draw(jax.random.fold_in(key, i), steps), seeds, batch_size=DRAWN)
 
 
+def paths(noise: AbstractNoise, key: PRNGKeyArray, seeds: Int[Array, " seeds"], grid: Grid) -> Realisation:
+    """Noise paths of every seed, drawn as in `draw`."""
+
+    def one(seed):
+        return noise.realise(noise.draw(jax.random.fold_in(key, seed), grid.steps), grid.dt)
+
+    return jax.lax.map(one, seeds, batch_size=DRAWN)
+
+
 def respond(
     task: AbstractTask, path: Realisation, grid: Grid, sampling: str
 ) -> tuple[Float[Array, "samples states"], Float[Array, " samples"]]:
@@ -203,12 +212,11 @@ def respond(
 
 @eqx.filter_jit
 def _simulate_seeds(task, linear, key, seeds, grid, sampling):
-    def one(normals):
-        path = task.noise.realise(normals, grid.dt)
+    def one(path):
         beside = None if linear is None else respond(linear, path, grid, sampling)[1]
         return *respond(task, path, grid, sampling), beside
 
-    return jax.vmap(one)(draw(task.noise, key, seeds, grid.steps))
+    return jax.vmap(one)(paths(task.noise, key, seeds, grid))
 
 
 def _run(
