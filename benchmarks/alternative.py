@@ -20,10 +20,10 @@ from measure import Row, Unequal, require_equal, seconds
 
 import jaxmuscle as jm
 from jaxmuscle._expected import WINDOW, expected_moments
+from jaxmuscle._lanes import respond
 from jaxmuscle._noise import Realisation
 from jaxmuscle._parameter import DEFAULT_FREE, as_arrays
 from jaxmuscle._path import Grid
-from jaxmuscle._simulate import respond
 from jaxmuscle._uncertainty import bin_statistics, standardised, target_variation
 
 SEEDS, RATE, ROUNDS, DOUBT = 48, 100.0, 3, 0.01

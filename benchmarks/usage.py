@@ -10,9 +10,9 @@ from integration import DT, SEEDS, STEPS
 from measure import DTYPES, Row, require_equal, seconds
 
 import jaxmuscle as jm
+from jaxmuscle._lanes import draw, respond
 from jaxmuscle._parameter import DEFAULT_FREE, as_arrays
 from jaxmuscle._path import Grid
-from jaxmuscle._simulate import draw, respond
 
 GRADIENT_SEEDS = 8
 

@@ -335,12 +335,12 @@ def test_options_reach_the_fit(tmp_path, monkeypatch):
 
 
 def test_a_failing_simulation_is_not_a_users_mistake(tmp_path, monkeypatch):
-    from jaxmuscle import _simulate
+    from jaxmuscle import _ensemble
 
     def explode(*_, **__):
         raise jm.SimulationError("3 seed(s) did not stay finite [0, 1, 2]")
 
-    monkeypatch.setattr(_simulate, "ensemble", explode)
+    monkeypatch.setattr(_ensemble, "ensemble", explode)
     made_result().save(tmp_path / "fit.json")
     outcome = run("simulate", tmp_path / "fit.json", "--out", tmp_path / "out")
     assert outcome.exit_code == 1 and "failed: 3 seed(s) did not stay finite [0, 1, 2]" in outcome.stderr

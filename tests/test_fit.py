@@ -18,11 +18,11 @@ from jaxmuscle._check import AMBIGUOUS, rival_frequencies
 from jaxmuscle._derived import consequences, derived
 from jaxmuscle._descend import BATCH, Descent, _moments_and_slopes, _residuals, descend, seen_at
 from jaxmuscle._expected import Moments
+from jaxmuscle._lanes import draw
 from jaxmuscle._objective import Coordinates, MonteCarlo, welch_operator
 from jaxmuscle._parameter import DEFAULT_FREE, PARAMETERS, as_arrays
 from jaxmuscle._path import Grid
 from jaxmuscle._problem import Setup, residual_sigma
-from jaxmuscle._simulate import draw
 from jaxmuscle._starts import contenders
 from jaxmuscle._trajectory import WINDOW
 from jaxmuscle._uncertainty import bin_statistics, identifiability, target_variation, undetermined_directions

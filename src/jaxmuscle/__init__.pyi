@@ -13,6 +13,8 @@ from ._compare import compare_noise as compare_noise
 from ._comparison import ComparedModel as ComparedModel
 from ._comparison import Comparison as Comparison
 from ._comparison import Decision as Decision
+from ._ensemble import ensemble as ensemble
+from ._ensemble_summary import EnsembleSummary as EnsembleSummary
 from ._estimate import SpectrumEstimate as SpectrumEstimate
 from ._expected import expected_spectrum as expected_spectrum
 from ._fit import FitInterrupted as FitInterrupted
@@ -77,7 +79,6 @@ from ._signal import RampHold as RampHold
 from ._signal import Sampled as Sampled
 from ._signal import SmoothStep as SmoothStep
 from ._simulate import SimulationError as SimulationError
-from ._simulate import ensemble as ensemble
 from ._simulate import simulate as simulate
 from ._spectrum import Spectrum as Spectrum
 from ._spectrum import SpectrumSettings as SpectrumSettings
@@ -87,6 +88,8 @@ from ._spectrum import spectrum_of as spectrum_of
 from ._spectrum import welch as welch
 from ._static import StaticCharacteristics as StaticCharacteristics
 from ._static import static_characteristics as static_characteristics
+from ._sweep import Population as Population
+from ._sweep import Sweep as Sweep
 from ._target import Target as Target
 from ._target import load_target as load_target
 from ._task import AbstractTask as AbstractTask

@@ -7,13 +7,14 @@ from typing import Any
 import jax
 import numpy as np
 
+from ._ensemble import ensemble
 from ._likelihood import Likelihood
 from ._linear import settled
 from ._operating import slowest_rate
 from ._parameter import as_arrays, as_numbers
 from ._problem import Setup
 from ._replicate import drawn_spectra, repeated
-from ._simulate import SimulationError, ensemble
+from ._simulate import SimulationError
 from ._target import Target
 from ._task import AbstractTask
 from ._uncertainty import target_variation

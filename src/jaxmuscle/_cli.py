@@ -10,6 +10,7 @@ from rich.table import Table
 from ._bundled import describe_presets, describe_targets
 from ._cli_analyse import analyse
 from ._cli_compare import compare
+from ._cli_ensemble import ensemble, speed
 from ._cli_fit import fit
 from ._cli_posterior import posterior
 from ._cli_reproduce import reproduce
@@ -25,10 +26,12 @@ app = typer.Typer(
 )
 app.command()(fit)
 app.command()(simulate)
+app.command()(ensemble)
 app.command()(analyse)
 app.command()(posterior)
 app.command()(compare)
 app.command()(reproduce)
+app.command()(speed)
 
 
 @app.command()

@@ -46,8 +46,8 @@ def _simulate(model: "AbstractTask", seeds: int, seed: int, folder: Path) -> Non
     import numpy as np
 
     from . import plot
+    from ._ensemble import ensemble
     from ._metrics import peaks
-    from ._simulate import ensemble
     from ._store import replacing, write_text
 
     runs = ensemble(model, jax.random.key(seed), seeds=seeds, progress=err.is_terminal)

@@ -72,9 +72,17 @@ def estimated(
         error = rows.std(axis=0, ddof=1) / np.sqrt(count) if count > 1 else np.full(rows.shape[1], np.nan)
         return rows.mean(axis=0), error
 
-    mean, error = summary(plain)
-    power, stderr = mean, error
-    if beside is not None and expected is not None:
-        difference, stderr = summary(plain - beside)
-        power = expected + difference
-    return SpectrumEstimate(settings.frequency, power, stderr, mean, error, expected, count, settings, unit)
+    control = None if beside is None or expected is None else (*summary(plain - beside), expected)
+    return from_moments(summary(plain), control, count, settings, unit)
+
+
+def from_moments(
+    plain: tuple[Bins, Bins], control: tuple[Bins, Bins, Bins] | None, seeds: int, settings: SpectrumSettings, unit: str
+) -> SpectrumEstimate:
+    """From means and standard errors: of the Welch power, and of what the linearised task leaves of it, whose exact
+    expectation is the third of `control`."""
+    mean, error = plain
+    if control is None:
+        return SpectrumEstimate(settings.frequency, mean, error, mean, error, None, seeds, settings, unit)
+    difference, stderr, expected = control
+    return SpectrumEstimate(settings.frequency, expected + difference, stderr, mean, error, expected, seeds, settings, unit)

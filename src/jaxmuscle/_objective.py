@@ -11,12 +11,12 @@ from jaxtyping import Array, Float
 from scipy.special import expit
 
 from ._expected import Moments, expected_moments, response
+from ._lanes import respond
 from ._law import Scalar
 from ._linear import LinearTask, settled
 from ._noise import Realisation
 from ._parameter import PARAMETERS, Parameter, set_parameters
 from ._path import Grid
-from ._simulate import respond
 from ._spectrum import SpectrumSettings
 from ._task import AbstractTask
 

@@ -8,6 +8,7 @@ import optimistix as optx
 from jaxtyping import Array, Float
 
 from ._parameter import as_arrays
+from ._signal import AbstractSignal
 from ._task import AbstractTask
 
 HOLD = 15.0
@@ -39,6 +40,9 @@ def equilibrium(task: AbstractTask, time: float = HOLD) -> Float[Array, " states
     # cannot keep: the same derivative without it.
     # Off the origin, where the literal equation (2) has no stiffness and Newton's method no direction.
     start = task.initial_state() + GUESS
+    held = getattr(task, "x_z", None)
+    if task.initial is None and held is not None:
+        start = start.at[0].add(held(jnp.asarray(time, dtype)) if isinstance(held, AbstractSignal) else held)
     # In units of the state, so that one tolerance suits accelerations and displacements in either precision.
     slope = jnp.sum(jnp.abs(jax.lax.stop_gradient(jax.jacfwd(field)(start))), axis=1)
     scale = jnp.where((slope > 0) & jnp.isfinite(slope), slope, 1.0)

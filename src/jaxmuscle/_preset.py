@@ -23,6 +23,7 @@ _KINDS: dict[str, type] = {
     for kind in vars(module).values()
     if isinstance(kind, type) and issubclass(kind, eqx.Module) and not kind.__name__.startswith("Abstract")
 }
+_BASES = (_muscle.AbstractMuscle, _law.AbstractLaw, _noise.AbstractNoise, _signal.AbstractSignal)
 _NAMES = {kind: name for name, kind in TASKS.items()}
 
 
@@ -33,6 +34,15 @@ class PresetError(ValueError):
 def task_to_table(task: AbstractTask) -> dict[str, Any]:
     """A task as nested tables of numbers and strings. Raises `PresetError` for a class that is not jaxmuscle's."""
     return {"task": _NAMES[type(task)]} | _fields_to_table(as_numbers(task)) if type(task) in _NAMES else _refuse(task)
+
+
+def _known() -> dict[str, type]:
+    """Classes by name: jaxmuscle's, and those of the user's that have been imported."""
+    return {kind.__name__: kind for base in _BASES for kind in _below(base)} | _KINDS
+
+
+def _below(kind: type) -> list[type]:
+    return [each for child in kind.__subclasses__() for each in (child, *_below(child))]
 
 
 def _refuse(value: Any) -> dict[str, Any]:
@@ -50,7 +60,7 @@ def _to_table(value: Any) -> Any:
     if isinstance(value, SpectrumSettings):
         return value.to_dict()
     if isinstance(value, eqx.Module):
-        if _KINDS.get(type(value).__name__) is not type(value):
+        if _known().get(type(value).__name__) is not type(value):
             _refuse(value)
         return {"type": type(value).__name__} | _fields_to_table(value)
     if isinstance(value, np.ndarray):
@@ -99,9 +109,12 @@ def _from_table(key: str, value: Any, where: str) -> Any:
         return SpectrumSettings.from_dict(value)
     if isinstance(value, dict):
         kind = value.get("type")
-        if kind not in _KINDS:
-            raise PresetError(f"{where}.type = {kind!r}: {choices(str(kind), _KINDS)}")
-        return _build(_KINDS[kind], {k: v for k, v in value.items() if k != "type"}, where)
+        known = _known()
+        if kind not in known:
+            raise PresetError(
+                f"{where}.type = {kind!r}: {choices(str(kind), known)}; a class of your own must be imported first"
+            )
+        return _build(known[kind], {k: v for k, v in value.items() if k != "type"}, where)
     if isinstance(value, list):
         return tuple(value) if key == "initial" else np.array(value, dtype=float)
     return value

@@ -11,12 +11,13 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ._expected import Moments
+from ._lanes import draw
 from ._law import Scalar
 from ._objective import Coordinates, Linear, MonteCarlo, at
 from ._operating import fastest_rate
 from ._parameter import as_arrays
 from ._path import Grid
-from ._simulate import DURATION, MAX_RATE_STEP, draw, whole
+from ._simulate import DURATION, MAX_RATE_STEP, whole
 from ._target import Target
 from ._task import AbstractTask
 from ._trajectory import WINDOW

@@ -26,6 +26,7 @@ from ._derived import (
     without_error,
 )
 from ._descend import SMALL, Descent
+from ._ensemble import ensemble
 from ._expected import Moments
 from ._harmonic_test import harmonic_test
 from ._linear import settled
@@ -33,7 +34,7 @@ from ._objective import MonteCarlo
 from ._parameter import as_arrays, as_numbers
 from ._problem import Problem, Setup
 from ._result import Estimate, FitResult, Start
-from ._simulate import SimulationError, ensemble
+from ._simulate import SimulationError
 from ._trajectory import WINDOW, versions
 from ._uncertainty import (
     Identifiability,

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from ._ensemble import ensemble
 from ._expected import WINDOW, expected_moments, response
 from ._metrics import approximate_entropy, peaks, spearman
 from ._noise import OrnsteinUhlenbeckNoise
@@ -20,7 +21,6 @@ from ._preset import load_preset
 from ._recording import RECORDED, Recording
 from ._reproduce_readings import HIGH_BIN, LOW_BIN, Reading, fast_share, pulled, readings
 from ._scaling import at_level
-from ._simulate import ensemble
 from ._spectrum import Spectrum, lowpass
 from ._task import AbstractTask, Isometric, PrescribedForce
 from ._trajectory import Trajectory, stack

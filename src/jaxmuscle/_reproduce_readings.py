@@ -5,6 +5,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
+from ._ensemble import ensemble
 from ._expected import WINDOW, expected_moments
 from ._harmonic import Harmonic
 from ._metrics import peaks
@@ -12,7 +13,6 @@ from ._muscle import Muscle
 from ._noise import BandLimitedNoise
 from ._parameter import CHANNELS, as_arrays
 from ._signal import Sampled
-from ._simulate import ensemble
 from ._spectrum import Spectrum, SpectrumSettings
 from ._task import AbstractTask, Isometric, PrescribedForce, PrescribedMotion
 

@@ -9,13 +9,14 @@ from jaxtyping import Float
 
 from ._check import Stage, controlled_moments, seen_best
 from ._descend import BATCH, Descent, descend
+from ._ensemble import ensemble
 from ._expected import Moments
 from ._linear import settled
 from ._parameter import as_arrays, as_numbers
 from ._problem import Problem, Setup
 from ._report import report_fit
 from ._result import FitResult
-from ._simulate import SimulationError, ensemble
+from ._simulate import SimulationError
 from ._starts import contenders, starting_points
 from ._trajectory import WINDOW
 

@@ -314,7 +314,7 @@ def periodogram(
 
 
 @eqx.filter_jit
-def _filtered_power(signal: Any, settings: SpectrumSettings, edges: tuple[int, int] | None) -> Float[Array, "*batch bins"]:
+def filtered_power(signal: Any, settings: SpectrumSettings, edges: tuple[int, int] | None) -> Float[Array, "*batch bins"]:
     filtered = lowpass(signal, settings)
     return welch(filtered if edges is None else filtered[..., edges[0] : edges[1]], settings)
 
@@ -343,5 +343,5 @@ def spectrum_of(
         remedy = f"give 0 <= start < stop <= {samples / settings.rate:g} s, the duration of the signal"
         require(0 <= start < stop <= samples, "window", window, remedy)
         edges = (start, stop)
-    power = _filtered_power(signal, settings, edges)
+    power = filtered_power(signal, settings, edges)
     return Spectrum(jnp.asarray(settings.frequency, power.dtype), power, settings, unit)

@@ -178,6 +178,29 @@ def trajectory(
     return ax
 
 
+@styled
+def moments(summary: Any, ax: Axes | None = None, point: int = 0) -> Axes:
+    """Draws the mean of a reduced ensemble over time, and the bands between its outer quantiles.
+
+    **Arguments:** `summary`, an `EnsembleSummary`; `ax`, or a new figure; `point` of a sweep. **Returns:** the axes.
+    """
+    ax = _axes(ax)
+    swept = summary.mean.ndim == 2
+    mean, quantile = (summary.mean[point], summary.quantile[point]) if swept else (summary.mean, summary.quantile)
+    (line,) = ax.plot(summary.time, mean, lw=1.2, label=f"Mean of {summary.seeds} seeds")
+    levels = summary.levels
+    for low in range(len(levels) // 2):
+        high = len(levels) - 1 - low
+        share = f"{100 * levels[low]:g} to {100 * levels[high]:g} %"
+        ax.fill_between(summary.time, quantile[low], quantile[high], color=line.get_color(), alpha=0.18, lw=0, label=share)
+    ax.set_xlabel("Time (s)")
+    first = summary.task[0] if swept else summary.task
+    ax.set_ylabel(output_label(first.output_name, first.output_unit))
+    ax.margins(x=0)
+    legend(ax, "above")
+    return ax
+
+
 def fit(result: Any) -> Figure:
     """Draws what a fit found: spectra linear and logarithmic, residuals, simulated output and parameters.
 

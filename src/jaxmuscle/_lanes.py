@@ -1,0 +1,119 @@
+"""One chunk of an ensemble: the compiled program for some points and seeds, shared by the devices of this process."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import Mesh
+from jax.sharding import PartitionSpec as P
+from jaxtyping import Array, Int, PRNGKeyArray
+
+from ._noise import AbstractNoise, Realisation
+from ._path import Grid, observe, solve
+from ._spectrum import SpectrumSettings, filtered_power
+from ._task import AbstractTask
+
+DRAWN = 8
+
+
+class Recipe(eqx.Module):
+    """What is computed of every seed: on which grid, sampled how, with or without states, and the Welch power over `edges`.
+
+    `every` is the ratio of the run's rate to the spectrum's; `edges` [samples] are None where no spectrum is asked for.
+    """
+
+    grid: Grid
+    sampling: str = eqx.field(static=True)
+    states: bool = eqx.field(static=True)
+    settings: SpectrumSettings
+    every: int = eqx.field(static=True, default=1)
+    edges: tuple[int, int] | None = eqx.field(static=True, default=None)
+
+
+def local_mesh() -> Mesh | None:
+    """The devices of this process as one axis; None if there is one."""
+    devices = jax.local_devices()
+    return Mesh(np.array(devices), ("lanes",)) if len(devices) > 1 else None
+
+
+def draw(noise: AbstractNoise, key: PRNGKeyArray, seeds: Int[Array, " seeds"], steps: int) -> Any:
+    """Normals of every seed; seed i depends on nothing but the key and i. Few at a time, which stay in the cache."""
+    return jax.lax.map(lambda i: noise.draw(jax.random.fold_in(key, i), steps), seeds, batch_size=DRAWN)
+
+
+def _paths(noise: AbstractNoise, key: PRNGKeyArray, seeds: Int[Array, " seeds"], grid: Grid) -> Realisation:
+    """Noise paths of every seed, drawn as in `draw`."""
+
+    def one(seed):
+        return noise.realise(noise.draw(jax.random.fold_in(key, seed), grid.steps), grid.dt)
+
+    return jax.lax.map(one, seeds, batch_size=DRAWN)
+
+
+def respond(task: AbstractTask, path: Realisation, grid: Grid, sampling: str) -> tuple[Array, Array]:
+    """States (samples, states) and sampled output (samples) of one noise path."""
+    if sampling == "instant":
+        states = solve(task, path, grid)
+        return states, observe(task, path, grid, states)
+    fine = Grid(grid.dt, grid.steps, 1, grid.substeps, grid.reverse)
+    states = solve(task, path, fine)
+    output = observe(task, path, fine, states)
+    mean = jnp.mean(0.5 * (output[1:] + output[:-1]).reshape(-1, grid.every), axis=1)
+    return states[:: grid.every], jnp.concatenate([output[:1], mean])
+
+
+def _responses(task: AbstractTask, linear: Any, path: Realisation, recipe: Recipe) -> dict[str, Any]:
+    """Of all paths along a leading axis of seeds."""
+
+    def one(path):
+        states, output = respond(task, path, recipe.grid, recipe.sampling)
+        finite = jnp.all(jnp.isfinite(output)) & jnp.all(jnp.isfinite(states))
+        beside = None if linear is None else respond(linear, path, recipe.grid, recipe.sampling)[1]
+        return {"output": output, "finite": finite, "linear": beside, "states": states if recipe.states else None}
+
+    found = jax.vmap(one)(path)
+    if recipe.edges is not None:
+        found["power"] = _power(found["output"], recipe)
+        found["linear_power"] = None if linear is None else _power(found["linear"], recipe)
+    return found
+
+
+def _power(output: Array, recipe: Recipe) -> Array:
+    return filtered_power(output[:, :: recipe.every], recipe.settings, recipe.edges)
+
+
+@eqx.filter_jit
+def run_seeds(task: Any, linear: Any, key: Any, seeds: Any, recipe: Recipe, mesh: Mesh | None) -> dict[str, Any]:
+    """Output, finiteness and what else the recipe asks for, of one task and every seed."""
+
+    def local(arrays, seeds):
+        task, linear, key = eqx.combine(arrays, rest)
+        return _responses(task, linear, _paths(task.noise, key, seeds, recipe.grid), recipe)
+
+    arrays, rest = eqx.partition((task, linear, key), eqx.is_array)
+    return _shared(local, mesh, (P(), P("lanes")))(arrays, seeds)
+
+
+@eqx.filter_jit
+def run_points(tasks: Any, linears: Any, key: Any, seeds: Any, recipe: Recipe, mesh: Mesh | None) -> dict[str, Any]:
+    """The same for every task along a leading axis of points; all of them get the same normals."""
+
+    def local(moving, key, seeds):
+        def one(moving):
+            task, linear = eqx.combine(moving, rest)
+            return _responses(task, linear, jax.vmap(lambda z: task.noise.realise(z, recipe.grid.dt))(normals), recipe)
+
+        normals = draw(eqx.combine(jax.tree.map(lambda x: x[0], moving), rest)[0].noise, key, seeds, recipe.grid.steps)
+        return jax.vmap(one)(moving)
+
+    moving, rest = eqx.partition((tasks, linears), eqx.is_array)
+    return _shared(local, mesh, (P("lanes"), P(), P()))(moving, key, seeds)
+
+
+def _shared(local: Any, mesh: Mesh | None, specs: tuple) -> Any:
+    """Every device of the mesh does its part of the lanes, without talking to the others."""
+    if mesh is None:
+        return local
+    return jax.shard_map(local, mesh=mesh, in_specs=specs, out_specs=P("lanes"), check_vma=False)

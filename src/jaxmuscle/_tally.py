@@ -1,0 +1,105 @@
+"""Moments and quantiles of an ensemble that never is in memory: tallies of chunks, which merge in any order."""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+LEVELS = (0.05, 0.25, 0.5, 0.75, 0.95)
+CELLS = 512
+REACH = 8.0  # standard deviations of the first chunk
+
+
+class Tally(NamedTuple):
+    """What is known of every point of a sweep (a leading axis, 1 long for one task).
+
+    `seeds` that were finite; `mean` and `squares` (sums of squared deviations) of the values of a seed in a row: its output
+    over time, then what else is averaged. Quantiles of the output are `exact` where all seeds of a point came together;
+    else its values are counted in `cells` between `low` and `high` of every sample (the outermost ones open), and NaN where
+    no chunk of the point was seen.
+    """
+
+    seeds: Int[np.ndarray, " points"]
+    mean: Float[np.ndarray, "points values"]
+    squares: Float[np.ndarray, "points values"]
+    exact: Float[np.ndarray, "points levels samples"]
+    low: Float[np.ndarray, "points samples"]
+    high: Float[np.ndarray, "points samples"]
+    cells: Int[np.ndarray, "points samples cells"]
+
+
+def empty(points: int, values: int, samples: int, levels: int, *, whole: bool) -> Tally:
+    """Of nothing; `whole` if every point comes in one piece, so that nothing has to be counted in cells."""
+    rows, cells = np.zeros((points, values)), 0 if whole else CELLS
+    unknown = np.full((points, samples), np.nan)
+    exact = np.full((points, levels, samples), np.nan)
+    return Tally(np.zeros(points, int), rows, rows.copy(), exact, unknown, unknown.copy(),
+                 np.zeros((points, samples, cells), np.int32))  # fmt: skip
+
+
+def add(tally: Tally, point: int, rows: Float[np.ndarray, "seeds values"]) -> None:
+    """Take the finite seeds of a chunk of one point into the tally, in place."""
+    if len(rows):
+        mean = rows.mean(axis=0, dtype=float)
+        squares = np.square(rows - mean).sum(axis=0)
+        moments = _merged((tally.seeds[point], tally.mean[point], tally.squares[point]), (len(rows), mean, squares))
+        tally.seeds[point], tally.mean[point], tally.squares[point] = moments
+
+
+def _merged(a: tuple, b: tuple) -> tuple:
+    """Moments of two sets together (Chan, Golub & LeVeque 1983, doi:10.1080/00031305.1983.10483115)."""
+    count = a[0] + b[0]
+    share = b[0] / np.maximum(count, 1)
+    delta = b[1] - a[1]
+    return count, a[1] + share * delta, a[2] + b[2] + delta**2 * (share * a[0])
+
+
+def set_cells(tally: Tally, point: int, output: Float[np.ndarray, "seeds samples"]) -> None:
+    """Where the cells of a point lie, from the output of its first chunk."""
+    mean, sd = output.mean(axis=0, dtype=float), output.std(axis=0, dtype=float)
+    tiny = 1e-6 * np.abs(mean) + np.finfo(output.dtype).tiny  # what does not vary has its value for a quantile
+    reach = np.maximum(REACH * sd, 2 * np.abs(output - mean).max(axis=0)) + tiny
+    tally.low[point], tally.high[point] = mean - reach, mean + reach
+
+
+def count_cells(tally: Tally, point: int, output: Float[np.ndarray, "seeds samples"]) -> None:
+    """Count the output of a chunk in the cells of its point."""
+    low, high = tally.low[point], tally.high[point]
+    cell = np.floor((output - low) * (CELLS / (high - low)))
+    cell = np.clip(cell, 0, CELLS - 1).astype(np.int64) + CELLS * np.arange(output.shape[1])
+    tally.cells[point] += np.bincount(cell.ravel(), minlength=tally.cells[point].size).reshape(-1, CELLS).astype(np.int32)
+
+
+def merged(first: Tally, second: Tally) -> Tally:
+    """Both together; they must not share a chunk."""
+    a, b = ((t.seeds[:, None], t.mean, t.squares) for t in (first, second))
+    count, mean, squares = _merged(a, b)
+    exact, low, high = (np.where(np.isnan(x), y, x) for x, y in zip(first[3:6], second[3:6], strict=True))
+    return Tally(count[:, 0], mean, squares, exact, low, high, first.cells + second.cells)
+
+
+def quantiles(tally: Tally, levels: tuple[float, ...]) -> Float[np.ndarray, "points levels samples"]:
+    """Quantiles of the output: exact, or linear within their cell (1/32 of a standard deviation); NaN in an open cell."""
+    found = tally.exact.copy()
+    for point in np.flatnonzero(np.isnan(found).all(axis=(1, 2)) & (tally.seeds > 0)):
+        low, high, cells = tally.low[point], tally.high[point], tally.cells[point]
+        if cells.size:
+            for i, level in enumerate(levels):
+                found[point, i] = _quantile(low, (high - low) / CELLS, cells, level)
+    return found
+
+
+def _quantile(
+    low: Float[np.ndarray, " samples"],
+    width: Float[np.ndarray, " samples"],
+    cells: Int[np.ndarray, "samples cells"],
+    level: float,
+) -> Float[np.ndarray, " samples"]:
+    wanted = level * cells.sum(axis=1)
+    upto = np.cumsum(cells, axis=1)
+    cell = np.minimum((upto < wanted[:, None]).sum(axis=1), CELLS - 1)
+    rows = np.arange(len(cells))
+    inside = np.maximum(cells[rows, cell], 1)
+    place = cell + (wanted - upto[rows, cell] + cells[rows, cell]) / inside
+    closed: Bool[np.ndarray, " samples"] = (cell > 0) & (cell < CELLS - 1)
+    return np.where(closed, low + width * place, np.nan)

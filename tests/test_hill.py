@@ -1,0 +1,417 @@
+"""A muscle from outside the package, docs/hill_muscle.py: its curves, its mechanics, and all that jaxmuscle does with it."""
+
+import importlib.util
+import re
+import sys
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import references
+import scipy.optimize
+
+import jaxmuscle as jm
+
+DOCS = Path(__file__).parents[1] / "docs"
+KEY = jax.random.key(7)
+STILL = np.zeros(4)
+
+
+def _load(path):
+    spec = importlib.util.spec_from_file_location(path.stem, path)
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[path.stem] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+hill = _load(DOCS / "hill_muscle.py")
+HillMuscle = hill.HillMuscle
+
+
+# --- the same muscle in NumPy, from the equations of docs/own-muscle.md with angles instead of cosines
+
+
+def numpy_values(muscle):
+    return {name: float(value) for name, value in jm.Isometric(muscle=muscle).parameters.items()}
+
+
+def numpy_velocity(v):
+    """Hill's (f + A) (A - v) = A (1 + A) for shortening; f = 1 + 0.4 e w / (1 + e w), e = 12.5, w = v + 16.5 v²."""
+    w = 12.5 * (v + 16.5 * v**2)
+    return np.where(v < 0, 0.25 * 1.25 / (0.25 - v) - 0.25, 1 + 0.4 * w / (1 + w))
+
+
+def numpy_belly(p, x_w, v_w):
+    height, along = p["optimal_length"] * np.sin(p["pennation"]), p["optimal_length"] * np.cos(p["pennation"]) - x_w
+    angle, length = np.arctan2(height, along), np.hypot(height, along) / p["optimal_length"]
+    velocity = numpy_velocity(-v_w * np.cos(angle) / (p["velocity_max"] * p["optimal_length"]))
+    active = p["activation"] * np.exp(-((length - 1) ** 2) / 0.45) * velocity
+    passive = (np.exp(5 * (length - 1) / 0.6) - 1) / (np.exp(5) - 1)
+    return p["force_max"] * (active + passive) * np.cos(angle)
+
+
+def numpy_tendon(p, stretch):
+    slope, s = 1.712, 0.09
+    eta = stretch / (p["tendon_strain"] * p["slack_length"])
+    q = scipy.optimize.brentq(lambda q: slope * s * np.log((1 + q * np.exp(1 / s)) / (1 + q)) - 1, 1e-6, 1.0, xtol=1e-15)
+    return p["force_max"] * slope * s * np.log((1 + q * np.exp(eta / s)) / (1 + q))
+
+
+def numpy_forces(p, x_w, v_w, x_z, v_z, u=STILL):
+    """Active and passive force."""
+    held = p["activation"] * p["force_max"] * np.cos(p["pennation"])
+    active = held - numpy_belly(p, x_w, v_w) + u[0] * x_w + u[2] * v_w
+    passive = (p["tendon_damping"] + u[3]) * (v_z - v_w) + u[1] * (x_z - x_w) - numpy_tendon(p, x_w - x_z)
+    return active, passive
+
+
+OTHERS = {"default": {}, "parallel": {"pennation": 0.0}, "large": {"pennation": 0.4, "activation": 0.6, "slack_length": 0.1}}
+
+
+@pytest.fixture(params=OTHERS.values(), ids=list(OTHERS))
+def muscle(request, x64):
+    return HillMuscle(**request.param)
+
+
+# --- curves
+
+
+def test_shortening_is_hills_hyperbola(x64):
+    v = np.linspace(-1, 0, 101)
+    f = np.asarray(hill.force_velocity(v))
+    np.testing.assert_allclose((f + 0.25) * (0.25 - v), 0.25 * 1.25, rtol=1e-14)
+    assert abs(f[0]) < 1e-15 and f[-1] == 1.0
+    # Hill's maximum of power for A = 0.25 is at √(A² + A) - A of the fastest shortening.
+    fine = np.linspace(-1, 0, 100001)
+    best = fine[np.argmax(-fine * np.asarray(hill.force_velocity(fine)))]
+    assert best == pytest.approx(0.25 - np.sqrt(0.25**2 + 0.25), abs=1e-5)
+
+
+def test_lengthening_rises_to_its_plateau(x64):
+    v = np.linspace(-2, 5, 2001)
+    f = np.asarray(hill.force_velocity(v))
+    assert np.all(np.diff(f) > 0) and f[-1] < 1.4
+    # 1.4 - f = 0.4 / (1 + e w), w = ν + 16.5 ν²
+    np.testing.assert_allclose(hill.force_velocity(100.0), 1.4 - 0.4 / (1 + 12.5 * (100 + 16.5e4)), rtol=1e-12)
+    np.testing.assert_allclose(f, numpy_velocity(v), rtol=1e-12, atol=1e-15)
+
+
+def test_force_velocity_is_smooth_at_rest(x64):
+    f, h = lambda v: float(hill.force_velocity(jnp.asarray(v))), 1e-5
+    slopes = [(f(0.0) - f(-h)) / h, (f(h) - f(0.0)) / h]
+    bends = [(f(0.0) - 2 * f(-h) + f(-2 * h)) / h**2, (f(2 * h) - 2 * f(h) + f(0.0)) / h**2]
+    # One-sided differences miss curvature · h / 2 and third derivative (480 and -7690) · h; rounding 4e-16 / h².
+    np.testing.assert_allclose(slopes, 5.0, atol=25 * h)
+    np.testing.assert_allclose(bends, 40.0, atol=8e3 * h)
+    for v in (0.0, -1e-13, 1e-13):
+        assert jax.grad(hill.force_velocity)(v) == pytest.approx(5.0, rel=1e-10)
+        assert jax.grad(jax.grad(hill.force_velocity))(v) == pytest.approx(40.0, rel=1e-8)
+
+
+def test_force_length_passive_and_tendon_pass_through_what_is_published(x64):
+    np.testing.assert_allclose(hill.force_length(np.array([0.5, 1.0, 1.5])), np.exp([-0.25 / 0.45, 0, -0.25 / 0.45]))
+    np.testing.assert_allclose(hill.passive_length(np.array([1.0, 1.6])), [0.0, 1.0], atol=1e-15)
+    np.testing.assert_allclose(hill.tendon(np.array([0.0, 1.0])), [0.0, 1.0], atol=1e-14)
+    assert jax.grad(hill.tendon)(3.0) == pytest.approx(1.712, rel=1e-6)
+    eta = np.linspace(-0.3, 1.5, 1801)
+    difference = np.abs(np.asarray(hill.tendon(eta)) - hill.thelen_tendon(eta))
+    assert 0.02 < difference.max() < 0.023
+    assert np.all(np.diff(hill.tendon(eta)) > 0) and hill.tendon(-10.0) > -0.0016
+    force = np.linspace(0.0, 1.2, 25)
+    np.testing.assert_allclose(hill.tendon(hill.tendon_strain(force)), force, atol=1e-12)
+
+
+def test_the_passive_curves_are_smooth(x64):
+    h = 1e-5
+    for curve in (hill.force_length, hill.passive_length, hill.tendon):
+        for q in np.linspace(-0.2, 1.6, 19):
+            slope = (curve(q + h) - curve(q - h)) / (2 * h)
+            bend = (curve(q + h) - 2 * curve(q) + curve(q - h)) / h**2
+            # Central differences: fourth derivatives are below 4e3 (the toe: 1.7/0.09³), rounding 1e-15 / h².
+            np.testing.assert_allclose(jax.grad(curve)(q), slope, rtol=1e-7, atol=1e-7)
+            np.testing.assert_allclose(jax.grad(jax.grad(curve))(q), bend, rtol=1e-5, atol=1e-4)
+
+
+# --- mechanics
+
+
+def test_forces_are_the_equations(muscle):
+    p, rng = numpy_values(muscle), np.random.default_rng(2)
+    for _ in range(20):
+        y, u = rng.normal(size=4) * [0.006, 0.05, 0.005, 0.05], rng.normal(size=4) * [40, 40, 5, 1]
+        active, passive = numpy_forces(p, *y, u)
+        np.testing.assert_allclose(muscle.active_force(y[0], y[1], u), active, rtol=1e-10, atol=1e-12)
+        np.testing.assert_allclose(muscle.passive_force(*y, u), passive, rtol=1e-10, atol=1e-12)
+        v_w = muscle.contraction_velocity(y[0], y[2], y[3], 3.0 * y[1], u)
+        np.testing.assert_allclose(muscle.passive_force(y[0], v_w, y[2], y[3], u), 3.0 * y[1], rtol=1e-10, atol=1e-10)
+
+
+def test_at_rest_nothing_pulls_and_shortening_lowers_the_force(muscle):
+    zero = jnp.zeros(())
+    assert abs(muscle.active_force(zero, zero, STILL)) < 1e-14 * muscle.force_max
+    assert abs(muscle.passive_force(zero, zero, zero, zero, STILL)) < 1e-14 * muscle.force_max
+    x, v = np.linspace(0.0, 0.01, 21), np.linspace(-0.2, 0.2, 21)
+    against_length = np.asarray(muscle.active_force(x, 0.0, STILL))
+    assert np.all(np.diff(against_length) > 0)  # the ascending limb: shorter is weaker
+    assert np.all(np.diff(np.asarray(muscle.active_force(0.0, v, STILL))) > 0)  # faster is weaker
+    pull = -np.asarray(muscle.passive_force(x, 0.0, 0.0, 0.0, STILL))
+    assert np.all(np.diff(pull) > 0)  # the belly's shortening stretches the tendon
+
+
+def test_the_base_coefficients_are_those_of_small_motions(muscle):
+    task = hill.at_activation(jm.Isometric(muscle=muscle), muscle.activation)
+    K_w, K_z, C_w, C_z = np.asarray(muscle.base())
+    x = float(jm.equilibrium(task)[0])
+    assert float(muscle.shortening()) == pytest.approx(x, rel=1e-10)
+    A = np.asarray(jax.jacfwd(lambda y: task.vector_field(15.0, y, jnp.zeros(4)))(jnp.array([x, 0.0])))
+    np.testing.assert_allclose(A[1] * muscle.m_w, [-(K_w + K_z), -(C_w + C_z)], rtol=1e-9)
+    p, h = numpy_values(muscle), 1e-6
+    ahead, behind = (numpy_forces(p, x + s, 0.0, 0.0, 0.0) for s in (h, -h))
+    np.testing.assert_allclose([K_w, -K_z], (np.array(ahead) - behind) / (2 * h), rtol=1e-5)
+    # C_w0 = a F_max f_L cos² α (1 + 1/A) / (v_max ℓ₀)
+    length, cosine = muscle.fibre(x)
+    share = 5 * muscle.activation * np.exp(-((length - 1) ** 2) / 0.45) * cosine**2
+    np.testing.assert_allclose(C_w, share * muscle.force_max / (muscle.velocity_max * muscle.optimal_length), rtol=1e-10)
+    assert C_z == muscle.tendon_damping and min(K_w, K_z, C_w) > 0
+
+
+@pytest.mark.parametrize("x_z", [-0.003, 0.0, 0.005, 0.008])
+def test_held_the_belly_and_the_tendon_balance(muscle, x_z):
+    task = hill.at_activation(jm.Isometric(muscle=muscle, x_z=x_z), muscle.activation)
+    p = numpy_values(muscle)
+    root = scipy.optimize.root(lambda x: numpy_tendon(p, x - x_z) - numpy_belly(p, x, 0.0), x_z + 1e-3, tol=1e-10)
+    assert root.success and abs(root.fun[0]) < 1e-9 * p["force_max"]
+    y = jm.equilibrium(task)
+    np.testing.assert_allclose(y, [root.x[0], 0.0], rtol=1e-8, atol=1e-12)
+    force = task.output(15.0, y, jnp.zeros(4), jnp.zeros(4))
+    np.testing.assert_allclose(force, numpy_tendon(p, root.x[0] - x_z), rtol=1e-8)
+
+
+@pytest.mark.parametrize("share", [0.75, 0.95])
+def test_under_a_load_the_belly_finds_the_length_that_carries_it(muscle, share):
+    p = numpy_values(muscle)
+    held = float(muscle.held_force)
+    task = hill.at_activation(jm.PrescribedForce(held, share * held, muscle=muscle), muscle.activation)
+    balance = lambda x: numpy_belly(p, x, 0.0) - share * held  # noqa: E731
+    x_w = scipy.optimize.brentq(balance, 0.0, 0.6 * p["optimal_length"], xtol=1e-14)
+    stretch = scipy.optimize.brentq(lambda e: numpy_tendon(p, e) - share * held, 0.0, 0.1, xtol=1e-15)
+    np.testing.assert_allclose(jm.equilibrium(task), [x_w, 0.0, x_w - stretch, 0.0], rtol=1e-7, atol=1e-11)
+
+
+def test_a_muscle_that_cannot_be_is_refused():
+    for name in ("force_max", "optimal_length", "slack_length", "velocity_max", "tendon_strain", "m_w", "m_z"):
+        with pytest.raises(ValueError, match=rf"{name} = 0\.0 must be positive"):
+            HillMuscle(**{name: 0.0})
+    for name in ("activation", "pennation", "tendon_damping"):
+        with pytest.raises(ValueError, match=rf"{name} = -0\.1 must not be negative"):
+            HillMuscle(**{name: -0.1})
+    with pytest.raises(ValueError, match=r"pennation = 9\.2 rad must be below"):
+        jm.Isometric(muscle=HillMuscle()).replace(pennation=9.2)
+
+
+def test_a_task_with_an_own_muscle_is_saved_and_read(tmp_path):
+    task = jm.Isometric(5.0, muscle=HillMuscle(pennation=0.2))
+    jm.save_preset(tmp_path / "hill.toml", task)
+    assert jm.load_preset(tmp_path / "hill.toml") == task
+    with pytest.raises(ValueError, match="a class of your own must be imported first"):
+        text = (tmp_path / "hill.toml").read_text().replace("HillMuscle", "NowhereMuscle")
+        (tmp_path / "other.toml").write_text(text)
+        jm.load_preset(tmp_path / "other.toml")
+
+
+def test_activation_and_drive_go_together():
+    task = hill.at_activation(jm.Isometric(muscle=HillMuscle(pennation=0.0)), 0.4)
+    assert task["activation"] == 0.4 and task["P_w"] == pytest.approx(0.4 * 33.75)
+    assert jm.Isometric()["P_w"] == pytest.approx(float(HillMuscle().held_force), rel=1e-3)  # the defaults agree
+    motion = hill.at_activation(jm.PrescribedMotion(muscle=HillMuscle()), 0.4)
+    assert motion["activation"] == 0.4 and "P_w" not in motion.parameter_names
+
+
+# --- simulation
+
+
+def quiet(task, **values):
+    return references.quiet(task, **values)
+
+
+def input_at(t, level):
+    return references.smooth_step(t, level, 0.2, 0.5)
+
+
+def rhythm(task, t):
+    """u of the harmonic, the base coefficients by differences of the NumPy forces about the NumPy equilibrium."""
+    p, h = {name: float(value) for name, value in task.parameters.items()}, 1e-6
+    x = scipy.optimize.brentq(lambda x: numpy_tendon(p, x) - numpy_belly(p, x, 0.0), 0.0, 0.01, xtol=1e-16)
+    ahead, behind = (np.array(numpy_forces(p, x + s, 0.0, 0.0, 0.0)) for s in (h, -h))
+    K = (ahead - behind) / (2 * h) * [1, -1]
+    sine = p["harmonic_amplitude"] * np.sin(2 * np.pi * p["harmonic_frequency"] * t)
+    return np.array([K[0] * sine, K[1] * sine, 0.0, 0.0])
+
+
+TASKS = {
+    "isometric": lambda **parts: jm.Isometric(jm.SmoothStep(5.0, 0.2, 0.5), 0.002, **parts),
+    "force": lambda **parts: jm.PrescribedForce(jm.SmoothStep(5.0, 0.2, 0.5), jm.SmoothStep(4.5, 0.2, 0.5), **parts),
+    "motion": lambda **parts: jm.PrescribedMotion(jm.SmoothStep(-0.002, 0.2, 0.5), jm.SmoothStep(4.5, 0.2, 0.5), **parts),
+}
+
+
+def numpy_field(name, p):
+    """Right-hand side of the equations of motion, u a function of time."""
+
+    def field(t, y, u):
+        if name == "isometric":
+            active, passive = numpy_forces(p, y[0], y[1], 0.002, 0.0, u)
+            return [y[1], (input_at(t, 5.0) - active + passive) / p["m_w"]]
+        active, passive = numpy_forces(p, *y, u)
+        return [y[1], (input_at(t, 5.0) - active + passive) / p["m_w"], y[3], -(input_at(t, 4.5) + passive) / p["m_z"]]
+
+    return field
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("amplitude", [0.0, 0.05])
+@pytest.mark.parametrize("name", ["isometric", "force"])
+def test_simulation_is_the_solution_of_the_equations(x64, name, amplitude):
+    task = quiet(TASKS[name](muscle=HillMuscle()), harmonic_amplitude=amplitude)
+    p = {key: float(value) for key, value in task.parameters.items()}
+    times, field, unit = np.linspace(0.0, 1.2, 121), numpy_field(name, p), rhythm(task, 1 / (4 * 4.25))
+
+    def rhs(t, y):
+        return field(t, y, unit * np.sin(2 * np.pi * 4.25 * t))
+
+    exact = references.solve_ode(rhs, np.zeros(len(task.state_names)), times)
+    runs = [jm.simulate(task, KEY, duration=1.2, substeps=n) for n in (8, 16)]
+    errors = [np.abs(np.asarray(run.states) - exact).max(axis=0) for run in runs]
+    # Heun's method: second order, and at 16 sub-steps, λ h = 0.09, an error of about (λ h)²/6 of what moves at that rate.
+    scale = np.abs(exact).max(axis=0)
+    assert np.all(errors[1] < 2e-3 * scale)
+    assert np.all(errors[0] / errors[1] > 3.0)
+
+
+def test_prescribed_motion_is_the_inverse_problem(x64):
+    task = TASKS["motion"](muscle=HillMuscle())
+    p = {key: float(value) for key, value in task.parameters.items()}
+    rng, h = np.random.default_rng(4), 1e-7
+
+    def motion(t):
+        return references.smooth_step_derivatives(t, -0.002, 0.2, 0.5)
+
+    def velocity(t, x_w, u):
+        x_z, v_z, a_z = motion(t)
+        pull = input_at(t, 4.5) + p["m_z"] * a_z
+        elastic = numpy_tendon(p, x_w - x_z) + u[1] * (x_w - x_z)
+        return v_z + (pull - elastic) / (p["tendon_damping"] + u[3])
+
+    for t in (0.3, 0.45, 3.0):
+        x_w, u, du = -0.001 + 1e-3 * rng.normal(), rng.normal(size=4) * [20, 90, 5, 1], rng.normal(size=4) * [99, 99, 9, 9]
+        v_w = velocity(t, x_w, u)
+        ahead, behind = (velocity(t + s, x_w + s * v_w, u + s * du) for s in (h, -h))
+        active, _ = numpy_forces(p, x_w, v_w, 0.0, 0.0, u)
+        P_w = p["m_w"] * (ahead - behind) / (2 * h) + active + p["m_z"] * motion(t)[2] + input_at(t, 4.5)
+        y, u, du = jnp.array([x_w]), jnp.asarray(u), jnp.asarray(du)
+        np.testing.assert_allclose(task.vector_field(t, y, u), [v_w], rtol=1e-9)
+        np.testing.assert_allclose(task.output(t, y, u, du), P_w, rtol=1e-6)  # differences: h² and 1e-16 v / h
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name, largest", [("isometric", 0.2), ("force", 0.05), ("motion", 1.0)])
+def test_every_task_runs_and_without_noise_every_seed_is_the_same(name, largest):
+    options = {"seeds": 2, "duration": 0.8, "dt": 2e-3}
+    noisy = np.asarray(jm.ensemble(TASKS[name](muscle=HillMuscle()), KEY, **options).output)
+    assert np.all(np.isfinite(noisy)) and np.ptp(noisy[0]) > 0 and np.any(noisy[0] != noisy[1])
+    task = quiet(TASKS[name](muscle=HillMuscle()), harmonic_amplitude=0.0)
+    silent = np.asarray(jm.ensemble(task, KEY, **options).output)
+    np.testing.assert_array_equal(silent[0], silent[1])
+    # Default noise: a few hundredths of the force, less of a displacement; P_w of a motion contains its time derivative.
+    assert 0 < np.abs(noisy - silent).max() < largest * np.abs(silent).max()
+
+
+# --- spectra, gradients, fits
+
+
+@pytest.mark.slow
+def test_gradients_of_the_spectrum(x64):
+    names, h = ("velocity_max", "tendon_strain", "activation", "pennation", "noise_K_z"), 1e-4
+    task = hill.held_task()
+    at = jnp.array([float(task[name]) for name in names])
+
+    def power(values):
+        return jm.expected_spectrum(task.replace(**dict(zip(names, values, strict=True)))).power[10]
+
+    forward, reverse = jax.jacfwd(power)(at), jax.grad(power)(at)
+    steps = h * np.diag(np.asarray(at))
+    difference = [(power(at + s) - power(at - s)) / (2 * s.sum()) for s in steps]
+    np.testing.assert_allclose(forward, reverse, rtol=1e-8)
+    # h² = 1e-8 times third derivatives of order one; equilibrium to 1e-12.
+    np.testing.assert_allclose(forward, difference, rtol=1e-5)
+
+
+@pytest.mark.slow
+def test_gradients_of_a_simulation(x64):
+    task = TASKS["isometric"](muscle=HillMuscle())
+
+    def moved(values):
+        run = jm.simulate(task.replace(velocity_max=values[0], tendon_strain=values[1]), KEY, duration=0.6, substeps=4)
+        return jnp.sum(run.output[30:] ** 2)
+
+    at = jnp.array([3.6, 0.04])
+    forward, reverse = jax.jacfwd(moved)(at), jax.grad(moved)(at)
+    steps = 1e-5 * np.diag(np.asarray(at))
+    difference = [(moved(at + s) - moved(at - s)) / (2 * s.sum()) for s in steps]
+    np.testing.assert_allclose(forward, reverse, rtol=1e-9)
+    np.testing.assert_allclose(forward, difference, rtol=1e-6)
+
+
+@pytest.mark.slow
+def test_the_mean_of_simulations_is_the_linear_response(x64):
+    z, window = [], (0.5, 5.62)  # started settled; by 0.5 s the slowest motion of the held belly is e^-40 of its start
+    for i, noise in enumerate((jm.BandLimitedNoise(), jm.OrnsteinUhlenbeckNoise({"K_w": 0.15, "K_z": 0.005}))):
+        task = hill.held_task(noise=noise)
+        key = jax.random.fold_in(KEY, i)
+        runs = jm.ensemble(jm.settled(task), key, seeds=320, duration=window[1], dt=1.25e-3, control=False)
+        power = np.asarray(runs.spectrum(window=window).power)
+        expected = np.asarray(jm.expected_spectrum(task, window=window).power)
+        z.append((power.mean(axis=0) - expected) / (power.std(axis=0, ddof=1) / np.sqrt(len(power))))
+    # 320 seeds: 3 % per bin, several times what second order adds (measured with the control variate: below 1 %).
+    references.assert_standard_normal(z, every=3)
+
+
+def test_the_spectrum_goes_by_its_rules(x64):
+    task = hill.held_task()
+    power = np.asarray(jm.expected_spectrum(task).power)
+    names = ("noise_K_w", "noise_K_z", "noise_C_w", "noise_C_z", "harmonic_amplitude")
+    louder = task.replace(**{name: 2 * task[name] for name in names})
+    np.testing.assert_allclose(jm.expected_spectrum(louder).power, 4 * power, rtol=1e-9)
+    # At rest nothing moves: noise on the damping has no first-order effect.
+    damping = task.replace(noise_C_w=0.3, noise_C_z=0.3)
+    np.testing.assert_allclose(jm.expected_spectrum(damping).power, power, rtol=1e-9)
+    # A stiff tendon and a light, fast belly: the force is -ΔK_w x_w. In the density of the samples, both sides of f = 0.
+    alone = task.replace(noise_K_z=0.0, harmonic_amplitude=0.0, tendon_strain=0.004, velocity_max=100.0, m_w=0.01)
+    x_w, K_w = float(jm.equilibrium(alone)[0]), float(alone.muscle.base()[0])
+    f = np.asarray(jm.expected_spectrum(alone).frequency)[1:12]
+    density = references.aliased(lambda f: 1 / (100 * (1 + (f / 50) ** 4)), 100.0, f)
+    # Left out: K_w / (K_w + K_z) below 0.1 %, the resonance near 670 Hz, the bend of the density across a bin.
+    np.testing.assert_allclose(jm.expected_spectrum(alone).power[1:12], 2 * (0.15 * K_w * x_w) ** 2 * density, rtol=0.01)
+
+
+@pytest.mark.slow
+def test_the_page_runs_as_written_and_its_fit_finds_the_muscle(monkeypatch):
+    """Every Python block of docs/own-muscle.md, in order, from the root of a checkout."""
+    monkeypatch.chdir(DOCS.parent)
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    blocks = re.findall(r"^```python\n(.*?)^```", (DOCS / "own-muscle.md").read_text(encoding="utf-8"), re.S | re.M)
+    assert len(blocks) == 5
+    names: dict = {}
+    for block in blocks:
+        exec(compile(block, "docs/own-muscle.md", "exec"), names)
+    result = names["result"]
+    assert result.success, result.message
+    found = result.parameters["velocity_max"]
+    assert found.identifiable and found.stderr is not None
+    # One draw of a synthetic recording: within 3.3 standard errors with 99.9 %; and it moved from its start, 3.6.
+    assert abs(found.value - 2.0) < 3.3 * found.stderr
+    assert found.stderr < 0.3
