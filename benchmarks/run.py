@@ -16,6 +16,7 @@ import fits
 import integration
 import jax
 import linear
+import scale
 import usage
 from measure import DTYPES, Row, Unequal
 
@@ -25,6 +26,7 @@ SECTIONS: dict[str, Callable[[int], list[Row]]] = {
     "white": lambda n: integration.rows("white", n),
     "band-limited": lambda n: integration.rows("band-limited", n),
     "stock": lambda n: integration.rows("stock", n),
+    "scale": scale.rows,
     "expected": linear.expected,
     "control": linear.control,
     "ensemble": usage.ensembles,
