@@ -24,6 +24,7 @@ NOISES = ("band-limited", "ornstein-uhlenbeck")
 STARTS, MAX_STEPS, SEEDS = 100, 40, 32
 NEAR = 1e-3
 CHI2, SEARCH, FOUND_AGAIN, COLD, WARM, COHORT = 1.2, 6.0, 10, 45.0, 15.0, 30.0
+POSTERIOR = 120.0
 PEOPLE, SEGMENTS = 50, 12
 
 
@@ -77,6 +78,22 @@ def starts(repetitions: int) -> list[Row]:
             Row(f"{STARTS} starts, {name}: within {100 * NEAR:g} % of the best cost", again, "starts", target=FOUND_AGAIN),
         ]
     return found
+
+
+def posterior() -> list[Row]:
+    """Four chains of a thousand draws for the first target, the second of two calls; determined quantities' worst R-hat."""
+    target = jm.load_target("vastus-lateralis-26mvc")
+    result = jm.fit(jm.task_for(target), target)
+    for key in (1, 2):
+        begun = time.perf_counter()
+        found = jm.posterior(result, target, key=key)
+        wall = time.perf_counter() - begun
+    r_hat = max(found.diagnostics[name][0] for name in found.determined)
+    return [
+        Row("posterior, 4 x 1000 draws: warm wall time", wall, "s", target=POSTERIOR, at_most=True),
+        Row("posterior, 4 x 1000 draws: largest R-hat of what is determined", r_hat, "", target=1.01, at_most=True),
+        Row("posterior, 4 x 1000 draws: divergences", found.divergences, "draws", target=0, at_most=True),
+    ]
 
 
 def cohort() -> list[Row]:

@@ -34,6 +34,7 @@ SECTIONS: dict[str, Callable[[int], list[Row]]] = {
     "fit": lambda n: fits.fits(),
     "starts": fits.starts,
     "cohort": lambda n: fits.cohort(),
+    "posterior": lambda n: fits.posterior(),
     "alternative": lambda n: alternative.rows(),
     "cold": lambda n: fits.cold(),
 }
