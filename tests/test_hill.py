@@ -317,6 +317,17 @@ def test_prescribed_motion_is_the_inverse_problem(x64):
         np.testing.assert_allclose(task.output(t, y, u, du), P_w, rtol=1e-6)  # differences: h² and 1e-16 v / h
 
 
+def test_own_muscles_run_at_scale(tmp_path):
+    """A reduced, stored sweep over a parameter that only this muscle has."""
+    sweep = jm.Sweep.grid(jm.Isometric(muscle=HillMuscle()), velocity_max=[2.0, 4.0])
+    options = {"seeds": 12, "duration": 1.0, "chunk": 8}
+    found = jm.ensemble(sweep, KEY, reduce=True, store=tmp_path / "hill.zarr", **options)
+    for point, task in enumerate(sweep):
+        output = np.asarray(jm.ensemble(task, KEY, **options).output, float)
+        np.testing.assert_allclose(found.mean[point], output.mean(axis=0), atol=1e-6 * output.max())
+    np.testing.assert_array_equal(found.to_xarray()["velocity_max"], [2.0, 4.0])
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name, largest", [("isometric", 0.2), ("force", 0.05), ("motion", 1.0)])
 def test_every_task_runs_and_without_noise_every_seed_is_the_same(name, largest):
