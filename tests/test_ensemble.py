@@ -143,6 +143,17 @@ def test_what_breaks_is_left_out_and_named():
     assert not runs.success and f"{len(broken)} seed(s) did not stay finite" in runs.message
 
 
+def test_where_nothing_is_left_nothing_is_said():
+    limit = {"amplitude": 50.0, "relative": False}
+    broken = Brittle(noise=jm.BandLimitedNoise(**limit), harmonic=jm.Harmonic(0.0))
+    with pytest.raises(jm.SimulationError, match="none of the first seeds of point 0 stayed finite"):
+        jm.ensemble(broken, KEY, seeds=40, reduce=True, **SHORT)
+    whole = jm.ensemble(broken, KEY, seeds=8, reduce=True, **SHORT)
+    assert len(whole.failed) == 8 and np.isnan(whole.mean).all() and np.isnan(whole.quantile).all()
+    single = jm.ensemble(TASK, KEY, seeds=1, reduce=True, **SHORT)
+    assert np.isfinite(single.mean).all() and np.isnan(single.variance).all()
+
+
 # Sweeps
 
 

@@ -32,6 +32,7 @@ from ._ensemble_summary import EnsembleSummary, summarised
 from ._expected import expected_spectrum
 from ._parameter import PARAMETERS, as_numbers
 from ._processes import agreed, meet, rank_and_count
+from ._simulate import SimulationError
 from ._sweep import Sweep
 from ._tally import CELLS, add, count_cells, empty, set_cells
 from ._task import AbstractTask
@@ -63,27 +64,31 @@ def reduced(layout: Layout, levels: tuple[float, ...], path: Path | None, tell: 
                                 array if name in blank.coordinates() else None)
                  for name, (dims, array, units) in blank.arrays().items()}  # fmt: skip
     if _opened(path, variables, blank.coordinates(), blank.attributes(), settings, resume=resume):
-        base = read_tallies(path, nothing())
-        rank, count = rank_and_count()
-        meet()  # all know what is left before anybody adds to it
-        todo = [n for n in range(layout.chunks) if n not in base.chunks][rank::count]
-        old = tally_files(path) if rank == 0 else []
-        name = f"{1 + max((int(file.stem.split('-')[1]) for file in tally_files(path)), default=0):06d}-{rank:06d}"
-        if rank == 0 and old:
-            write_tally(path, name, base)
-            for file in old:
-                file.unlink(missing_ok=True)
-        meet()
-        found = _reduce(layout, levels, base if rank == 0 else nothing(), todo, tell, _keeper(path, name))
-        write_tally(path, name, found)
-        meet()
-        if rank == 0:
+        _share_tallies(layout, levels, path, tell, nothing)
+        if rank_and_count()[0] == 0:
             whole = _summary(layout, levels, read_tallies(path, nothing()), settings)
-            arrays = {name: array for name, (_, array, _) in whole.arrays().items()}
-            write_region(path, ..., arrays)
+            write_region(path, ..., {name: array for name, (_, array, _) in whole.arrays().items()})
             complete(path, {"failed": json.dumps(whole.failed.tolist())})
         meet()
     return _loaded(layout, levels, path, blank)
+
+
+def _share_tallies(
+    layout: Layout, levels: tuple[float, ...], path: Path, tell: Tell, nothing: Callable[[], Reduced]
+) -> None:
+    """Every process reduces its share of what no tally in the store has yet; process 0 takes over those there are."""
+    rank, count = rank_and_count()
+    base, old = read_tallies(path, nothing()), tally_files(path)
+    todo = [n for n in range(layout.chunks) if n not in base.chunks][rank::count]
+    name = f"{1 + max((int(file.stem.split('-')[1]) for file in old), default=0):06d}-{rank:06d}"
+    meet()  # all know what is left before anybody adds to it
+    if rank == 0 and old:
+        write_tally(path, name, base)
+        for file in old:
+            file.unlink(missing_ok=True)
+    found = _reduce(layout, levels, base if rank == 0 else nothing(), todo, tell, _keeper(path, name))
+    write_tally(path, name, found)
+    meet()
 
 
 def _reduce(
@@ -121,7 +126,7 @@ def _cell_sample(layout: Layout, chunk: Chunk, point: int, output: np.ndarray) -
         (_, found), = run_chunks(layout, [first], lambda pace: None)  # fmt: skip
         output = found["output"][0][found["finite"][0]]
     if len(output) == 0:
-        raise ValueError(f"none of the first {len(chunk.seeds)} seeds of point {point} stayed finite: lower the noise or dt")
+        raise SimulationError(f"none of the first seeds of point {point} stayed finite: lower the noise amplitude or dt")
     return output
 
 

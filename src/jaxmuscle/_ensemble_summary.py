@@ -159,15 +159,17 @@ def summarised(
     (seeds, bins), samples = shape, time.size
     unit = (task[0] if isinstance(task, Sweep) else task).output_unit
     with np.errstate(invalid="ignore", divide="ignore"):
-        variance = tally.squares / (tally.seeds - 1)[:, None]
-        stderr = np.sqrt(variance / tally.seeds[:, None])
+        seen = np.where(tally.seeds > 0, tally.seeds, np.nan)[:, None]
+        averages = tally.mean + 0 * seen
+        variance = tally.squares / np.where(seen > 1, seen - 1, np.nan)
+        stderr = np.sqrt(variance / seen)
     parts = {"power": slice(samples, samples + bins), "left": slice(samples + bins, samples + 2 * bins)}
     spectra = []
     for point in range(len(tally.seeds) if bins else 0):
-        plain, left = ((tally.mean[point, part], stderr[point, part]) for part in parts.values())
+        plain, left = ((averages[point, part], stderr[point, part]) for part in parts.values())
         control = None if expected is None else (*left, expected[point])
         spectra.append(from_moments(plain, control, int(tally.seeds[point]), settings, unit))
-    variation = np.stack([tally.mean[:, -1], stderr[:, -1]], axis=-1) if bins else np.full((len(tally.seeds), 2), np.nan)
-    found = [tally.mean[:, :samples], variance[:, :samples], quantiles(tally, levels), variation]
+    variation = np.stack([averages[:, -1], stderr[:, -1]], axis=-1) if bins else np.full((len(tally.seeds), 2), np.nan)
+    found = [averages[:, :samples], variance[:, :samples], quantiles(tally, levels), variation]
     mean, variance, quantile, variation = found if isinstance(task, Sweep) else [values[0] for values in found]
     return EnsembleSummary(task, seeds, time, mean, variance, levels, quantile, variation, tuple(spectra), failed, about)
