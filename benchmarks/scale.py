@@ -267,33 +267,39 @@ def threads(repetitions: int) -> list[Row]:
 
 
 def processes(repetitions: int) -> list[Row]:
-    """`jaxmuscle ensemble` as 1, 2 and 4 processes on the loopback, start and compilation included."""
-    found = []
-    base = 0.0
+    """`jaxmuscle ensemble` as 1, 2 and 4 processes on the loopback: speed once compiled, and the whole command."""
+    found, base = [], 0.0
     for count in (1, 2, 4):
-        taken = []
-        for _ in range(max(1, repetitions // 3)):
-            folder = tempfile.mkdtemp()
-            with socket.socket() as listener:
-                listener.bind(("127.0.0.1", 0))
-                port = listener.getsockname()[1]
-            command = [sys.executable, "-m", "jaxmuscle._cli", "ensemble", "zagrodny-slifkin", "--seeds", "16384",
-                       "--reduce", "--duration", "1", "--devices", "1", "--out", f"{folder}/a.zarr"]  # fmt: skip
-            each = [["--coordinator", f"127.0.0.1:{port}", "--processes", str(count), "--process-id", str(i)]
-                    for i in range(count)] if count > 1 else [[]]  # fmt: skip
-            begun = time.perf_counter()
-            workers = [
-                subprocess.Popen([*command, *more], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) for more in each
-            ]
-            if any(worker.wait() for worker in workers):
-                raise Unequal(f"processes: {count} processes failed")
-            taken.append(time.perf_counter() - begun)
-            shutil.rmtree(folder)
-        base = base or float(np.median(taken))
-        found.append(Row(f"processes: {count}, whole command", float(np.median(taken)), "s"))
+        whole, speed = zip(*(_command(count) for _ in range(max(1, repetitions // 3))), strict=True)
+        found.append(Row(f"processes: {count}, speed", float(np.median(speed)), "seeds/s"))
+        found.append(Row(f"processes: {count}, whole command with start and compilation", float(np.median(whole)), "s"))
+        base = base or float(np.median(speed))
         if count > 1:
-            found.append(Row(f"processes: speed of {count}", base / float(np.median(taken)), "times", "one process"))
+            found.append(Row(f"processes: efficiency of {count}", float(np.median(speed)) / base / count, "", "one process"))
     return found
+
+
+def _command(count: int) -> tuple[float, float]:
+    """Seconds of the command, and seeds per second of all processes (the first one's times their number)."""
+    folder = tempfile.mkdtemp()
+    with socket.socket() as listener:
+        listener.bind(("127.0.0.1", 0))
+        port = listener.getsockname()[1]
+    command = [sys.executable, "-m", "jaxmuscle._cli", "ensemble", "zagrodny-slifkin", "--seeds", "32768", "--reduce",
+               "--json", "--duration", "1", "--devices", "1", "--out", f"{folder}/a.zarr"]  # fmt: skip
+    each = [["--coordinator", f"127.0.0.1:{port}", "--processes", str(count), "--process-id", str(i)]
+            for i in range(count)] if count > 1 else [[]]  # fmt: skip
+    begun = time.perf_counter()
+    workers = [
+        subprocess.Popen([*command, *more], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True) for more in each
+    ]
+    told = [worker.communicate()[0] for worker in workers]
+    if any(worker.returncode for worker in workers):
+        raise Unequal(f"processes: {count} processes failed")
+    shutil.rmtree(folder)
+    lines = [json.loads(line) for line in told[0].splitlines() if line.startswith("{")]
+    paces = [line["seeds_per_second"] for line in lines if line["event"] == "progress"]
+    return time.perf_counter() - begun, count * paces[-1]
 
 
 MEMORY = """

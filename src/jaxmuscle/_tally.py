@@ -57,16 +57,16 @@ def _merged(a: tuple, b: tuple) -> tuple:
 def set_cells(tally: Tally, point: int, output: Float[np.ndarray, "seeds samples"]) -> None:
     """Where the cells of a point lie, from the output of its first chunk."""
     mean, sd = output.mean(axis=0, dtype=float), output.std(axis=0, dtype=float)
-    tiny = 1e-6 * np.abs(mean) + np.finfo(output.dtype).tiny  # what does not vary has its value for a quantile
+    tiny = 1e-6 * np.abs(mean) + 1e3 * np.finfo(output.dtype).tiny  # what does not vary has its value for a quantile
     reach = np.maximum(REACH * sd, 2 * np.abs(output - mean).max(axis=0)) + tiny
     tally.low[point], tally.high[point] = mean - reach, mean + reach
 
 
 def count_cells(tally: Tally, point: int, output: Float[np.ndarray, "seeds samples"]) -> None:
     """Count the output of a chunk in the cells of its point."""
-    low, high = tally.low[point], tally.high[point]
-    cell = np.floor((output - low) * (CELLS / (high - low)))
-    cell = np.clip(cell, 0, CELLS - 1).astype(np.int64) + CELLS * np.arange(output.shape[1])
+    low, high = (edge[point].astype(output.dtype) for edge in (tally.low, tally.high))
+    place = np.clip((output - low) * (CELLS / (high - low)), 0, CELLS - 1)
+    cell = place.astype(np.int32) + CELLS * np.arange(output.shape[1], dtype=np.int32)
     tally.cells[point] += np.bincount(cell.ravel(), minlength=tally.cells[point].size).reshape(-1, CELLS).astype(np.int32)
 
 
