@@ -47,18 +47,19 @@ POWERS = str.maketrans("23", "²³")
 def number(value: float) -> str:
     if math.isinf(value):
         return "∞" if value > 0 else "-∞"
-    return f"{value:.4g}"
+    return f"{value:.4g}".replace("e+0", "e").replace("e-0", "e-")
 
 
-def interval(row: Parameter, low: float, high: float) -> str:
-    """Bounds in words of mathematics; a positive parameter's zero is excluded in a fit."""
+def interval(low: float, high: float) -> str:
     left = "(" if math.isinf(low) else "["
     right = ")" if math.isinf(high) else "]"
     return f"{left}{number(low)}, {number(high)}{right}"
 
 
 def unit(row: Parameter) -> str:
-    return row.unit.replace("^", "").translate(POWERS) if "^" in row.unit else row.unit
+    """With powers as a reader writes them; a unit is not broken between lines."""
+    text = row.unit.replace("^", "").translate(POWERS) if "^" in row.unit else row.unit
+    return text.replace(" ", "&nbsp;")
 
 
 def page() -> str:
@@ -66,9 +67,9 @@ def page() -> str:
     values, fits = [], []
     for row in PARAMETERS.values():
         name = f"`{row.name}`" + (" ●" if row.name in DEFAULT_FREE else "")
-        bounds = interval(row, row.lower, row.upper)
+        bounds = interval(row.lower, row.upper)
         values.append(f"| {name} | {row.symbol} | {unit(row)} | {number(row.default)} | {bounds} | {row.meaning} |\n")
-        reached = interval(row, row.fit_lower, row.fit_upper)
+        reached = interval(row.fit_lower, row.fit_upper)
         log = "yes" if row.positive else "no"
         source = row.source.replace("^2", "²")
         fits.append(f"| `{row.name}` | {log} | {number(row.prior_sd)} | {reached} | {source} |\n")

@@ -1,20 +1,48 @@
-"""For mkdocstrings: the constructor of an `eqx.Module` or `NamedTuple`, which follows from its fields, as the signature of its class."""
+"""For mkdocstrings: signatures of classes that get their constructor from their fields, and constants in signatures by value."""
+
+import ast
 
 import griffe
 
 POSITIONAL, KEYWORD = griffe.ParameterKind.positional_or_keyword, griffe.ParameterKind.keyword_only
 
 
+class Signatures(griffe.Extension):
+    """`eqx.Module` and `NamedTuple` make constructors at run time, which griffe, reading the sources, does not see."""
+
+    def on_package(self, *, pkg: griffe.Module, **kwargs: object) -> None:
+        for module in pkg.modules.values():
+            for cls in module.classes.values():
+                if not cls.is_alias and makes_constructor(cls):
+                    cls.set_member("__init__", constructor(cls))
+            for function in module.functions.values():
+                if not function.is_alias:
+                    for parameter in function.parameters:
+                        parameter.default = constant(parameter.default, module)
+
+
+def makes_constructor(cls: griffe.Class) -> bool:
+    family = [cls, *cls.mro()]
+    bases = [str(base) for parent in family for base in parent.bases]
+    written = any("__init__" in parent.members for parent in family if not parent.name.startswith("Abstract"))
+    return not written and not cls.name.startswith("Abstract") and any(b.endswith(("Module", "NamedTuple")) for b in bases)
+
+
+def constructor(cls: griffe.Class) -> griffe.Function:
+    this = griffe.Parameter("self", kind=POSITIONAL)
+    given = sorted(fields_of(cls).values(), key=lambda p: p.kind is KEYWORD)
+    return griffe.Function("__init__", parameters=griffe.Parameters(this, *given), parent=cls)
+
+
 def fields_of(cls: griffe.Class) -> dict[str, griffe.Parameter]:
     """Annotated class attributes in the order of a dataclass, the parents' first; abstract and class variables left out."""
     found: dict[str, griffe.Parameter] = {}
-    for base in [*reversed(cls.mro()), cls]:
-        for name, member in base.members.items():
-            if not member.is_attribute or member.is_alias or member.annotation is None or "property" in member.labels:
+    for parent in [*reversed(cls.mro()), cls]:
+        for name, member in parent.members.items():
+            if member.is_alias or not member.is_attribute or member.annotation is None or "property" in member.labels:
                 continue
-            if "ClassVar" in str(member.annotation) or "AbstractVar" in str(member.annotation):
-                continue
-            found[name] = parameter(name, member)
+            if not any(kind in str(member.annotation) for kind in ("ClassVar", "AbstractVar")):
+                found[name] = parameter(name, member)
     return found
 
 
@@ -28,21 +56,14 @@ def parameter(name: str, field: griffe.Attribute) -> griffe.Parameter:
     return griffe.Parameter(name, annotation=field.annotation, kind=kind, default=default)
 
 
-class Signatures(griffe.Extension):
-    def on_package(self, *, pkg: griffe.Module, **kwargs: object) -> None:
-        for module in pkg.modules.values():
-            for cls in module.classes.values():
-                if not cls.is_alias and "__init__" not in cls.all_members and is_data(cls):
-                    own = fields_of(cls)
-                    ordered = sorted(own.values(), key=lambda p: p.kind is KEYWORD)
-                    cls.set_member("__init__", made(cls, ordered))
-
-
-def is_data(cls: griffe.Class) -> bool:
-    bases = [str(base) for parent in [cls, *cls.mro()] for base in parent.bases]
-    return any(base.endswith(("Module", "NamedTuple")) for base in bases)
-
-
-def made(cls: griffe.Class, parameters: list[griffe.Parameter]) -> griffe.Function:
-    this = griffe.Parameter("self", kind=POSITIONAL)
-    return griffe.Function("__init__", parameters=griffe.Parameters(this, *parameters), parent=cls)
+def constant(default: object, module: griffe.Module) -> object:
+    """A default that names a constant as the constant's value, if that is a literal."""
+    if not isinstance(default, griffe.ExprName):
+        return default
+    try:
+        value = module[default.name]
+        value = value.final_target if value.is_alias else value
+        ast.literal_eval(str(value.value))
+    except (KeyError, ValueError, SyntaxError, AttributeError, griffe.AliasResolutionError):
+        return default
+    return value.value
