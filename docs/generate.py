@@ -8,9 +8,9 @@ from jaxmuscle._parameter import DEFAULT_FREE, PARAMETERS, Parameter
 PAGE = Path(__file__).parent / "reference" / "parameters.md"
 HEAD = """# Parameters and units
 
-One table holds every parameter: `jm.PARAMETERS[name]` is its row, `task[name]` its value in a task, `task.replace(name=value)`
-a copy with another value, `--fix NAME=VALUE` and `--free NAMES` the same from a shell. This page is written by `docs/generate.py`
-from that table.
+One table holds every parameter: `jm.PARAMETERS[name]` is its row, `task[name]` its value in a task,
+`task.replace(name=value)` a copy with another value, `--fix NAME=VALUE` and `--free NAMES` the same from a shell. This page
+is written by `docs/generate.py` from that table.
 
 ## Values
 
@@ -22,8 +22,8 @@ from that table.
 FIT = """
 ## In a fit
 
-A positive parameter is fitted in log space, and *prior sd* is the standard deviation of its logarithm about the value of the task
-that is passed in; of the others it is in the parameter's own unit.
+A positive parameter is fitted in log space, and *prior sd* is the standard deviation of its logarithm about the value of the
+task that is passed in; of the others it is in the parameter's own unit.
 
 | name | log space | prior sd | reached by a fit | source of the default |
 |---|---|---|---|---|
@@ -31,9 +31,9 @@ that is passed in; of the others it is in the parameter's own unit.
 TAIL = """
 ## Units
 
-SI throughout: masses in kg, lengths in m, forces in N, times in s, frequencies in Hz, angles in rad. `k` [N/m³] times a squared
-length is a stiffness [N/m], `c` [N s³/m³] times a squared velocity a damping coefficient [N s/m]. A unit of 1 is a ratio: noise and
-harmonic amplitudes are fractions of the coefficient at rest.
+SI throughout: masses in kg, lengths in m, forces in N, times in s, frequencies in Hz, angles in rad. `k` [N/m³] times a
+squared length is a stiffness [N/m], `c` [N s³/m³] times a squared velocity a damping coefficient [N s/m]. A unit of 1 is a
+ratio: noise and harmonic amplitudes are fractions of the coefficient at rest.
 
 ::: jaxmuscle.PARAMETERS
 

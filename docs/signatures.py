@@ -1,10 +1,15 @@
-"""For mkdocstrings: signatures of classes that get their constructor from their fields, and constants in signatures by value."""
+"""For mkdocstrings: signatures of classes whose constructor follows from their fields, and the values of named defaults."""
 
 import ast
+import re
+from pathlib import Path
 
 import griffe
 
 POSITIONAL, KEYWORD = griffe.ParameterKind.positional_or_keyword, griffe.ParameterKind.keyword_only
+TABLE = ast.parse((Path(__file__).parents[1] / "src/jaxmuscle/_parameter.py").read_text(encoding="utf-8"))
+ROWS = [n.args for n in ast.walk(TABLE) if isinstance(n, ast.Call) and ast.unparse(n.func) in ("_row", "_free_sign")]
+DEFAULTS = {ast.unparse(row[0]).strip("'"): ast.unparse(row[3]) for row in ROWS if isinstance(row[3], ast.Constant)}
 
 
 class Signatures(griffe.Extension):
@@ -12,13 +17,12 @@ class Signatures(griffe.Extension):
 
     def on_package(self, *, pkg: griffe.Module, **kwargs: object) -> None:
         for module in pkg.modules.values():
-            for cls in module.classes.values():
-                if not cls.is_alias and makes_constructor(cls):
-                    cls.set_member("__init__", constructor(cls))
-            for function in module.functions.values():
-                if not function.is_alias:
-                    for parameter in function.parameters:
-                        parameter.default = constant(parameter.default, module)
+            classes = [cls for cls in module.classes.values() if not cls.is_alias]
+            for cls in filter(makes_constructor, classes):
+                cls.set_member("__init__", constructor(cls))
+            functions = [f for place in (module, *classes) for f in place.functions.values() if not f.is_alias]
+            for parameter in (p for function in functions for p in function.parameters):
+                parameter.default = constant(parameter.default, module)
 
 
 def makes_constructor(cls: griffe.Class) -> bool:
@@ -39,9 +43,9 @@ def fields_of(cls: griffe.Class) -> dict[str, griffe.Parameter]:
     found: dict[str, griffe.Parameter] = {}
     for parent in [*reversed(cls.mro()), cls]:
         for name, member in parent.members.items():
-            if member.is_alias or not member.is_attribute or member.annotation is None or "property" in member.labels:
+            if member.is_alias or not member.is_attribute or "instance-attribute" not in member.labels:
                 continue
-            if not any(kind in str(member.annotation) for kind in ("ClassVar", "AbstractVar")):
+            if member.annotation is not None and "AbstractVar" not in str(member.annotation):
                 found[name] = parameter(name, member)
     return found
 
@@ -53,11 +57,18 @@ def parameter(name: str, field: griffe.Attribute) -> griffe.Parameter:
         given = {a.name: a.value for a in default.arguments if isinstance(a, griffe.ExprKeyword)}
         kind = KEYWORD if str(given.get("kw_only")) == "True" else POSITIONAL
         default = given.get("default", "..." if "default_factory" in given else None)
-    return griffe.Parameter(name, annotation=field.annotation, kind=kind, default=default)
+    return griffe.Parameter(name, annotation=field.annotation, kind=kind, default=tabulated(default))
+
+
+def tabulated(default: object) -> object:
+    """`default("k_w")` and `PARAMETERS["k_w"].default` as the number in the parameter table."""
+    found = re.fullmatch(r"""(?:default\(|PARAMETERS\[)['"](\w+)['"][)\]](?:\.default)?""", str(default))
+    return DEFAULTS[found[1]] if found else default
 
 
 def constant(default: object, module: griffe.Module) -> object:
     """A default that names a constant as the constant's value, if that is a literal."""
+    default = tabulated(default)
     if not isinstance(default, griffe.ExprName):
         return default
     try:
