@@ -5,13 +5,14 @@ BIN = .venv/bin
 PYTEST = $(BIN)/python -m pytest -q -n 2 --dist loadfile
 PIP = $(BIN)/python -m pip --quiet --disable-pip-version-check install
 
-.PHONY: help fit test test-fast bench clean
+.PHONY: help fit test test-fast bench docs clean
 
 help:
 	@echo "make fit        fit a bundled measured target; writes report and figure to out/fit"
 	@echo "make test       ruff, basedpyright and the whole test suite"
 	@echo "make test-fast  the tests that are not marked slow"
 	@echo "make bench      measure speed; writes out/bench.json"
+	@echo "make docs       write the documentation; open site/index.html"
 	@echo "make clean      remove outputs and caches, but not .venv"
 	@echo "Another interpreter: make PYTHON=python3.12 fit"
 
@@ -30,8 +31,12 @@ test-fast: .venv/.stamp-test
 bench: .venv/.stamp-bench
 	$(BIN)/python benchmarks/run.py --out out/bench.json
 
+docs: .venv/.stamp-docs
+	$(BIN)/python docs/generate.py
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
+
 clean:
-	rm -rf out dist build .test-out .pytest_cache .ruff_cache .hypothesis
+	rm -rf out site dist build .test-out .pytest_cache .ruff_cache .hypothesis
 	find . -path ./.venv -prune -o -type d -name __pycache__ -prune -exec rm -rf {} +
 
 .venv/.stamp-run: pyproject.toml
@@ -54,4 +59,9 @@ clean:
 .venv/.stamp-bench: .venv/.stamp-run
 	@echo "Installing the benchmark tools into .venv"
 	@$(PIP) --group bench
+	@touch $@
+
+.venv/.stamp-docs: .venv/.stamp-run
+	@echo "Installing the documentation tools into .venv"
+	@$(PIP) --group docs
 	@touch $@
