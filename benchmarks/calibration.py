@@ -1,7 +1,7 @@
 """Do the error bars hold? Recordings of known muscles, simulated nonlinearly; how often intervals cover the truth.
 
     python benchmarks/calibration.py --recordings 200 --seconds 10 --out out/calibration-10.json
-    python benchmarks/calibration.py --recordings 200 --seconds 60 --out out/calibration-60.json
+    python benchmarks/calibration.py --recordings 200 --seconds 60 --draws 600 --warmup 400 --out out/calibration-60.json
 
 Truths are drawn from the prior of the fit itself (simulation-based calibration, Talts et al. 2018, arXiv:1804.06788), about
 muscles whose perturbations are a third of the default, so that nearly all respond linearly. Interrupted runs go on where
@@ -31,7 +31,8 @@ PERTURBED = ("noise_K_w", "noise_K_z", "harmonic_amplitude")
 SOFTER = 3.0
 START = 5.0
 BATCH = 20
-CHAINS, DRAWS, WARMUP, THIN = 2, 150, 150, 5
+CHAINS, DRAWS, WARMUP, RANKED = 2, 150, 150, 60
+MIXED = 1.05  # R-hat
 HELD = 0.8  # share of its bin above which the harmonic's frequency is judged
 SHOWN = ("corner_frequency", "harmonic_share", "harmonic_frequency", "high_frequency_floor", "coefficient_of_variation")
 
@@ -74,7 +75,7 @@ def true_values(task: jm.AbstractTask, target: jm.Target) -> tuple[dict[str, flo
     return values | {name: float(task[name]) for name in setup.coordinates.names}, float(share[nearest]) if inside else 0.0
 
 
-def judged(number: int, target: jm.Target, result: jm.FitResult) -> dict:
+def judged(number: int, target: jm.Target, result: jm.FitResult, length: tuple[int, int]) -> dict:
     """What fit and posterior say of one recording, against the truth."""
     task = truth(number)
     true, share = true_values(task, target)
@@ -82,20 +83,22 @@ def judged(number: int, target: jm.Target, result: jm.FitResult) -> dict:
     for name, estimate in result.derived.items():
         if estimate.stderr is not None:
             row["curvature"][name] = [estimate.value, estimate.stderr]
-    found = jm.posterior(result, key=number, chains=CHAINS, draws=DRAWS, warmup=WARMUP)
+    found = jm.posterior(result, key=number, chains=CHAINS, draws=length[0], warmup=length[1])
     row |= {"divergences": found.divergences, "r_hat": max(d[0] for d in found.diagnostics.values())}
     row["p_value"] = found.replicates.p_value
     for name, draws in found.quantities.items():
-        thin = draws[:, THIN - 1 :: THIN].ravel()
+        step = max(1, draws.size // RANKED)
+        thin = draws.ravel()[step - 1 :: step]
         row["posterior"][name] = [*np.quantile(draws, [0.025, 0.975]).tolist(), int(np.sum(thin < true[name])), thin.size]
     return row
 
 
-def run(numbers: list[int], seconds: float, out: Path) -> list[dict]:
+def run(numbers: list[int], seconds: float, out: Path, length: tuple[int, int] = (DRAWS, WARMUP)) -> list[dict]:
     """All recordings that are not in the file yet, in batches; the file is replaced after each."""
-    table = json.loads(out.read_text()) if out.exists() else {"seconds": seconds, "rows": [], "failed": {}}
-    if table["seconds"] != seconds:
-        raise SystemExit(f"{out}: holds recordings of {table['seconds']} s, not of {seconds} s; give another file")
+    asked = {"seconds": seconds, "draws": length[0], "warmup": length[1]}
+    table = json.loads(out.read_text()) if out.exists() else asked | {"rows": [], "failed": {}}
+    if (there := {name: table.get(name, default) for name, default in zip(asked, (0, DRAWS, WARMUP), strict=True)}) != asked:
+        raise SystemExit(f"{out}: holds {there}, not {asked}; give another file")
     done = {row["number"] for row in table["rows"]} | {int(n) for n in table["failed"]}
     left = [n for n in numbers if n not in done]
     for start in range(0, len(left), BATCH):
@@ -109,7 +112,7 @@ def run(numbers: list[int], seconds: float, out: Path) -> list[dict]:
             plans = [planned(base(), target, counts=(32, None, None)) for target in targets.values()]
             results = search_together(plans, lambda text, share: None)
             for (number, target), result in zip(targets.items(), results, strict=True):
-                table["rows"].append(judged(number, target, result))
+                table["rows"].append(judged(number, target, result, length))
                 write_json(out, table)
                 print(f"{seconds:g} s: {len(table['rows'])} of {len(numbers)}", file=sys.stderr, flush=True)
     return table["rows"]
@@ -144,6 +147,8 @@ def main() -> None:
     parser.add_argument("--recordings", type=int, default=200)
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--seconds", type=float, default=10.0)
+    parser.add_argument("--draws", type=int, default=DRAWS, help="of each of two chains")
+    parser.add_argument("--warmup", type=int, default=WARMUP)
     parser.add_argument("--out", type=Path, default=Path("out/calibration.json"))
     parser.add_argument("--merge", type=Path, nargs="*", help="print the table of these files instead")
     given = parser.parse_args()
@@ -152,7 +157,10 @@ def main() -> None:
     else:
         keep_compiled_programs()
         given.out.parent.mkdir(parents=True, exist_ok=True)
-        rows = run(list(range(given.first, given.first + given.recordings)), given.seconds, given.out)
+        numbers = list(range(given.first, given.first + given.recordings))
+        rows = run(numbers, given.seconds, given.out, (given.draws, given.warmup))
+    mixed = [row for row in rows if row["r_hat"] <= MIXED]
+    print(report(mixed), f"\n\nChains that had mixed (R-hat <= {MIXED}): {len(mixed)} of {len(rows)}. All of them:\n")
     print(report(rows))
 
 
