@@ -1,4 +1,4 @@
-"""The scripts in fitting/, their expected results, and the notebooks."""
+"""The scripts in fitting/ and their expected results."""
 
 import importlib
 import json
@@ -6,10 +6,8 @@ import sys
 from pathlib import Path
 
 import jax
-import nbformat
 import numpy as np
 import pytest
-from nbclient import NotebookClient
 
 import jaxmuscle as jm
 
@@ -72,21 +70,6 @@ def test_a_digitised_csv_takes_the_place_of_the_bundled_target(scripts, tmp_path
     assert mine.segments == (6,) and mine.quantity == target.quantity
     # Six decimals of a proportional power of at least 1e-5 are good to 5 %.
     np.testing.assert_allclose(mine.proportional_power, target.proportional_power, rtol=0.05)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("path", sorted((ROOT / "notebooks").glob("*.ipynb")), ids=lambda p: p.stem)
-def test_notebooks_run(path, tmp_path, monkeypatch):
-    monkeypatch.delenv("MPLBACKEND", raising=False)  # the kernel's own, as a reader has it
-    notebook = nbformat.read(path, as_version=4)
-    lines = sum(len(cell.source.splitlines()) for cell in notebook.cells if cell.cell_type == "code")
-    assert lines <= 60
-    (tmp_path / "notebooks").mkdir()
-    (tmp_path / "out" / "notebooks").mkdir(parents=True)
-    client = NotebookClient(notebook, timeout=900, resources={"metadata": {"path": str(tmp_path / "notebooks")}})
-    client.execute()
-    images = sum("image/png" in o.get("data", {}) for c in notebook.cells for o in c.get("outputs", []))
-    assert images >= 2
 
 
 @pytest.fixture(scope="module")

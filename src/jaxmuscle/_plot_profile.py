@@ -32,7 +32,7 @@ def draw(found: Profile, ax: Axes | None = None) -> Axes:
     if found.name != "harmonic_frequency":
         ax.plot(x, parabola, color=ORANGE, lw=0.9, label="by curvature")
     ax.set(ylim=(0, top), xlim=(found.values[0], found.values[-1]), ylabel="Rise of -2 ln L")
-    ax.set_xlabel(found.name.replace("_", " ") + ("" if found.unit == "1" else f" ({found.unit})"))
+    ax.set_xlabel(found.name + ("" if found.unit == "1" else f" ({found.unit})"))
     ax.set_title(f"{found.target}: profile likelihood")
     if found.low is None or found.high is None:
         side = "on both sides" if found.low is found.high else "downwards" if found.low is None else "upwards"

@@ -192,7 +192,9 @@ def moments(summary: Any, ax: Axes | None = None, point: int = 0) -> Axes:
     for low in range(len(levels) // 2):
         high = len(levels) - 1 - low
         share = f"{100 * levels[low]:g} to {100 * levels[high]:g} %"
-        ax.fill_between(summary.time, quantile[low], quantile[high], color=line.get_color(), alpha=0.18, lw=0, label=share)
+        ax.fill_between(
+            summary.time, quantile[low], quantile[high], color=line.get_color(), alpha=0.18 * (1 + low), lw=0, label=share
+        )
     ax.set_xlabel("Time (s)")
     first = summary.task[0] if swept else summary.task
     ax.set_ylabel(output_label(first.output_name, first.output_unit))

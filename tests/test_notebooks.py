@@ -1,0 +1,65 @@
+"""The notebooks: short, stored with their outputs, linked, and run."""
+
+import re
+from pathlib import Path
+
+import nbformat
+import pytest
+from nbclient import NotebookClient
+
+NOTEBOOKS = sorted((Path(__file__).parents[1] / "notebooks").glob("*.ipynb"))
+
+
+def stored(path):
+    """A notebook and the outputs of its code cells."""
+    notebook = nbformat.read(path, as_version=4)
+    return notebook, [output for cell in notebook.cells for output in cell.get("outputs", [])]
+
+
+def test_the_notebooks_are_all_there_with_their_titles():
+    titles = {path.stem: nbformat.read(path, as_version=4).cells[0].source.splitlines()[0] for path in NOTEBOOKS}
+    assert titles == {
+        "01-first-fit": "# A first fit",
+        "02-monte-carlo-ensemble": "# A Monte Carlo ensemble",
+        "03-three-tasks": "# One muscle, three tasks",
+        "04-from-recording-to-parameters": "# From a recording to parameters",
+        "05-uncertainty-and-noise-colour": "# How sure, and which noise?",
+        "06-gradients-and-design": "# Gradients, and an experiment designed with them",
+        "07-your-own-muscle": "# Your own muscle",
+    }
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda p: p.stem)
+def test_a_notebook_can_be_read_without_running_it(path):
+    notebook, outputs = stored(path)
+    nbformat.validate(notebook)
+    code = [cell for cell in notebook.cells if cell.cell_type == "code"]
+    assert sum(len(cell.source.splitlines()) for cell in code) <= 60
+    assert [cell.execution_count for cell in code] == list(range(1, len(code) + 1))  # run once, from top to bottom
+    assert not [output for output in outputs if output.output_type == "error" or output.get("name") == "stderr"]
+    assert sum("image/png" in output.get("data", {}) for output in outputs) >= 2
+    assert path.stat().st_size < 400_000
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda p: p.stem)
+def test_the_links_of_a_notebook_lead_somewhere(path):
+    text = "\n".join(cell.source for cell in stored(path)[0].cells if cell.cell_type == "markdown")
+    missing = [link for link in re.findall(r"\]\(([^)#]+)\)", text) if not (path.parent / link).exists()]
+    assert not missing
+
+
+def test_one_notebook_has_sliders():
+    kinds = {kind for path in NOTEBOOKS for output in stored(path)[1] for kind in output.get("data", {})}
+    assert "application/vnd.jupyter.widget-view+json" in kinds
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda p: p.stem)
+def test_notebooks_run(path, tmp_path, monkeypatch):
+    monkeypatch.delenv("MPLBACKEND", raising=False)  # the kernel's own, as a reader has it
+    notebook = nbformat.read(path, as_version=4)
+    lines = sum(len(cell.source.splitlines()) for cell in notebook.cells if cell.cell_type == "code")
+    assert lines <= 60
+    NotebookClient(notebook, timeout=900, resources={"metadata": {"path": str(tmp_path)}}).execute()
+    outputs = [output for cell in notebook.cells for output in cell.get("outputs", [])]
+    assert sum("image/png" in output.get("data", {}) for output in outputs) >= 2
