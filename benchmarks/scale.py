@@ -244,7 +244,7 @@ def threads(repetitions: int) -> list[Row]:
     cores = sorted(os.sched_getaffinity(0))
     if len(cores) < 2:
         return []
-    seeds = 8192
+    seeds = 32_768
     groups = {
         "one core": [_worker(cores[:1], 1, seeds)],
         "two threads": [_worker(cores[:2], 2, seeds)],

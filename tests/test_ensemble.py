@@ -520,7 +520,7 @@ KILLED = """
 import sys, jax
 import jaxmuscle as jm, jaxmuscle._ensemble_run as run
 run.KEEP_EVERY = run.KEEP_SHARE = 0
-jm.ensemble(jm.Isometric(), jax.random.key(5), seeds=3000, duration=1.0, chunk=8, store=sys.argv[1], resume=True,
+jm.ensemble(jm.Isometric(), jax.random.key(5), seeds=12000, duration=1.0, chunk=8, store=sys.argv[1], resume=True,
             **({"reduce": True} if sys.argv[2] == "reduced" else {}))
 """
 
@@ -537,19 +537,19 @@ def test_kill_9_ten_times(tmp_path, kind):
         wait_for(lambda worker=worker, before=before: worker.poll() is not None or amount(path) != before)
         time.sleep(rng.uniform(0, 0.4))
         worker.send_signal(signal.SIGKILL)
-        if worker.wait() == 0:
+        worker.wait()
+        if xarray.open_zarr(path).attrs["complete"]:
             break
         progressed += 1
-        assert xarray.open_zarr(path).attrs["complete"] is False
     assert progressed >= 5, "too fast to be interrupted: the test shows nothing"
     assert subprocess.run([*PYTHON, KILLED, str(path), kind], env=environment()).returncode == 0
     found = xarray.open_zarr(path)
     assert found.attrs["complete"] is True
-    output = np.asarray(jm.ensemble(TASK, KEY, seeds=3000, duration=1.0, chunk=8, control=False).output, float)
+    output = np.asarray(jm.ensemble(TASK, KEY, seeds=12000, duration=1.0, chunk=8, control=False).output, float)
     if kind == "trajectories":
         np.testing.assert_array_equal(found["F_ext"], output)
         return
-    whole = jm.ensemble(TASK, KEY, seeds=3000, duration=1.0, chunk=8, reduce=True)
+    whole = jm.ensemble(TASK, KEY, seeds=12000, duration=1.0, chunk=8, reduce=True)
     np.testing.assert_allclose(found["mean"], whole.mean, rtol=1e-12)
     np.testing.assert_allclose(found["variance"], whole.variance, rtol=1e-9)
     np.testing.assert_array_equal(found["quantiles"], whole.quantile)

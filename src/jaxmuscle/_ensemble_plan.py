@@ -12,7 +12,7 @@ from jax.sharding import Mesh, NamedSharding
 from jax.sharding import PartitionSpec as P
 from jaxtyping import Int, PRNGKeyArray
 
-from ._lanes import Recipe, local_mesh, run_points, run_seeds
+from ._lanes import LANES, Recipe, blocks, local_mesh, run_points, run_seeds
 from ._linear import LinearTask
 from ._parameter import as_arrays
 from ._processes import agreed
@@ -21,7 +21,7 @@ from ._sweep import Sweep
 from ._task import AbstractTask
 from ._trajectory import WINDOW
 
-LANES = 1024
+BLOCKS = 4
 STEPS_AT_ONCE = 4_000_000
 EIGHT = 8
 
@@ -124,21 +124,26 @@ def laid_out(
     if spectrum:
         edges = (round(WINDOW[0] * settings.rate), round(WINDOW[1] * settings.rate))
         every = round(plan.rate / settings.rate)
-    recipe = Recipe(plan.grid, plan.sampling, states, settings, every or 1, edges)
+    recipe = Recipe(plan.grid, plan.sampling, states, settings, lanes_of(plan), every or 1, edges)
     together, width = cut_of(task, len(seeds), plan, chunk) if cut is None else cut
     return Layout(task, key, seeds, plan, linear, recipe, together, width, local_mesh())
 
 
 def cut_of(task: AbstractTask | Sweep, seeds: int, plan: Plan, chunk: int | None) -> Cut:
-    """As many seeds at once as the cache of every device likes, whole points where their seeds are few.
+    """As many seeds at once as the cache of every device likes, times `BLOCKS`; whole points where their seeds are few.
 
     The same for all processes: what process 0 says.
     """
-    lanes = max(EIGHT, min(LANES, EIGHT * (STEPS_AT_ONCE // plan.grid.steps // EIGHT))) * jax.local_device_count()
-    lanes = int(agreed(str(lanes))) if chunk is None else chunk
+    lanes = int(agreed(str(lanes_of(plan) * jax.local_device_count()))) if chunk is None else chunk
     if isinstance(task, Sweep) and 2 * seeds <= lanes:
         return Cut(min(len(task), lanes // seeds), seeds)
+    lanes *= BLOCKS if chunk is None else 1
     return Cut(1, EIGHT * math.ceil(min(lanes, seeds) / EIGHT))
+
+
+def lanes_of(plan: Plan) -> int:
+    """How many seeds a device simulates side by side."""
+    return max(EIGHT, min(LANES, EIGHT * (STEPS_AT_ONCE // plan.grid.steps // EIGHT)))
 
 
 def covers_window(plan: Plan, task: AbstractTask) -> bool:
@@ -174,7 +179,8 @@ def _start(layout: Layout, chunk: Chunk, ready: dict[int, Any]) -> dict[str, Any
     """
     devices = 1 if layout.mesh is None else layout.mesh.size
     single = layout.together == 1 and (layout.width > 1 or layout.points == 1)
-    width = EIGHT * devices * math.ceil(layout.width / (EIGHT * devices)) if single else layout.width
+    width, step = layout.width, EIGHT * devices * blocks(math.ceil(layout.width / devices), layout.recipe.lanes)
+    width = step * math.ceil(width / step) if single else width
     columns = np.minimum(chunk.seeds.start + np.arange(width), chunk.seeds.stop - 1)
     seeds = np.asarray(layout.seeds)[columns] if not isinstance(layout.seeds, range) else layout.seeds.start + columns
     linear = layout.linear

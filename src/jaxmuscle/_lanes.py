@@ -16,18 +16,21 @@ from ._spectrum import SpectrumSettings, filtered_power
 from ._task import AbstractTask
 
 DRAWN = 8
+LANES = 1024
 
 
 class Recipe(eqx.Module):
     """What is computed of every seed: on which grid, sampled how, with or without states, and the Welch power over `edges`.
 
-    `every` is the ratio of the run's rate to the spectrum's; `edges` [samples] are None where no spectrum is asked for.
+    A device simulates at most `lanes` seeds side by side, what is more one block after the other. `every` is the ratio of
+    the run's rate to the spectrum's; `edges` [samples] are None where no spectrum is asked for.
     """
 
     grid: Grid
     sampling: str = eqx.field(static=True)
     states: bool = eqx.field(static=True)
     settings: SpectrumSettings
+    lanes: int = eqx.field(static=True, default=LANES)
     every: int = eqx.field(static=True, default=1)
     edges: tuple[int, int] | None = eqx.field(static=True, default=None)
 
@@ -84,13 +87,26 @@ def _power(output: Array, recipe: Recipe) -> Array:
     return filtered_power(output[:, :: recipe.every], recipe.settings, recipe.edges)
 
 
+def blocks(seeds: int, lanes: int) -> int:
+    """How many blocks of at most `lanes` seeds that makes."""
+    return -(-seeds // lanes)
+
+
 @eqx.filter_jit
 def run_seeds(task: Any, linear: Any, key: Any, seeds: Any, recipe: Recipe, mesh: Mesh | None) -> dict[str, Any]:
     """Output, finiteness and what else the recipe asks for, of one task and every seed."""
 
     def local(arrays, seeds):
         task, linear, key = eqx.combine(arrays, rest)
-        return _responses(task, linear, _paths(task.noise, key, seeds, recipe.grid), recipe)
+
+        def block(seeds):
+            return _responses(task, linear, _paths(task.noise, key, seeds, recipe.grid), recipe)
+
+        count = blocks(len(seeds), recipe.lanes)
+        if count == 1 or len(seeds) % count:
+            return block(seeds)
+        found = jax.lax.map(block, seeds.reshape(count, -1))
+        return jax.tree.map(lambda values: values.reshape(len(seeds), *values.shape[2:]), found)
 
     arrays, rest = eqx.partition((task, linear, key), eqx.is_array)
     return _shared(local, mesh, (P(), P("lanes")))(arrays, seeds)
