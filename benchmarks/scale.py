@@ -18,97 +18,14 @@ import jax
 import jax.numpy as jnp
 import numba
 import numpy as np
-from handwritten import filter_matrices
+from batched import DT, SEEDS, STEPS, band_by_hand, grid_inputs, numbers, white_by_hand
 from measure import Row, Unequal, require_equal, seconds, speed_ratio, speeds
 
 import jaxmuscle as jm
-from jaxmuscle._lanes import draw
 from jaxmuscle._parameter import as_arrays
 
-SEEDS, DT, EVERY, STEPS = 1024, 1e-3, 10, 2000
 OURS, BEST = "jaxmuscle.ensemble", "hand-written batched lax.scan"
 EPSILONS = 200
-BAND = (float(jm.BandLimitedNoise().rate), float(jm.BandLimitedNoise().cutoff))
-
-
-def _numbers(task: Any) -> tuple[Any, ...]:
-    m = task.muscle
-    return (m.m_w, m.m_z, m.stiffness_w.k, m.stiffness_z.k, m.damping_w.c, m.damping_z.c, m.stiffness_w.x_ref**2,
-            m.stiffness_z.x_ref**2, m.damping_w.v_ref**2, m.damping_z.v_ref**2)  # fmt: skip
-
-
-def _slope(p: tuple, inputs: tuple, y: tuple, noise: tuple) -> tuple:
-    """Increment of (x_w, v_w, x_z, v_z), one array per state; `inputs` and `noise` (of K_w, K_z, C_w, C_z) times dt."""
-    m_w, m_z, k_w, k_z, c_w, c_z, xw2, xz2, vw2, vz2 = p
-    (x_w, v_w, x_z, v_z), (dt, P_w, F_ext, harmonic_w, harmonic_z) = y, inputs
-    K_w = dt * k_w * (xw2 + x_w**2) + harmonic_w + noise[0]
-    K_z = dt * k_z * (xz2 + x_z**2) + harmonic_z + noise[1]
-    C_w, C_z = dt * c_w * (vw2 + v_w**2) + noise[2], dt * c_z * (vz2 + v_z**2) + noise[3]
-    passive = C_z * (v_z - v_w) + K_z * (x_z - x_w)
-    return dt * v_w, (P_w - C_w * v_w - K_w * x_w + passive) / m_w, dt * v_z, -(F_ext + passive) / m_z
-
-
-def _inputs(task: Any) -> tuple:
-    """Times dt, at the beginning and end of every step: dt, P_w, F_ext and the harmonic's part of K_w and K_z."""
-    times = jnp.arange(STEPS + 1) * DT
-    base = task.muscle.base()
-    wave = jax.vmap(task.harmonic)(times)
-    rows = [DT * jnp.ones_like(times), *(DT * jax.vmap(f)(times) for f in (task.P_w, task.F_ext)), DT * base[0] * wave,
-            DT * base[1] * wave]  # fmt: skip
-    return tuple(jnp.stack([row[:-1], row[1:]], 1).reshape(-1, EVERY, 2) for row in rows)
-
-
-def _heun(p: tuple, inputs: tuple, y: tuple, before: tuple, after: tuple) -> tuple:
-    first = _slope(p, tuple(i[0] for i in inputs), y, before)
-    moved = tuple(a + b for a, b in zip(y, first, strict=True))
-    second = _slope(p, tuple(i[1] for i in inputs), moved, after)
-    return tuple(a + 0.5 * (b + c) for a, b, c in zip(y, first, second, strict=True))
-
-
-def _kept(step: Any, carry: Any, xs: Any) -> Any:
-    def block(carry, x):
-        carry, _ = jax.lax.scan(lambda c, x: (step(c, x), None), carry, x)
-        return carry, carry[0]
-
-    _, states = jax.lax.scan(block, carry, xs)
-    return jnp.moveaxis(jnp.stack(states, -1), 0, 1)
-
-
-def white_by_hand(task: Any, key: Any) -> Any:
-    """One array per state, seeds side by side, normals drawn for every seed as jaxmuscle does."""
-    scale = task.noise_scale() * jnp.sqrt(DT / task.noise.rate)
-    normals = jnp.moveaxis(draw(task.noise, key, jnp.arange(SEEDS), STEPS), 0, -1).reshape(-1, EVERY, 4, SEEDS)
-    p, start = _numbers(task), tuple(jnp.zeros(SEEDS) for _ in range(4))
-
-    def step(carry, x):
-        inputs, n = x
-        noise = tuple(scale[i] * n[i] for i in range(4))
-        return (_heun(p, inputs, carry[0], noise, noise),)
-
-    return _kept(step, (start,), (_inputs(task), normals))
-
-
-def band_by_hand(task: Any, key: Any) -> Any:
-    """The same with the filter's recursion in the loop."""
-    noise = task.noise
-    f, root, deviation = filter_matrices(*BAND, DT)
-    scale = DT * deviation * task.noise_scale()
-    drawn = draw(noise, key, jnp.arange(SEEDS), STEPS)
-    normals = jnp.moveaxis(drawn, 0, -1)
-    f, root = jnp.asarray(f, normals.dtype), jnp.asarray(root, normals.dtype)
-    p, start = _numbers(task), tuple(jnp.zeros(SEEDS) for _ in range(4))
-
-    def step(carry, x):
-        (y, n, slope), (inputs, kick) = carry, x
-        new = tuple(f[0, 0] * n[i] + f[0, 1] * slope[i] + root[0, 0] * kick[i] for i in range(4))
-        steep = tuple(
-            f[1, 0] * n[i] + f[1, 1] * slope[i] + root[1, 0] * kick[i] + root[1, 1] * kick[4 + i] for i in range(4)
-        )
-        before, after = (tuple(scale[i] * values[i] for i in range(4)) for values in (n, new))
-        return _heun(p, inputs, y, before, after), new, steep
-
-    rows = tuple(normals[0, i] for i in range(8))
-    return _kept(step, (start, rows[:4], rows[4:]), (_inputs(task), normals[1:].reshape(-1, EVERY, 8, SEEDS)))
 
 
 @numba.njit(fastmath=True)
@@ -139,17 +56,10 @@ def _numba_loop(rng, p, scale, P_w, F_ext, harmonic_w, harmonic_z, seeds, steps,
         out[seed] = y[2]
 
 
-def _grid_inputs(task: Any) -> list[np.ndarray]:
-    """P_w, F_ext and the harmonic's part of K_w and K_z at the grid points."""
-    times = np.arange(STEPS + 1) * DT
-    wave, base = np.asarray(jax.vmap(task.harmonic)(times)), np.asarray(task.muscle.base())
-    return [np.asarray(jax.vmap(f)(times)) for f in (task.P_w, task.F_ext)] + [base[0] * wave, base[1] * wave]
-
-
 def _anchors(task: Any) -> dict[str, Any]:
     """numba with PCG64, and C if there is a compiler; both return the last x_z of every seed."""
-    inputs = [np.ascontiguousarray(row, np.float32) for row in _grid_inputs(task)]
-    p = tuple(np.float32(v) for v in _numbers(task))
+    inputs = [np.ascontiguousarray(row, np.float32) for row in grid_inputs(task)]
+    p = tuple(np.float32(v) for v in numbers(task))
     scale = np.asarray(task.noise_scale() * np.sqrt(DT / float(task.noise.rate)), np.float32)
 
     def by_numba():
@@ -244,7 +154,7 @@ def threads(repetitions: int) -> list[Row]:
     cores = sorted(os.sched_getaffinity(0))
     if len(cores) < 2:
         return []
-    seeds = 32_768
+    seeds = 131_072
     groups = {
         "one core": [_worker(cores[:1], 1, seeds)],
         "two threads": [_worker(cores[:2], 2, seeds)],
@@ -267,10 +177,10 @@ def threads(repetitions: int) -> list[Row]:
 
 
 def processes(repetitions: int) -> list[Row]:
-    """`jaxmuscle ensemble` as 1, 2 and 4 processes on the loopback: speed once compiled, and the whole command."""
+    """`jaxmuscle ensemble` as 1, 2 and 4 processes on the loopback: the whole command, and its speed once compiled."""
     found, base = [], 0.0
     for count in (1, 2, 4):
-        whole, speed = zip(*(_command(count) for _ in range(max(1, repetitions // 3))), strict=True)
+        whole, speed = zip(*(_pace(count) for _ in range(max(1, repetitions // 3))), strict=True)
         found.append(Row(f"processes: {count}, speed", float(np.median(speed)), "seeds/s"))
         found.append(Row(f"processes: {count}, whole command with start and compilation", float(np.median(whole)), "s"))
         base = base or float(np.median(speed))
@@ -279,27 +189,30 @@ def processes(repetitions: int) -> list[Row]:
     return found
 
 
-def _command(count: int) -> tuple[float, float]:
-    """Seconds of the command, and seeds per second of all processes (the first one's times their number)."""
+def _pace(count: int) -> tuple[float, float]:
+    """Seconds of the command for few seeds, and seeds per second: by how much longer it takes for many more."""
+    few, many = 32_768, 425_984
+    short, long = _command(count, few), _command(count, many)
+    return short, (many - few) / (long - short)
+
+
+def _command(count: int, seeds: int) -> float:
+    """Seconds of the command."""
     folder = tempfile.mkdtemp()
     with socket.socket() as listener:
         listener.bind(("127.0.0.1", 0))
         port = listener.getsockname()[1]
-    command = [sys.executable, "-m", "jaxmuscle._cli", "ensemble", "zagrodny-slifkin", "--seeds", "32768", "--reduce",
-               "--json", "--duration", "1", "--devices", "1", "--out", f"{folder}/a.zarr"]  # fmt: skip
+    command = [sys.executable, "-m", "jaxmuscle._cli", "ensemble", "zagrodny-slifkin", "--seeds", str(seeds), "--reduce",
+               "--duration", "1", "--devices", "1", "--out", f"{folder}/a.zarr"]  # fmt: skip
     each = [["--coordinator", f"127.0.0.1:{port}", "--processes", str(count), "--process-id", str(i)]
             for i in range(count)] if count > 1 else [[]]  # fmt: skip
     begun = time.perf_counter()
-    workers = [
-        subprocess.Popen([*command, *more], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True) for more in each
-    ]
-    told = [worker.communicate()[0] for worker in workers]
-    if any(worker.returncode for worker in workers):
+    workers = [subprocess.Popen([*command, *more], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) for more in each]
+    if any([worker.wait() for worker in workers]):
         raise Unequal(f"processes: {count} processes failed")
+    taken = time.perf_counter() - begun
     shutil.rmtree(folder)
-    lines = [json.loads(line) for line in told[0].splitlines() if line.startswith("{")]
-    paces = [line["seeds_per_second"] for line in lines if line["event"] == "progress"]
-    return time.perf_counter() - begun, count * paces[-1]
+    return taken
 
 
 MEMORY = """

@@ -10,12 +10,14 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 import xarray
+from test_simulate import Integral
 from typer.testing import CliRunner
 
 import jaxmuscle as jm
@@ -32,20 +34,11 @@ PYTHON = [sys.executable, "-c"]
 COMMAND = [sys.executable, "-m", "jaxmuscle._cli"]
 
 
-class Brittle(jm.AbstractTask):
+class Brittle(Integral):
     """`y' = ΔK_w - y`, which breaks for good where ΔK_w exceeds a limit."""
-
-    state_names = ("y",)
-    state_units = ("N s/m",)
-    output_name = "y"
-    output_unit = "N s/m"
-    smoothness_needed = (0, 0, 0, 0)
 
     def vector_field(self, t, y, u):
         return jnp.where(u[:1] > 3.3, jnp.inf, u[:1]) - y
-
-    def output(self, t, y, u, du):
-        return y[0]
 
 
 BRITTLE = Brittle(noise=jm.OrnsteinUhlenbeckNoise(1.0, 0.01, relative=False), harmonic=jm.Harmonic(0.0))
@@ -122,6 +115,15 @@ def test_a_reduced_ensemble_has_the_moments_of_the_whole_one():
     assert "30 seeds" in str(found)
     ax = found.plot()
     assert ax.get_ylabel().endswith("(N)") and len(ax.collections) == 1
+
+
+def test_a_stored_summary_is_the_one_in_memory(tmp_path):
+    options: Any = {"seeds": 4, "duration": 15.0, "reduce": True}
+    found = jm.ensemble(TASK, KEY, **options)
+    stored = jm.ensemble(TASK, KEY, store=tmp_path / "a.zarr", **options)
+    assert stored.spectrum.seeds == found.spectrum.seeds == 4
+    jax.tree.map(np.testing.assert_array_equal, stored.spectrum, found.spectrum)
+    assert str(stored) == str(found)
 
 
 def test_a_run_too_short_for_a_spectrum_has_none():
@@ -479,6 +481,27 @@ def test_several_processes_give_the_numbers_of_one(tmp_path, count, reduce):
     close(found["mean"], whole.mean)
     close(found["variance"], whole.variance)
     np.testing.assert_allclose(found["quantiles"], whole.quantile, rtol=1e-6)
+
+
+ALONE = """
+import sys, jax, jaxmuscle as jm
+from jaxmuscle._processes import join
+rank, port = int(sys.argv[1]), sys.argv[2]
+join(f"127.0.0.1:{port}", 2, rank)
+jax.devices()  # JAX itself waits for all here
+if rank == 0:
+    print(jm.ensemble(jm.Isometric(), jax.random.key(5), seeds=12, duration=1.0).output.shape, flush=True)
+jax.distributed.shutdown()
+"""
+
+
+def test_one_of_several_processes_simulates_alone_in_memory():
+    """Only a store is shared: who has none must not wait for the others."""
+    port = str(free_port())
+    workers = [subprocess.Popen([*PYTHON, ALONE, str(rank), port], env=environment(), stdout=subprocess.PIPE, text=True)
+               for rank in range(2)]  # fmt: skip
+    told = [worker.communicate(timeout=120)[0].strip() for worker in workers]
+    assert told == ["(12, 101)", ""] and [worker.returncode for worker in workers] == [0, 0]
 
 
 def wait_for(condition, seconds=120.0):

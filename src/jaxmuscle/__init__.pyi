@@ -58,6 +58,7 @@ from ._posterior import Posterior as Posterior
 from ._posterior import posterior as posterior
 from ._preset import load_preset as load_preset
 from ._preset import save_preset as save_preset
+from ._processes import ProcessLostError as ProcessLostError
 from ._profile import Profile as Profile
 from ._profile import profile as profile
 from ._recording import Recording as Recording

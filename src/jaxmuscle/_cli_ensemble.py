@@ -11,13 +11,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from ._console import NOT_CONVERGED, Seed, TaskName, err, out, progress, reporting
+from ._console import NOT_CONVERGED, Preset, Seed, TaskName, err, out, progress, reporting, task_of
 
 if TYPE_CHECKING:
     from ._ensemble_plan import Pace
     from ._task import AbstractTask
 
-Preset = Annotated[str, typer.Argument(help="Bundled preset (see `jaxmuscle presets`), preset file or fit.json.")]
 Devices = Annotated[int | None, typer.Option(min=1, help="Cores of a CPU to use, each as a device; all by default.")]
 Json = Annotated[bool, typer.Option("--json", help="One JSON object per line instead of text.")]
 
@@ -62,9 +61,7 @@ def ensemble(
     """
     with alone_or_together(coordinator, processes):
         from ._cache import keep_compiled_programs
-        from ._preset import load_preset
         from ._processes import join, launched
-        from ._task import TASKS
 
         if states and reduce:
             raise ValueError("--states belongs to a store of trajectories: leave out --reduce")
@@ -72,9 +69,7 @@ def ensemble(
         if launched() or any(given is not None for given in (coordinator, processes, process_id)):
             join(coordinator, processes, process_id)
         keep_compiled_programs()
-        model = load_preset(preset)
-        if task is not None and type(model) is not TASKS[task]:
-            model = model.as_task(TASKS[task])
+        model = task_of(preset, task)
         settings = {"duration": duration, "dt": dt, "chunk": chunk, "resume": resume, "states": states}
         if not run(model, swept(model, vary or []), seeds, seed, output, settings, reduce=reduce, as_json=as_json):
             raise typer.Exit(NOT_CONVERGED)
@@ -85,11 +80,11 @@ def run(
 ) -> bool:
     """Simulate and say how it went; whether every seed stayed finite."""
     import jax
-    import numpy as np
 
     from ._ensemble import ensemble as simulate_all
     from ._ensemble_plan import Watch
     from ._ensemble_store import attributes_of
+    from ._simulate import listed
 
     first = jax.process_index() == 0
     before = attributes_of(output).get("complete") if settings["resume"] and output.exists() else None
@@ -100,25 +95,24 @@ def run(
         kept: Any = {"reduce": True} if reduce else {}
         found: Any = simulate_all(model if sweep is None else sweep, jax.random.key(seed), seeds=seeds, store=output,
                                   progress=Watch(tell), **kept, **settings)  # fmt: skip
-    failed = attributes_of(output).get("failed", "[]")
-    elapsed, number = time.monotonic() - begun, len(json.loads(failed))
+    failed, elapsed = json.loads(attributes_of(output)["failed"]), time.monotonic() - begun
     if not first:
-        return number == 0
+        return not failed
     if as_json:
         print(json.dumps({"event": "done", "out": str(output), "seeds": seeds, "elapsed_s": round(elapsed, 3),
-                          "failed": json.loads(failed)}), flush=True)  # fmt: skip
-        return number == 0
+                          "failed": failed}), flush=True)  # fmt: skip
+        return not failed
     if reduce:
         out.print(str(found), highlight=False)
     else:
         sizes = ", ".join(f"{name} {size}" for name, size in found.sizes.items())
         out.print(f"{type(model).__name__}: {', '.join(map(str, found.data_vars))} ({sizes})", highlight=False)
-    if number and not reduce:
-        shown = np.array(json.loads(failed))[:10, 1].tolist()
-        err.print(f"[bold red]failed:[/] {number} seed(s) did not stay finite ({shown}): lower the noise amplitude or dt")
+    if failed and not reduce:
+        shown = listed([seed for _, seed in failed])
+        err.print(f"[bold red]failed:[/] {len(failed)} seed(s) did not stay finite ({shown}): lower the noise or dt")
     said = f"{output}: was complete, nothing to do" if before else f"Written: {output} in {elapsed:.1f} s"
     out.print(said, highlight=False, soft_wrap=True)
-    return number == 0
+    return not failed
 
 
 @contextmanager
@@ -210,14 +204,11 @@ def speed(
     Reduces an ensemble as `jaxmuscle ensemble --reduce` does, without control variate; medians of three calls.
     """
     with reporting():
-        from ._preset import load_preset
         from ._speed import measure
         from ._task import TASKS, Isometric
 
         use(precision, devices, cores(None, None))
-        model = Isometric() if preset is None else load_preset(preset)
-        if task is not None and type(model) is not TASKS[task]:
-            model = model.as_task(TASKS[task])
+        model = task_of(preset, task) if preset else Isometric() if task is None else TASKS[task]()
         found = measure(model, seeds, duration)
         if as_json:
             print(json.dumps(found))

@@ -5,14 +5,14 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from ._console import Output, Seed, TaskName, csv_text, err, out, reporting, save_figure, writable
+from ._console import Output, Preset, Seed, TaskName, csv_text, err, out, reporting, save_figure, task_of, writable
 
 if TYPE_CHECKING:
     from ._task import AbstractTask
 
 
 def simulate(
-    preset: Annotated[str, typer.Argument(help="Bundled preset (see `jaxmuscle presets`), preset file or fit.json.")],
+    preset: Preset,
     task: Annotated[TaskName | None, typer.Option(help="Put the same muscle into another task.")] = None,
     seeds: Annotated[int, typer.Option(min=1, help="Noise paths.")] = 50,
     seed: Seed = 0,
@@ -30,13 +30,9 @@ def simulate(
     """
     with reporting():
         from ._cache import keep_compiled_programs
-        from ._preset import load_preset
-        from ._task import TASKS
 
         keep_compiled_programs()
-        model = load_preset(preset)
-        if task is not None and type(model) is not TASKS[task]:
-            model = model.as_task(TASKS[task])
+        model = task_of(preset, task)
         writable(output)
         _simulate(model, seeds, seed, output)
 

@@ -27,6 +27,18 @@ class TaskName(StrEnum):
     force = "prescribed-force"
 
 
+Preset = Annotated[str, typer.Argument(help="Bundled preset (see `jaxmuscle presets`), preset file or fit.json.")]
+
+
+def task_of(preset: str, task: TaskName | None) -> Any:
+    """The task of a preset, its muscle put into another task if one is named."""
+    from ._preset import load_preset
+    from ._task import TASKS
+
+    model = load_preset(preset)
+    return model if task is None or type(model) is TASKS[task] else model.as_task(TASKS[task])
+
+
 @contextlib.contextmanager
 def reporting() -> Iterator[None]:
     """Turn a user's mistake into one line and exit code 2, a numerical failure into 1, an interruption into 130."""

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Int, PRNGKeyArray
 
-from ._ensemble_plan import Layout, Pace, Watch, companions, covers_window, laid_out, plan_of, run_chunks
+from ._ensemble_plan import Layout, Pace, Watch, companions, covers_window, cut_of, laid_out, plan_of, run_chunks
 from ._ensemble_run import begun_with, reduced, stored
 from ._ensemble_summary import EnsembleSummary
 from ._linear import LinearTask
@@ -87,9 +87,7 @@ def ensemble(  # pyright: ignore[reportInconsistentOverload]
         task = Sweep.of(task)
     numbers: Any = range(seeds) if isinstance(seeds, int) else np.asarray(seeds)
     if len(numbers) == 0:
-        raise ValueError("seeds = 0: an ensemble needs at least one seed")
-    if isinstance(seeds, int) and seeds < 0:
-        raise ValueError(f"seeds = {seeds} must be at least 1")
+        raise ValueError(f"seeds = {seeds}: an ensemble needs at least one seed")
     if chunk is not None and chunk < 1:
         raise ValueError(f"chunk = {chunk} must be at least 1")
     if (resume or states) and store is None:
@@ -105,10 +103,11 @@ def ensemble(  # pyright: ignore[reportInconsistentOverload]
         return trajectories(task, linear, key, jnp.asarray(np.asarray(numbers)), plan)
     linear = companions(task, duration, control)
     kept = levels is not None or store is not None
-    spectrum = kept and covers_window(plan, task.task if isinstance(task, Sweep) else task)
+    spectrum = kept and covers_window(plan, task)
     whole = not kept or (states and levels is None)
     cut = begun_with(Path(store)) if store is not None and resume and chunk is None else None
-    layout = laid_out(task, key, numbers, plan, linear, chunk=chunk, cut=cut, states=whole, spectrum=spectrum)
+    cut = cut_of(task, len(numbers), plan, chunk, shared=store is not None) if cut is None else cut
+    layout = laid_out(task, key, numbers, plan, linear, cut=cut, states=whole, spectrum=spectrum)
     with telling(progress, layout) as tell:
         if levels is not None:
             return reduced(layout, levels, None if store is None else Path(store), tell, resume=resume)

@@ -1,5 +1,6 @@
 """How an ensemble is cut into chunks, and what runs one of them."""
 
+import dataclasses
 import math
 import time
 from collections.abc import Callable, Iterable, Iterator
@@ -113,28 +114,31 @@ def laid_out(
     plan: Plan,
     linear: tuple[LinearTask, ...] | None,
     *,
-    chunk: int | None,
-    cut: Cut | None,
+    cut: Cut,
     states: bool,
     spectrum: bool,
 ) -> Layout:
-    """The layout, cut as given or as `cut_of` says."""
-    settings = (task.task if isinstance(task, Sweep) else task).settings
-    edges = every = None
+    """The layout; with `spectrum` the Welch power of every seed is computed, with `states` they are kept."""
+    settings = _one_of(task).settings
+    recipe = Recipe(plan.grid, plan.sampling, states, settings, lanes_of(plan))
     if spectrum:
         edges = (round(WINDOW[0] * settings.rate), round(WINDOW[1] * settings.rate))
-        every = round(plan.rate / settings.rate)
-    recipe = Recipe(plan.grid, plan.sampling, states, settings, lanes_of(plan), every or 1, edges)
-    together, width = cut_of(task, len(seeds), plan, chunk) if cut is None else cut
-    return Layout(task, key, seeds, plan, linear, recipe, together, width, local_mesh())
+        recipe = dataclasses.replace(recipe, every=round(plan.rate / settings.rate), edges=edges)
+    return Layout(task, key, seeds, plan, linear, recipe, *cut, local_mesh())
 
 
-def cut_of(task: AbstractTask | Sweep, seeds: int, plan: Plan, chunk: int | None) -> Cut:
+def _one_of(task: AbstractTask | Sweep) -> AbstractTask:
+    """A task with the classes and settings of all points."""
+    return task.task if isinstance(task, Sweep) else task
+
+
+def cut_of(task: AbstractTask | Sweep, seeds: int, plan: Plan, chunk: int | None, *, shared: bool) -> Cut:
     """As many seeds at once as the cache of every device likes, times `BLOCKS`; whole points where their seeds are few.
 
-    The same for all processes: what process 0 says.
+    Where processes share the work, what process 0 says.
     """
-    lanes = int(agreed(str(lanes_of(plan) * jax.local_device_count()))) if chunk is None else chunk
+    lanes = lanes_of(plan) * jax.local_device_count() if chunk is None else chunk
+    lanes = int(agreed(str(lanes))) if shared else lanes
     if isinstance(task, Sweep) and 2 * seeds <= lanes:
         return Cut(min(len(task), lanes // seeds), seeds)
     lanes *= BLOCKS if chunk is None else 1
@@ -146,9 +150,9 @@ def lanes_of(plan: Plan) -> int:
     return max(EIGHT, min(LANES, EIGHT * (STEPS_AT_ONCE // plan.grid.steps // EIGHT)))
 
 
-def covers_window(plan: Plan, task: AbstractTask) -> bool:
+def covers_window(plan: Plan, task: AbstractTask | Sweep) -> bool:
     """Whether a run covers the analysed 5 s to 15 s at a multiple of the spectrum's rate."""
-    every = plan.rate / task.settings.rate
+    every = plan.rate / _one_of(task).settings.rate
     whole = every >= 1 and abs(every - round(every)) < 1e-9 * every
     return whole and plan.grid.dt * plan.grid.steps >= WINDOW[1] - 1e-9
 
@@ -178,7 +182,7 @@ def _start(layout: Layout, chunk: Chunk, ready: dict[int, Any]) -> dict[str, Any
     `ready` keeps the arrays of the last single task, which are made once.
     """
     devices = 1 if layout.mesh is None else layout.mesh.size
-    single = layout.together == 1 and (layout.width > 1 or layout.points == 1)
+    single = layout.together == 1
     width, step = layout.width, EIGHT * devices * blocks(math.ceil(layout.width / devices), layout.recipe.lanes)
     width = step * math.ceil(width / step) if single else width
     columns = np.minimum(chunk.seeds.start + np.arange(width), chunk.seeds.stop - 1)

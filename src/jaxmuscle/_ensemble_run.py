@@ -14,13 +14,14 @@ from jaxtyping import Int
 from ._ensemble_plan import Chunk, Cut, Layout, Pace, run_chunks
 from ._ensemble_store import (
     SETTINGS,
-    Log,
     Reduced,
     StoreError,
     Variable,
     attributes_of,
+    begin_log,
     complete,
     create,
+    log_chunk,
     logged,
     read_tallies,
     state_of,
@@ -35,8 +36,7 @@ from ._processes import agreed, meet, rank_and_count
 from ._simulate import SimulationError
 from ._sweep import Sweep
 from ._tally import CELLS, add, count_cells, empty, set_cells
-from ._task import AbstractTask
-from ._trajectory import WINDOW, versions
+from ._trajectory import WINDOW, run_attributes, versions
 
 if TYPE_CHECKING:
     import xarray
@@ -56,21 +56,21 @@ def reduced(layout: Layout, levels: tuple[float, ...], path: Path | None, tell: 
         tally = empty(layout.points, values, _time(layout).size, len(levels), whole=layout.whole)
         return Reduced(tally, frozenset(), [])
 
-    blank = _summary(layout, levels, nothing(), settings)
+    blank = _summary(layout, levels, nothing())
     if path is None:
         found = _reduce(layout, levels, nothing(), range(layout.chunks), tell, lambda found: None)
-        return _summary(layout, levels, found, settings)
+        return _summary(layout, levels, found)
     variables = {name: Variable(dims, array.shape, array.shape, array.dtype, units,
                                 array if name in blank.coordinates() else None)
                  for name, (dims, array, units) in blank.arrays().items()}  # fmt: skip
     if _opened(path, variables, blank.coordinates(), blank.attributes(), settings, resume=resume):
         _share_tallies(layout, levels, path, tell, nothing)
         if rank_and_count()[0] == 0:
-            whole = _summary(layout, levels, read_tallies(path, nothing()), settings)
+            whole = _summary(layout, levels, read_tallies(path, nothing()))
             write_region(path, ..., {name: array for name, (_, array, _) in whole.arrays().items()})
             complete(path, {"failed": json.dumps(whole.failed.tolist())})
         meet()
-    return _loaded(layout, levels, path, blank)
+    return _loaded(path, blank)
 
 
 def _share_tallies(
@@ -169,12 +169,12 @@ def stored(layout: Layout, path: Path, tell: Tell, *, resume: bool, states: bool
         rank, count = rank_and_count()
         done = logged(path)
         meet()
-        log = Log(path, rank)
+        begin_log(path, rank)
         todo = [n for n in range(layout.chunks) if n not in done][rank::count]
         for chunk, found in run_chunks(layout, todo, tell):
             region, parts = _region(layout, chunk, found, states=states)
             write_region(path, region, parts)
-            log.add(chunk.number, _failed(layout, chunk, found))
+            log_chunk(path, rank, chunk.number, _failed(layout, chunk, found))
         meet()
         if rank == 0:
             there = logged(path)
@@ -271,18 +271,18 @@ def _time(layout: Layout) -> np.ndarray:
     return np.arange(layout.plan.grid.steps // layout.plan.grid.every + 1) / layout.plan.rate
 
 
-def _summary(layout: Layout, levels: tuple[float, ...], found: Reduced, settings: dict) -> EnsembleSummary:
+def _summary(layout: Layout, levels: tuple[float, ...], found: Reduced) -> EnsembleSummary:
     expected = None
     if _bins(layout) and layout.linear is not None:
         spectra = [expected_spectrum(layout.task_of(i), layout.recipe.settings) for i in range(layout.points)]
         expected = np.stack([np.asarray(spectrum.power, float) for spectrum in spectra])
     failed: Int[np.ndarray, "failed 2"] = np.array(sorted(found.failed), int).reshape(-1, 2)
-    about = _about(layout) | {"cells_per_quantile": None if layout.whole else CELLS}
+    about = _about(layout) | ({} if layout.whole else {"cells_per_quantile": CELLS})
     return summarised(found.tally, layout.task, (len(layout.seeds), _bins(layout)), _time(layout), levels,
                       layout.recipe.settings, expected, failed, about)  # fmt: skip
 
 
-def _loaded(layout: Layout, levels: tuple[float, ...], path: Path, blank: EnsembleSummary) -> EnsembleSummary:
+def _loaded(path: Path, blank: EnsembleSummary) -> EnsembleSummary:
     """The summary in a complete store."""
     import zarr
 
@@ -293,20 +293,9 @@ def _loaded(layout: Layout, levels: tuple[float, ...], path: Path, blank: Ensemb
 
 def _about(layout: Layout) -> dict[str, Any]:
     """What was run, as attributes."""
-    task, plan = layout.task_of(0), layout.plan
-    known = _parameters(task) if not isinstance(layout.task, Sweep) else {
-        name: entry for name, entry in _parameters(task).items() if name not in layout.task.labels}  # fmt: skip
-    return {
-        "task": type(task).__name__, "muscle": type(task.muscle).__name__, "noise": type(task.noise).__name__,
-        "parameters": json.dumps(known), "spectrum_settings": json.dumps(task.settings.to_dict()), "dt": plan.grid.dt,
-        "substeps": plan.grid.substeps, "rate": plan.rate, "sampling": plan.sampling,
-        "precision": str(jax.numpy.result_type(float)), "versions": json.dumps(versions()),
-    }  # fmt: skip
-
-
-def _parameters(task: AbstractTask) -> dict[str, Any]:
-    return {name: {"value": float(value), "unit": PARAMETERS[name].unit if name in PARAMETERS else ""}
-            for name, value in as_numbers(task.parameters).items()}  # fmt: skip
+    plan, labels = layout.plan, layout.task.labels if isinstance(layout.task, Sweep) else ()
+    made = run_attributes(layout.task_of(0), plan.rate, plan.grid.dt, plan.grid.substeps, plan.sampling, labels)
+    return made | {"precision": str(jax.numpy.result_type(float))}
 
 
 def settings_of(layout: Layout) -> dict[str, Any]:
@@ -316,7 +305,7 @@ def settings_of(layout: Layout) -> dict[str, Any]:
     everything = _digest(str(jax.tree.structure(numbers)), *jax.tree.leaves(numbers))
     seeds = layout.seeds
     given = f"0 to {len(seeds) - 1}" if isinstance(seeds, range) else f"{len(seeds)}, digest {_digest(seeds)}"
-    parameters = {name: entry["value"] for name, entry in _parameters(task).items()}
+    parameters = {name: float(value) for name, value in as_numbers(task.parameters).items()}
     return {
         "task": type(task).__name__, "muscle": type(task.muscle).__name__, "noise": type(task.noise).__name__,
         "points": layout.points, "parameters": parameters, "inputs and everything else": everything,

@@ -129,20 +129,21 @@ def write_region(path: Path, region: Any, values: Mapping[str, np.ndarray]) -> N
             array[region] = part
 
 
-class Log:
-    """Which chunks of a store this process completed: a line each, appended once the chunk is written."""
+def begin_log(path: Path, rank: int) -> None:
+    """Start, or go on with, the log of the chunks that this process completes; ends a line that a full disk has cut."""
+    _append(path, rank, b"\n")
 
-    def __init__(self, path: Path, rank: int):
-        self.path, self.file = path, path / f"{DONE}{rank}.txt"
-        with writing(path), self.file.open("ab") as file:
-            file.write(b"\n")  # ends a line that a full disk may have cut
 
-    def add(self, chunk: int, failed: list[list[int]]) -> None:
-        """A chunk is there, with these failed (point, seed)."""
-        with writing(self.path), self.file.open("ab") as file:
-            file.write(json.dumps({"chunk": chunk, "failed": failed}).encode() + b" ok\n")
-            file.flush()
-            os.fsync(file.fileno())
+def log_chunk(path: Path, rank: int, chunk: int, failed: list[list[int]]) -> None:
+    """A chunk has been written, with these failed (point, seed)."""
+    _append(path, rank, json.dumps({"chunk": chunk, "failed": failed}).encode() + b" ok\n")
+
+
+def _append(path: Path, rank: int, line: bytes) -> None:
+    with writing(path), (path / f"{DONE}{rank}.txt").open("ab") as file:
+        file.write(line)
+        file.flush()
+        os.fsync(file.fileno())
 
 
 def logged(path: Path) -> dict[int, list[list[int]]]:

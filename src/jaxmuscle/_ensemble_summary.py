@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from ._estimate import SpectrumEstimate, from_moments
+from ._simulate import listed
 from ._spectrum import SpectrumSettings
 from ._sweep import Sweep
 from ._tally import Tally, quantiles
@@ -17,6 +18,11 @@ from ._task import AbstractTask
 if TYPE_CHECKING:
     import xarray
     from matplotlib.axes import Axes
+
+
+# Fields of a spectrum, and their names as arrays.
+SPECTRUM = {"power": "power", "stderr": "power_stderr", "plain_power": "plain_power", "plain_stderr": "plain_stderr",
+            "expected": "power_expected"}  # fmt: skip
 
 
 class EnsembleSummary(eqx.Module):
@@ -50,11 +56,10 @@ class EnsembleSummary(eqx.Module):
         """What failed, in words."""
         if self.success:
             return "every seed stayed finite"
-        shown = ", ".join(str(seed) if not isinstance(self.task, Sweep) else f"{seed} of point {point}"
-                          for point, seed in self.failed[:10])  # fmt: skip
-        more = f" and {len(self.failed) - 10} more" if len(self.failed) > 10 else ""
-        return (f"{len(self.failed)} seed(s) did not stay finite and are left out ({shown}{more}): lower the noise "
-                "amplitude or dt")  # fmt: skip
+        swept = isinstance(self.task, Sweep)
+        names = [f"{seed} of point {point}" if swept else seed for point, seed in self.failed]
+        return (f"{len(names)} seed(s) did not stay finite and are left out ({listed(names)}): lower the noise amplitude "
+                "or dt")  # fmt: skip
 
     @property
     def spectrum(self) -> SpectrumEstimate:
@@ -89,9 +94,7 @@ class EnsembleSummary(eqx.Module):
 
     def attributes(self) -> dict[str, Any]:
         """What was run, and which seeds failed."""
-        attributes = {name: value if isinstance(value, str | int | float | bool) else json.dumps(value)
-                      for name, value in self.about.items() if value is not None}  # fmt: skip
-        return attributes | {"failed": json.dumps(self.failed.tolist())}
+        return self.about | {"failed": json.dumps(self.failed.tolist())}
 
     def arrays(self) -> dict[str, tuple[tuple[str, ...], np.ndarray, str]]:
         """Dimensions, values and unit of everything, by name."""
@@ -108,10 +111,9 @@ class EnsembleSummary(eqx.Module):
             found["frequency"] = ("frequency",), self.spectra[0].frequency, "Hz"
             found["coefficient_of_variation"] = lead, self.coefficient_of_variation[..., 0], "1"
             found["coefficient_of_variation_stderr"] = lead, self.coefficient_of_variation[..., 1], "1"
-            for name in ("power", "stderr", "plain_power", "plain_stderr", "expected"):
+            for name, label in SPECTRUM.items():
                 rows = [getattr(spectrum, name) for spectrum in self.spectra]
                 if rows[0] is not None:
-                    label = name if name.endswith("power") or name.startswith("plain") else f"power_{name}"
                     values = np.stack(rows) if swept else rows[0]
                     found[label] = ((*lead, "frequency"), values, f"{unit}^2/Hz")
         if isinstance(self.task, Sweep):
@@ -123,11 +125,12 @@ class EnsembleSummary(eqx.Module):
         variation, spectra = self.coefficient_of_variation, self.spectra
         if spectra:
             variation = np.stack([arrays["coefficient_of_variation"], arrays["coefficient_of_variation_stderr"]], axis=-1)
-            names = {"power": "power", "stderr": "power_stderr", "plain_power": "plain_power",
-                     "plain_stderr": "plain_stderr", "expected": "power_expected"}  # fmt: skip
-            rows = {name: np.atleast_2d(arrays[label]) for name, label in names.items() if label in arrays}
-            spectra = tuple(dataclasses.replace(spectrum, **{name: values[i] for name, values in rows.items()})
-                            for i, spectrum in enumerate(spectra))  # fmt: skip
+            rows = {name: np.atleast_2d(arrays[label]) for name, label in SPECTRUM.items() if label in arrays}
+            left = [self.seeds - int(np.sum(failed[:, 0] == point)) for point in range(len(spectra))]
+            spectra = tuple(
+                dataclasses.replace(spectrum, seeds=left[i], **{name: values[i] for name, values in rows.items()})
+                for i, spectrum in enumerate(spectra)
+            )
         return dataclasses.replace(self, mean=arrays["mean"], variance=arrays["variance"], quantile=arrays["quantiles"],
                                    coefficient_of_variation=variation, spectra=spectra, failed=failed)  # fmt: skip
 

@@ -1,5 +1,7 @@
 """One chunk of an ensemble: the compiled program for some points and seeds, shared by the devices of this process."""
 
+import functools
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -43,16 +45,12 @@ def local_mesh() -> Mesh | None:
 
 def draw(noise: AbstractNoise, key: PRNGKeyArray, seeds: Int[Array, " seeds"], steps: int) -> Any:
     """Normals of every seed; seed i depends on nothing but the key and i. Few at a time, which stay in the cache."""
-    return jax.lax.map(lambda i: noise.draw(jax.random.fold_in(key, i), steps), seeds, batch_size=DRAWN)
+    return _drawn(noise, key, seeds, steps, lambda normals: normals)
 
 
-def _paths(noise: AbstractNoise, key: PRNGKeyArray, seeds: Int[Array, " seeds"], grid: Grid) -> Realisation:
-    """Noise paths of every seed, drawn as in `draw`."""
-
-    def one(seed):
-        return noise.realise(noise.draw(jax.random.fold_in(key, seed), grid.steps), grid.dt)
-
-    return jax.lax.map(one, seeds, batch_size=DRAWN)
+def _drawn(noise: AbstractNoise, key: PRNGKeyArray, seeds: Int[Array, " seeds"], steps: int, use: Callable) -> Any:
+    """What `use` makes of the normals of every seed."""
+    return jax.lax.map(lambda i: use(noise.draw(jax.random.fold_in(key, i), steps)), seeds, batch_size=DRAWN)
 
 
 def respond(task: AbstractTask, path: Realisation, grid: Grid, sampling: str) -> tuple[Array, Array]:
@@ -87,12 +85,28 @@ def _power(output: Array, recipe: Recipe) -> Array:
     return filtered_power(output[:, :: recipe.every], recipe.settings, recipe.edges)
 
 
+def _dispatched(program: Callable) -> Callable:
+    """Compiled for the arrays among its arguments, the rest fixed. Returns at once, where `eqx.filter_jit` would wait."""
+
+    @functools.partial(jax.jit, static_argnums=(1, 2))
+    def compiled(arrays, leaves, structure):
+        return program(*eqx.combine(arrays, jax.tree.unflatten(structure, leaves)))
+
+    @functools.wraps(program)
+    def run(*given):
+        arrays, rest = eqx.partition(given, lambda leaf: isinstance(leaf, jax.Array | np.ndarray))
+        leaves, structure = jax.tree.flatten(rest)
+        return compiled(arrays, tuple(leaves), structure)
+
+    return run
+
+
 def blocks(seeds: int, lanes: int) -> int:
     """How many blocks of at most `lanes` seeds that makes."""
     return -(-seeds // lanes)
 
 
-@eqx.filter_jit
+@_dispatched
 def run_seeds(task: Any, linear: Any, key: Any, seeds: Any, recipe: Recipe, mesh: Mesh | None) -> dict[str, Any]:
     """Output, finiteness and what else the recipe asks for, of one task and every seed."""
 
@@ -100,7 +114,9 @@ def run_seeds(task: Any, linear: Any, key: Any, seeds: Any, recipe: Recipe, mesh
         task, linear, key = eqx.combine(arrays, rest)
 
         def block(seeds):
-            return _responses(task, linear, _paths(task.noise, key, seeds, recipe.grid), recipe)
+            grid = recipe.grid
+            paths = _drawn(task.noise, key, seeds, grid.steps, lambda normals: task.noise.realise(normals, grid.dt))
+            return _responses(task, linear, paths, recipe)
 
         count = blocks(len(seeds), recipe.lanes)
         if count == 1 or len(seeds) % count:
@@ -112,7 +128,7 @@ def run_seeds(task: Any, linear: Any, key: Any, seeds: Any, recipe: Recipe, mesh
     return _shared(local, mesh, (P(), P("lanes")))(arrays, seeds)
 
 
-@eqx.filter_jit
+@_dispatched
 def run_points(tasks: Any, linears: Any, key: Any, seeds: Any, recipe: Recipe, mesh: Mesh | None) -> dict[str, Any]:
     """The same for every task along a leading axis of points; all of them get the same normals."""
 

@@ -1,6 +1,7 @@
 """Simulation of a task: the grid, the sub-steps that keep it stable, one seed."""
 
 import math
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -161,9 +162,9 @@ def require_finite(found: Trajectory, where: str = "") -> None:
         )
 
 
-def listed(numbers: Any) -> str:
-    """The first ten of some numbers."""
-    return ", ".join(str(int(n)) for n in numbers[:10]) + (f" and {len(numbers) - 10} more" if len(numbers) > 10 else "")
+def listed(items: Sequence | np.ndarray) -> str:
+    """The first ten of some numbers or names."""
+    return ", ".join(str(item) for item in items[:10]) + (f" and {len(items) - 10} more" if len(items) > 10 else "")
 
 
 def told(task: AbstractTask) -> str:

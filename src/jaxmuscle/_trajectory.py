@@ -129,24 +129,34 @@ class Trajectory(eqx.Module):
         data = {task.output_name: (dims, np.asarray(self.output), {"units": task.output_unit})}
         for name, unit in zip(task.state_names, task.state_units, strict=True):
             data.setdefault(name, (dims, np.asarray(self.state(name)), {"units": unit}))
-        parameters = {
-            name: {"value": float(value), "unit": PARAMETERS[name].unit if name in PARAMETERS else ""}
-            for name, value in as_numbers(self.task.parameters).items()
-        }
-        attributes = {
-            "task": type(task).__name__,
-            "noise": type(task.noise).__name__,
-            "parameters": json.dumps(parameters),
-            "spectrum_settings": json.dumps(task.settings.to_dict()),
-            "dt": self.dt,
-            "substeps": self.substeps,
-            "sampling": self.sampling,
-            "versions": json.dumps(versions()),
-        }
+        attributes = run_attributes(task, self.rate, self.dt, self.substeps, self.sampling)
         coordinates: dict[str, Any] = {"time": ("time", self.time, {"units": "s"}), "seed": np.asarray(self.seeds)}
         if not single:
             coordinates["seed"] = ("seed", np.asarray(self.seeds))
         return xarray.Dataset(data, coords=coordinates, attrs=attributes)
+
+
+def run_attributes(
+    task: AbstractTask, rate: float, dt: float, substeps: int, sampling: str, without: Iterable[str] = ()
+) -> dict[str, Any]:
+    """What a file says about how its trajectories were made; parameters `without` those that vary."""
+    parameters = {
+        name: {"value": float(value), "unit": PARAMETERS[name].unit if name in PARAMETERS else ""}
+        for name, value in as_numbers(task.parameters).items()
+        if name not in without
+    }
+    return {
+        "task": type(task).__name__,
+        "muscle": type(task.muscle).__name__,
+        "noise": type(task.noise).__name__,
+        "parameters": json.dumps(parameters),
+        "spectrum_settings": json.dumps(task.settings.to_dict()),
+        "rate": rate,
+        "dt": dt,
+        "substeps": substeps,
+        "sampling": sampling,
+        "versions": json.dumps(versions()),
+    }
 
 
 @functools.cache
