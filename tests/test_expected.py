@@ -16,6 +16,7 @@ import jaxmuscle as jm
 from jaxmuscle._expected import _Autocovariance, covariance_operator, expected_moments
 from jaxmuscle._linear import has_response
 from jaxmuscle._parameter import as_arrays
+from jaxmuscle._uncertainty import target_variation
 
 KEY = jax.random.key(31)
 WINDOW, SHIFTED = (5.0, 15.0), (2.7, 12.7)
@@ -468,6 +469,31 @@ def test_the_mean_of_simulations_is_as_expected(x64):
         expected = np.asarray(jm.expected_spectrum(task, window=window).power)
         z.append((power.mean(axis=0) - expected) / (power.std(axis=0, ddof=1) / np.sqrt(len(power))))
     references.assert_standard_normal(z, every=3)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("amplitude", [0.0, 0.04], ids=["noise", "mostly a line"])
+def test_the_coefficient_of_variation_of_a_recording_scatters_as_expected(x64, amplitude):
+    """Recordings of 9.6 s by the nonlinear simulator; 400 of them know their standard deviation to 3.5 %."""
+    task = jm.Isometric().replace(harmonic_amplitude=amplitude)
+    runs = jm.ensemble(jm.settled(task), KEY, seeds=400, control=False)
+    held = np.asarray(runs.between((5.0, 14.6)))
+    variation = held.std(axis=1) / held.mean(axis=1)
+    moments = expected_moments(as_arrays(task), task.settings, (5.0, 14.6))[0]
+    assert variation.mean() == pytest.approx(float(moments.variation), rel=0.02)
+    target = jm.Target("ten seconds", np.ones(30), segments=6, coefficient_of_variation=0.01, settings=task.settings)
+    assert task.settings.length + 5.5 * task.settings.step == 960
+    value, sd = target_variation(target, task)
+    assert value == np.log(0.01)
+    assert sd == pytest.approx(np.log(variation).std(), rel=0.11)
+    line = float(moments.variance) - float(expected_moments(as_arrays(quiet_line(task)), task.settings, WINDOW)[0].variance)
+    assert (line / float(moments.variance) > 0.5) == (amplitude > 0)
+    several = jm.Target("trials", np.ones(30), segments=(6,) * 4, coefficient_of_variation=0.01, settings=task.settings)
+    assert target_variation(several, task)[1] == pytest.approx(sd / 2)
+
+
+def quiet_line(task):
+    return task.replace(harmonic_amplitude=0.0)
 
 
 def snapped(P_w=41.57, F_ext=7.0):

@@ -27,7 +27,7 @@ from jaxmuscle._likelihood import Likelihood, welch_law
 from jaxmuscle._operating import equilibrium
 from jaxmuscle._parameter import DEFAULT_FREE, PARAMETERS, as_arrays
 from jaxmuscle._trajectory import WINDOW
-from jaxmuscle._uncertainty import bin_statistics
+from jaxmuscle._uncertainty import target_variation
 
 TRUTH = jm.Isometric().replace(harmonic_amplitude=0.012, harmonic_frequency=5.0)
 LOADED = TRUTH.as_task(jm.PrescribedForce, P_w=0.0)
@@ -206,12 +206,11 @@ def test_a_single_number_adds_one_row(x64, what):
     setup, theta = setup_at(fitted())
     given = {"coefficient_of_variation": True} if what == "variation" else {"mean": 0.03}
     found = design_information(setup, theta, jm.Design("one number", segments=0, **given))
-    power = moments_of(TRUTH).power
-    p = power / power.sum()
     if what == "variation":
         # The variance in the window ripples with the frequency.
         row = slopes(TRUTH, lambda m: 0.5 * np.log(m.variance) - np.log(m.mean), step=0.2 * STEP)
-        sd = 0.5 * np.sqrt(p @ bin_statistics(setup.target).covariance @ p)
+        stated = jm.Target("stated", np.ones(30), segments=SEGMENTS, coefficient_of_variation=0.01)
+        sd = target_variation(stated, TRUTH)[1]  # tests/test_expected.py checks it by simulation
     else:
         row, sd = slopes(TRUTH, lambda m: np.log(m.mean)), 0.03
     expected = np.outer(row, row) / sd**2

@@ -209,6 +209,33 @@ def test_density_is_summed_over_the_frequency():
             assert float(numeric[i]) == pytest.approx((sides[1] - sides[0]) / (2 * step), rel=1e-4, abs=1e-5)
 
 
+@pytest.mark.slow
+def test_the_common_scale_is_counted_from_the_coefficient_of_variation():
+    """The density of the amplitudes as they are, up to a constant; the coordinate alone moves the model's variation."""
+    with jax.enable_x64(True):
+        setup = taken_up(sloppy())
+        marginal, _, _ = marginal_of(setup, Likelihood.of(setup), theta_of(setup, sloppy().task))
+        assert marginal.level is not None
+        plain = eqx.tree_at(lambda m: m.level, marginal, None, is_leaf=lambda x: x is None)
+        columns = list(marginal.columns)
+
+        @jax.jit
+        def both(white):
+            s, offset = marginal.split(white)
+            sampled = jnp.append(s[jnp.asarray(columns)], offset)
+            same = jnp.linalg.solve(plain.scale, sampled - plain.centre)
+            return marginal.log_density(white), plain.log_density(same)
+
+        points = 0.5 * np.random.default_rng(0).normal(size=(12, marginal.size))
+        found = np.array([both(jnp.asarray(point)) for point in points])
+        assert np.ptp(found[:, 0]) > 3  # else there is nothing to compare
+        np.testing.assert_allclose(np.diff(found[:, 0]), np.diff(found[:, 1]), atol=1e-6)
+        level, s = marginal.level, jnp.asarray(marginal.point)
+        moved = [float(marginal.log_variation(marginal.levelled(s.at[level.column].add(d))[0], level.weight)[0])
+                 for d in (0.0, 0.1)]  # fmt: skip
+        assert moved[1] - moved[0] == pytest.approx(0.1 * level.sd, rel=1e-3)  # noise on damping is fixed, but tiny
+
+
 def bare():
     return jm.Target("bare", np.linspace(2, 1, 30))
 

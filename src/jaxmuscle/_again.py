@@ -61,7 +61,7 @@ def taken_up(
         mean_force=None if settings["mean_force"] is None else tuple(settings["mean_force"]),
         dt=settings.get("dt", DT),
     )
-    return plan.setup
+    return plan.setup.scattering_as(result.task.with_parts(settings=plan.setup.target.settings))
 
 
 def _default(result: FitResult, name: str) -> float:

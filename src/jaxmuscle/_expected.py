@@ -172,20 +172,26 @@ def covariance_operator(settings: SpectrumSettings) -> Float[np.ndarray, "bins l
 
 
 def noise_response(
-    task: AbstractTask, settings: SpectrumSettings, window: tuple[float, float]
-) -> tuple[Float[Array, " bins"], Float[Array, ""], Linearisation]:
-    """Expected Welch power and variance in the window without the harmonic, and the linearisation."""
-    system = linearise(task)
+    task: AbstractTask, system: Linearisation, settings: SpectrumSettings, window: tuple[float, float]
+) -> tuple[Float[Array, " bins"], Float[Array, ""]]:
+    """Expected Welch power and variance in the window without the harmonic."""
     samples = round(window[1] * settings.rate) - round(window[0] * settings.rate)
     operator = covariance_operator(settings)
     lags = operator.shape[1]
     r = _autocovariance(_covariances(task, system), 1 / settings.rate, max(lags, samples), settings.sampling)
-    return jnp.asarray(operator, r.zero.dtype) @ r.lagged(lags), r.zero - r.mean_variance(samples), system
+    return jnp.asarray(operator, r.zero.dtype) @ r.lagged(lags), r.zero - r.mean_variance(samples)
+
+
+def noise_variance(task: AbstractTask, system: Linearisation) -> Float[Array, ""]:
+    """Stationary variance of the output without the harmonic, at an instant."""
+    found = _covariances(task, system)
+    return found.row @ found.start
 
 
 def response(task: AbstractTask, settings: SpectrumSettings, window: tuple[float, float]) -> tuple[Moments, Linearisation]:
     """Expected moments of the linearised task in the window, and the linearisation. Not finite where it is unstable."""
-    noise, variance, system = noise_response(task, settings, window)
+    system = linearise(task)
+    noise, variance = noise_response(task, system, settings, window)
     line, swing = harmonic_line(task, system, settings, window)
     return Moments(noise + line, line, system.rest, variance + swing), system
 
@@ -196,6 +202,27 @@ def expected_moments(
 ) -> tuple[Moments, Linearisation]:
     """`response`, compiled."""
     return response(task, settings, window)
+
+
+@eqx.filter_jit
+def log_variation_sd(task: AbstractTask, settings: SpectrumSettings, samples: int) -> Float[Array, ""]:
+    """Standard deviation of the log of the coefficient of variation of so many successive samples, in linear response.
+
+    For Gaussian noise of autocovariance r and a line of mean square h at the frequency f, whose sum has the variance s²,
+
+        Var s² = 2/n Σ_l (1 - |l|/n) r̃(lΔ)² + 4h/n Σ_l (1 - |l|/n) r̃(lΔ) cos(2πf lΔ),    r̃ = r - Var(mean),
+
+    and sd(ln CV) = √(Var s²) / (2 s²). How the mean scatters is left out: it counts as CV² beside this.
+    """
+    system = linearise(task)
+    found = _autocovariance(_covariances(task, system), 1 / settings.rate, samples, settings.sampling)
+    r = found.lagged(samples) - found.mean_variance(samples)
+    _, swing = harmonic_line(task, system, settings, (WINDOW[0], WINDOW[0] + samples / settings.rate))
+    lag = jnp.arange(samples, dtype=r.dtype)
+    weight = jnp.where(lag > 0, 2.0, 1.0) * (1 - lag / samples) / samples
+    turning = jnp.cos(2 * np.pi * task.harmonic.frequency * lag / settings.rate)
+    variance = jnp.sum(weight * (2 * r**2 + 4 * swing * r * turning))
+    return 0.5 * jnp.sqrt(variance) / (r[0] + swing)
 
 
 def expected_spectrum(

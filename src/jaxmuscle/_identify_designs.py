@@ -228,7 +228,7 @@ def _with_data(setup: Setup, design: Design, moments: Any) -> Setup:
         design.name, moments.proportional, bins=old.bins, quantity=old.quantity, segments=old.segments,
         coefficient_of_variation=sd / abs(mean) if design.coefficient_of_variation else None, settings=old.settings,
     )  # fmt: skip
-    further = target_variation(target), None if design.mean is None else (mean, design.mean * abs(mean))
+    further = target_variation(target, setup.task), None if design.mean is None else (mean, design.mean * abs(mean))
     return dataclasses.replace(setup, target=target, extra=further)
 
 

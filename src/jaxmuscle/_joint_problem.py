@@ -124,6 +124,13 @@ class JointSetup:
         """The target whose bins are narrowest."""
         return min((setup.target for setup in self.setups.values()), key=lambda target: target.settings.resolution)
 
+    def scattering_as(self, s: Float[np.ndarray, " free"]) -> "JointSetup":
+        """The setup with coefficients of variation that scatter as those of the tasks at these coordinates do."""
+        theta = np.asarray(self.coordinates.theta(s))
+        setups = {name: setup.scattering_as(setup.at(self.theta_of_part(theta, i)))
+                  for i, (name, setup) in enumerate(self.setups.items())}  # fmt: skip
+        return dataclasses.replace(self, setups=setups)
+
     def linear(self, shares: list[Any] | None = None, corrections: list[Any] | None = None) -> JointProblem:
         """The problem in linear response, as `Setup.linear` with a list entry for each target."""
         none = [None] * len(self.setups)

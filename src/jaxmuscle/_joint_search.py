@@ -36,6 +36,7 @@ def search_jointly(plan: JointPlan) -> JointResult:
     if not np.isfinite(first.cost[first.best]):
         return report_joint(setup, problem, first, first, plan.settings, plan.seed, most, {})
     best = first.s[contenders(setup.coordinates, setup.finest, first, RIVAL_MARGIN)[:BATCH]]
+    setup = setup.scattering_as(first.s[first.best])
     shares = [np.clip(np.nan_to_num(m.line / m.power), 0.0, 1.0) for m in seen_best(problem, first).moments]
     problem = setup.linear(shares)
     found = _stage(setup, problem, best, most, "linear response", (0.6, 0.7))

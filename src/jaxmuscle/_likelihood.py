@@ -207,7 +207,7 @@ def _target_likelihood(task, bins, chosen, variation, window):
     moments = expected_moments(task, task.settings, window)[0]
     found = log_marginal(bins, moments.power[chosen], moments.line[chosen])
     if variation is not None:
-        found += _gaussian(((jnp.log(moments.variation) - variation[0]) / variation[1])[None])
+        found += _gaussian(((jnp.log(moments.variation) - variation[0]) / variation[1])[None]) - jnp.log(variation[1])
     return found
 
 
@@ -223,7 +223,8 @@ def log_likelihood(task: AbstractTask, data: Target | Recording) -> Scalar:
     """Log likelihood of measured data under a task in linear response; differentiable in the task.
 
     A `Target` with segments: its Welch bins are correlated gamma variables about the expected spectrum (`log_density`),
-    their unknown total integrated out; with its coefficient of variation as one more Gaussian datum, if it states one.
+    their unknown total integrated out; with its coefficient of variation as one more datum, Gaussian in the log with the
+    standard deviation that it has under this task, if it states one.
     A `Recording`: the Whittle likelihood of the periodogram of its window, in its own units, between the first and last
     bin of the task's settings, about the *expected* periodogram of a window of that length (leakage and aliases included:
     debiased Whittle, Sykulski et al. 2019, doi:10.1093/biomet/asy071). With a line L_k in noise N_k,
@@ -240,7 +241,7 @@ def log_likelihood(task: AbstractTask, data: Target | Recording) -> Scalar:
     if isinstance(data, Target):
         task = task.with_parts(settings=data.settings)
         bins = jax.tree.map(jnp.asarray, measured_bins(data))
-        variation = target_variation(data)
+        variation = target_variation(data, task)
         return _target_likelihood(as_arrays(task), bins, data.bins - data.settings.first_bin, variation, WINDOW)
     whole = data.fft_spectrum(task.settings.replace(window="boxcar"))
     duration = whole.settings.length / whole.settings.rate

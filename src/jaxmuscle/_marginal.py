@@ -10,11 +10,13 @@ from jaxtyping import Array, Complex, Float
 
 from ._again import highest
 from ._climb import Peak
-from ._expected import Moments, noise_response
+from ._expected import Moments, noise_response, noise_variance
 from ._law import Scalar
 from ._likelihood import Likelihood
 from ._line import LineTable, harmonic_size, line_table
+from ._linear import Linearisation, linearise
 from ._objective import at
+from ._parameter import CHANNELS
 from ._problem import Setup
 from ._signal import Constant
 from ._trajectory import WINDOW
@@ -73,13 +75,32 @@ def _rational(A: Array, b: Array, c: Array, d: Array, e: Array) -> tuple[Array, 
     return inside + through + jnp.concatenate([e * denominator, jnp.zeros(1, A.dtype)]), denominator
 
 
+class Level(NamedTuple):
+    """The common scale of the amplitudes, as the coordinate of one of them, counted from a fixed coefficient of variation.
+
+    Only the coefficient of variation shows that scale, and narrowly: in the amplitudes themselves the posterior is a thin
+    curved sheet that chains hardly follow; counted from there the scale is all but a normal variable of its own. `column`
+    is the coordinate of one amplitude, `start` its value at the maximum, `sd` its prior standard deviation,
+    `log_variation` that at the maximum, `along` what a common factor does to all coordinates, `weight` of the harmonic's
+    frequencies.
+    """
+
+    column: int
+    start: Float[Array | np.ndarray, ""]
+    sd: Float[Array | np.ndarray, ""]
+    log_variation: Float[Array | np.ndarray, ""]
+    along: Float[Array | np.ndarray, " free"]
+    weight: Float[Array | np.ndarray, " grid"]
+
+
 class Marginal(eqx.Module):
     """Log posterior density of the unbounded coordinates s (without the harmonic's frequency) and the offset.
 
         ln p(s, u) = ln Σ_j w_j L(θ(s), f_j, u) - ½ Σ θ² + ln |dθ/ds|
 
     over the grid f_j of the harmonic's frequency, w_j its prior density times the width of the cell. Without a free
-    frequency there is one f_j. `columns` are the sampled coordinates among the free ones, `centre` and `scale` whiten them.
+    frequency there is one f_j. `columns` are the sampled coordinates among the free ones, `centre` and `scale` whiten them,
+    one of them being counted from a `level` (the Jacobian of which is constant).
     """
 
     likelihood: Likelihood
@@ -91,6 +112,7 @@ class Marginal(eqx.Module):
     scale: Float[Array | np.ndarray, "sampled sampled"]
     columns: tuple[int, ...] = eqx.field(static=True)
     offset: bool = eqx.field(static=True)
+    level: Level | None = None
 
     @property
     def size(self) -> int:
@@ -99,12 +121,42 @@ class Marginal(eqx.Module):
 
     def split(self, white: Float[Array, " sampled"]) -> tuple[Float[Array, " free"], Scalar]:
         """Unbounded coordinates (with the point's own where not sampled) and the offset of whitened ones."""
-        both = self.centre + self.scale @ white
-        s = jnp.asarray(self.point).at[jnp.asarray(self.columns)].set(both[: len(self.columns)])
-        return s, both[-1] if self.offset else jnp.zeros(())
+        return self.placed(self.centre + self.scale @ white)[:2]
 
-    def features(self, s: Float[Array, " free"]) -> Features | Moments:
-        """Of the model at s; the moments themselves where there is no grid."""
+    def placed(
+        self, both: Float[Array | np.ndarray, " sampled"]
+    ) -> tuple[Float[Array, " free"], Scalar, Linearisation | None]:
+        """The same of sampled coordinates, with the linearised task if that was needed."""
+        s = jnp.asarray(self.point).at[jnp.asarray(self.columns)].set(both[: len(self.columns)])
+        s, system = self.levelled(s)
+        return s, both[-1] if self.offset else jnp.zeros(()), system
+
+    def levelled(self, s: Float[Array, " free"]) -> tuple[Float[Array, " free"], Linearisation | None]:
+        """Coordinates s of which one is counted from the level, as they are."""
+        level = self.level
+        if level is None:
+            return s, None
+        s, above = s.at[level.column].set(level.start), level.sd * (s[level.column] - level.start)
+        found, system = self.log_variation(s, level.weight)
+        return s + (level.log_variation + above - found) * level.along, system
+
+    def log_variation(
+        self, s: Float[Array, " free"], weight: Float[Array | np.ndarray, " grid"]
+    ) -> tuple[Scalar, Linearisation]:
+        """Log coefficient of variation of a long recording, the harmonic's frequencies weighted; the linearised task."""
+        problem = self.likelihood.problem
+        task = at(problem.task, problem.coordinates, problem.coordinates.theta(s))
+        system = linearise(task)
+        variance, base = noise_variance(task, system), task.harmonic_base()
+        top, below = _rational(system.A, system.B @ base, system.C, system.D @ base, system.E @ base)
+        frequency = jnp.asarray(self.frequency) if self.table is not None else task.harmonic.frequency
+        s = jax.lax.complex(jnp.zeros_like(frequency), 2 * jnp.pi * frequency)
+        reply = harmonic_size(task, system.A.dtype) * _polynomial(top, s) / _polynomial(below, s)
+        line = 0.5 * jnp.sum(weight * (jnp.real(reply) ** 2 + jnp.imag(reply) ** 2))
+        return 0.5 * jnp.log(variance + line) - jnp.log(jnp.abs(system.rest)), system
+
+    def features(self, s: Float[Array, " free"], system: Linearisation | None = None) -> Features | Moments:
+        """Of the model at s (linearised already); the moments themselves where there is no grid."""
         problem = self.likelihood.problem
         theta = problem.coordinates.theta(s)
         if self.table is None:
@@ -112,7 +164,8 @@ class Marginal(eqx.Module):
         task = at(problem.task, problem.coordinates, theta)
         model: Any = problem.model
         chosen, correction = model.chosen, model.correction
-        power, variance, system = noise_response(task, task.settings, WINDOW)
+        system = linearise(task) if system is None else system
+        power, variance = noise_response(task, system, task.settings, WINDOW)
         base = task.harmonic_base()
         top, below = _rational(system.A, system.B @ base, system.C, system.D @ base, system.E @ base)
         size = harmonic_size(task, system.A.dtype)
@@ -137,8 +190,8 @@ class Marginal(eqx.Module):
 
     def log_density(self, white: Float[Array, " sampled"]) -> Scalar:
         """The density; minus infinity where the task has no stable equilibrium."""
-        s, offset = self.split(white)
-        found = jax.nn.logsumexp(self.heights(self.features(s), offset)) + self.log_prior(s)
+        s, offset, system = self.placed(self.centre + self.scale @ white)
+        found = jax.nn.logsumexp(self.heights(self.features(s, system), offset)) + self.log_prior(s)
         return jnp.where(jnp.isfinite(found), found, -jnp.inf)
 
     def at_frequencies(self, white: Float[Array, " sampled"]) -> Float[Array, " grid"]:
@@ -178,7 +231,35 @@ def marginal_of(setup: Setup, likelihood: Likelihood, theta: Float[np.ndarray, "
     scale = np.linalg.cholesky(covariance + 1e-10 * np.diag(np.diag(covariance)))
     centre = np.append(s[list(columns)], peak.offset[best])[: len(kept)]
     made = Marginal(likelihood, frequency, log_weight, table, s, centre, scale, columns, offset)
+    level = _level(setup, made, peak.offset[best])
+    if level is not None:
+        made = eqx.tree_at(lambda m: m.level, made, level, is_leaf=lambda x: x is None)
+        turn = np.eye(len(kept))
+        inner = np.ix_(range(len(columns)), range(len(columns)))
+        turn[inner] = np.asarray(jax.jit(jax.jacfwd(lambda s: made.levelled(s)[0]))(jnp.asarray(s)))[
+            np.ix_(columns, columns)
+        ]
+        made = eqx.tree_at(lambda m: m.scale, made, np.linalg.solve(turn, scale))
     return made, peak, best
+
+
+def _level(setup: Setup, made: Marginal, offset: float) -> Level | None:
+    """The level, where a coefficient of variation is known and an amplitude is free and without bounds."""
+    names, c = setup.coordinates.names, setup.coordinates
+    free = [(n.startswith("noise_") and n.removeprefix("noise_") in CHANNELS) or n == "harmonic_amplitude" for n in names]
+    loose = np.array(free) & c.positive & ~np.isfinite(c.low)
+    if setup.extra[0] is None or not loose.any() or not isinstance(setup.task.harmonic.envelope, Constant):
+        return None
+    s = jnp.asarray(made.point)
+
+    @jax.jit
+    def seen(s: Array) -> tuple[Array, Array]:
+        weight = jax.nn.softmax(made.heights(made.features(s), jnp.asarray(offset)))
+        return weight, made.log_variation(s, weight)[0]
+
+    weight, variation = map(np.asarray, seen(s))
+    column = int(np.argmax(np.where(loose, [n != "harmonic_amplitude" for n in names], -1.0)))
+    return Level(column, np.asarray(s[column]), c.sd[column], variation, np.where(loose, 1 / c.sd, 0.0), weight)
 
 
 def _grid(setup: Setup, peak: Peak) -> Float[np.ndarray, " grid"]:

@@ -214,7 +214,8 @@ def _reported(
     setup: Setup, marginal: Marginal, found: Chains, result: FitResult, key: Array | int, warmup: int
 ) -> Posterior:
     shape = found.log_density.shape
-    theta = _thetas(setup, marginal, found)
+    theta, s = _thetas(setup, marginal, found)
+    found = found._replace(s=s)
     flat = theta.reshape(-1, theta.shape[-1])
     derived, moments = _consequences(marginal.likelihood.problem, flat)
     values = setup.coordinates.values_of(flat)
@@ -241,13 +242,12 @@ def _reported(
                      settings, key if isinstance(key, int) else None, versions())  # fmt: skip
 
 
-def _thetas(setup: Setup, marginal: Marginal, found: Chains) -> Float[np.ndarray, "chains draws free"]:
-    """θ of every draw, the harmonic's frequency drawn from its grid given the rest, anywhere in its cell."""
+def _thetas(setup: Setup, marginal: Marginal, found: Chains) -> tuple[np.ndarray, np.ndarray]:
+    """θ of every draw, the harmonic's frequency drawn from its grid given the rest, anywhere in its cell; s and offset."""
     coordinates, names = setup.coordinates, setup.coordinates.names
-    columns = list(marginal.columns)
     both = found.s.reshape(-1, found.s.shape[-1])
-    s = np.tile(np.asarray(marginal.point), (len(both), 1))
-    s[:, columns] = both[:, : len(columns)]
+    parts = [np.asarray(_placed(marginal, jnp.asarray(part))) for part in _filled(both)]
+    s = np.concatenate(parts)[: len(both)]
     theta = np.asarray(coordinates.theta(s))
     if marginal.table is not None:
         white = np.linalg.solve(np.asarray(marginal.scale), (both - np.asarray(marginal.centre)).T).T
@@ -258,7 +258,14 @@ def _thetas(setup: Setup, marginal: Marginal, found: Chains) -> Float[np.ndarray
         edges = edges_of(np.asarray(marginal.frequency))
         frequency = edges[chosen] + place * (edges[chosen + 1] - edges[chosen])
         theta[:, names.index("harmonic_frequency")] = coordinates.theta_of("harmonic_frequency", frequency)
-    return theta.reshape(*found.log_density.shape, -1)
+    shape = found.log_density.shape
+    sampled = np.concatenate([s[:, list(marginal.columns)], both[:, len(marginal.columns) :]], axis=1)
+    return theta.reshape(*shape, -1), sampled.reshape(*shape, -1)
+
+
+@eqx.filter_jit
+def _placed(marginal: Marginal, both: Array) -> Array:
+    return jax.lax.map(lambda row: marginal.placed(row)[0], both, batch_size=16)
 
 
 @eqx.filter_jit

@@ -13,6 +13,7 @@ from jaxtyping import Array, Float
 from ._expected import Moments
 from ._lanes import draw
 from ._law import Scalar
+from ._linear import has_response
 from ._objective import Coordinates, Linear, MonteCarlo, at
 from ._operating import fastest_rate
 from ._parameter import as_arrays
@@ -21,7 +22,7 @@ from ._simulate import DURATION, MAX_RATE_STEP, whole
 from ._target import Target
 from ._task import AbstractTask
 from ._trajectory import WINDOW
-from ._uncertainty import BinStatistics, bin_statistics, shares_map
+from ._uncertainty import BinStatistics, bin_statistics, shares_map, target_variation
 
 MOST_SUBSTEPS = 16
 
@@ -116,6 +117,16 @@ class Setup:
         """Steps of the noise grid per sampling interval. Raises `ValueError` if dt does not divide it."""
         interval = 1 / self.target.settings.rate
         return whole(interval / self.dt, f"dt = {self.dt} s does not divide the sampling interval {interval} s")
+
+    def at(self, theta: Float[np.ndarray, " free"]) -> AbstractTask:
+        """The task with the values that θ stands for."""
+        return self.task.replace(**{name: float(value) for name, value in self.coordinates.values(theta).items()})
+
+    def scattering_as(self, task: AbstractTask) -> "Setup":
+        """The setup with a coefficient of variation that scatters as that of this task does."""
+        if self.extra[0] is None or not has_response(task, required=False):
+            return self
+        return dataclasses.replace(self, extra=(target_variation(self.target, task), self.extra[1]))
 
     def linear(self, line_share: np.ndarray | None = None, correction: Moments | None = None) -> Problem:
         """The problem in linear response, times a correction of its moments."""

@@ -81,7 +81,8 @@ def search_together(plans: list[Plan], tell: Callable[[str, float], None]) -> li
     first = _together([setup.linear() for setup in setups], points, plans[0].max_steps, "trying starts", tell, (0.0, 0.7))
     best = [stage.descent.s[contenders(s.coordinates, s.target, stage.descent, RIVAL_MARGIN)[:BATCH]]
             for s, stage in zip(setups, first, strict=True)]  # fmt: skip
-    problems = [setup.linear(_share(stage.problem, stage.descent)) for setup, stage in zip(setups, first, strict=True)]
+    problems = [_known(setup, stage.problem, stage.descent) for setup, stage in zip(setups, first, strict=True)]
+    problems = [setup.linear(share) for setup, share in problems]
     second = _together(problems, best, plans[0].max_steps, "linear response", tell, (0.7, 0.8))
     results = []
     for plan, *stages in zip(plans, first, second, strict=True):
@@ -132,7 +133,7 @@ def _linear(setup: Setup, points: np.ndarray, max_steps: int, stages: list[Stage
     if not np.isfinite(first.cost[first.best]):
         return
     best = first.s[contenders(setup.coordinates, setup.target, first, RIVAL_MARGIN)[:BATCH]]
-    share = _share(problem, first)
+    setup, share = _known(setup, problem, first)
     problem = setup.linear(share)
     show = _stage(setup, stages, problem, "linear response", (0.5, 0.6), 15)
     found = descend(problem, best, max_steps, report=show)
@@ -153,8 +154,7 @@ def _linear(setup: Setup, points: np.ndarray, max_steps: int, stages: list[Stage
 
 def correction_at(setup: Setup, theta: Float[np.ndarray, " free"]) -> Moments | None:
     """Moments of the nonlinear model over those of the linear response at θ; None if it cannot be simulated."""
-    values = setup.coordinates.values(theta)
-    task = setup.task.replace(**{name: float(v) for name, v in values.items()})
+    task = setup.at(theta)
     try:
         runs = ensemble(as_numbers(settled(as_arrays(task))), jax.random.fold_in(setup.key, 2), seeds=setup.seeds)
     except (SimulationError, ValueError):
@@ -182,13 +182,16 @@ def _montecarlo(setup: Setup, points: np.ndarray, max_steps: int, stages: list[S
     if not np.isfinite(first.cost[first.best]):
         return
     best = first.s[contenders(setup.coordinates, setup.target, first, RIVAL_MARGIN)[:MOST_RIVALS]]
-    share = _share(problem, first)
+    setup, share = _known(setup, problem, first)
     problem = setup.finer(setup.montecarlo(setup.seeds, share), best)
     descend(problem, best, max_steps, prepare=setup.finer,
             report=_stage(setup, stages, problem, "polishing", (0.4, 0.8), 15))  # fmt: skip
 
 
-def _share(problem: Problem, descent: Descent) -> Float[np.ndarray, " bins"]:
-    """Share of the harmonic's line in each bin at the best point."""
+def _known(setup: Setup, problem: Problem, descent: Descent) -> tuple[Setup, Float[np.ndarray, " bins"]]:
+    """What the best point says of how the data scatter: the setup with it, and the line's share of each bin."""
     moments = seen_best(problem, descent).moments
-    return np.clip(np.nan_to_num(moments.line / moments.power), 0.0, 1.0)
+    share = np.clip(np.nan_to_num(moments.line / moments.power), 0.0, 1.0)
+    if np.isfinite(descent.cost[descent.best]):
+        setup = setup.scattering_as(setup.at(np.asarray(setup.coordinates.theta(descent.s[descent.best]))))
+    return setup, share

@@ -1,13 +1,17 @@
 """How much a spectrum scatters, and what that leaves undetermined: bin statistics, standard errors, identifiability."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 from scipy.special import digamma, polygamma
 
+from ._expected import log_variation_sd
+from ._parameter import as_arrays, is_concrete
 from ._spectrum import SpectrumSettings
 from ._target import Target
+from ._task import AbstractTask
 
 DETERMINED = 3.0
 SHARE_DETERMINED = 0.99
@@ -74,21 +78,28 @@ def bin_statistics(target: Target, line_share: Float[np.ndarray, " bins"] | None
     return BinStatistics(np.zeros(n), np.ones(n), np.eye(n), False)
 
 
-def target_variation(target: Target) -> tuple[float, float] | None:
+def target_variation(target: Target, task: AbstractTask | None = None) -> tuple[Any, Any] | None:
     """Log coefficient of variation of a target and its standard deviation.
 
-    Half the relative error of the variance, `½ √(pᵀ V p)` with V the covariance of the log powers, or the standard error
-    over trials where it states several and they differ by more.
+    With a task and where the target states its segments: `log_variation_sd` of recordings that give so many. Else half the
+    relative error of the power in the bins, `½ √(pᵀ V p)` with V the covariance of the log powers, which is too much where
+    power lies elsewhere or in a harmonic. The standard error over trials where there are several and it is larger.
     """
     values = target.coefficient_of_variation
     if values is None:
         return None
     logs = np.log(np.asarray(values))
-    p = np.asarray(target.proportional_power)
-    sd = 0.5 * np.sqrt(p @ bin_statistics(target).covariance @ p)
+    if task is None or target.segments is None:
+        p = np.asarray(target.proportional_power)
+        sd: Any = 0.5 * np.sqrt(p @ bin_statistics(target).covariance @ p)
+    else:
+        settings, counts, arrays = target.settings, target.segments, as_arrays(task)
+        whole = settings.length - settings.step // 2  # a recording is half a step longer than its segments, on the average
+        each = {k: log_variation_sd(arrays, settings, whole + k * settings.step) for k in set(counts)}
+        sd = sum(each[k] ** 2 for k in counts) ** 0.5 / len(counts)
     if len(logs) > 1:
-        sd = max(sd, logs.std(ddof=1) / np.sqrt(len(logs)))
-    return float(logs.mean()), float(sd)
+        sd = jnp.maximum(sd, logs.std(ddof=1) / np.sqrt(len(logs)))
+    return float(logs.mean()), float(sd) if is_concrete(sd) else sd
 
 
 def standardised(
