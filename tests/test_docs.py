@@ -77,6 +77,12 @@ def test_every_page_is_in_the_navigation():
     assert set(re.findall(r"[\w/-]+\.md", navigation)) == pages
 
 
+def test_the_citation_names_the_current_version():
+    about = (PACKAGE / "__about__.py").read_text(encoding="utf-8")
+    (version,) = re.findall(r'^__version__ = "(.+)"$', about, re.MULTILINE)
+    assert f"\nversion: {version}\n" in (ROOT / "CITATION.cff").read_text(encoding="utf-8")
+
+
 def test_parameter_page_is_current():
     spec = importlib.util.spec_from_file_location("generate", ROOT / "docs" / "generate.py")
     assert spec is not None and spec.loader is not None
