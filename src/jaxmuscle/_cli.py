@@ -30,10 +30,11 @@ app.command()(reproduce)
 app.command()(speed)
 
 
-def show_version(wanted: bool) -> None:
+def show_version(wanted: bool) -> bool:
     if wanted:
         out.print(f"jaxmuscle {__version__}", highlight=False)
         raise typer.Exit
+    return wanted
 
 
 @app.callback()
@@ -52,7 +53,8 @@ def targets() -> None:
     for column in ("name", "provenance", "quantity", "source"):
         table.add_column(column, overflow="fold", no_wrap=column == "name")
     for entry in describe_targets():
-        table.add_row(entry.name, entry.provenance, entry.quantity, plain(entry.source.partition(". ")[0]))
+        first = entry.source.replace("Fig. ", "Fig.\N{NO-BREAK SPACE}").partition(". ")[0]
+        table.add_row(entry.name, entry.provenance, entry.quantity, plain(first))
     out.print(table)
 
 

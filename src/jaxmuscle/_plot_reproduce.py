@@ -16,8 +16,8 @@ from ._reproduce import Experiment, Reproduction, Tuned
 from ._reproduce_readings import HIGH, LOW, Reading
 from ._spectrum import Spectrum
 from ._store import replacing
+from ._style import BLACK, BLUE, GREEN, GREY, PALETTE, VERMILLION, styled
 from ._trajectory import Trajectory
-from .plot import BLACK, BLUE, GREEN, GREY, PALETTE, VERMILLION, styled
 
 SIZE = (4.2, 2.9)  # inches: letters of 8 points are 10 pixels high on a phone of 390
 DPI = 200
