@@ -110,6 +110,7 @@ def test_the_installed_command_fits_a_bundled_target(installed):
     printed = run(
         command, "fit", TARGET, "--starts", "20", "--out", "out", cwd=installed, XDG_CACHE_HOME=str(installed / "cache")
     )
+    assert max(map(len, printed.splitlines())) <= 80
     assert TARGET in printed and "Written: out/fit.json" in printed
     result = jm.load_result(installed / "out" / "fit.json")
     assert result.success and result.target == jm.load_target(TARGET)
