@@ -71,7 +71,7 @@ def formula(found: re.Match[str]) -> str:
     """An image in the text, as high as its letters; a displayed one in a line of its own."""
     shown, latex = found[1] is not None, (found[1] or found[2]).strip()
     image = io.BytesIO()
-    depth = math_to_image(f"${latex}$", image, prop=FontProperties(size=11), dpi=72, format="svg")
+    depth = math_to_image(f"${latex}$", image, prop=FontProperties(size=12), dpi=72, format="svg")
     data = base64.b64encode(image.getvalue()).decode()
     alt = latex.replace('"', "&quot;")
     tag = f'<img class="math" alt="{alt}" src="data:image/svg+xml;base64,{data}" style="vertical-align: -{depth:.1f}pt">'

@@ -21,8 +21,8 @@ ELSEWHERE = {"docs/digitise.md": "test_digitised.py", "docs/own-muscle.md": "tes
 BELOW = {"docs/gallery.md"}  # its program is read instead
 RUN_HERE = {
     "README.md", "docs/coming-from-diffrax.md", "docs/coming-from-matlab.md", "docs/ensembles.md", "docs/fit-a-csv.md",
-    "docs/identifiability.md", "docs/index.md", "docs/recordings.md", "docs/scaling.md", "docs/tutorial.md",
-    "docs/uncertainty.md",
+    "docs/identifiability.md", "docs/index.md", "docs/recordings.md", "docs/reference/figures.md", "docs/scaling.md",
+    "docs/tutorial.md", "docs/uncertainty.md",
 }  # fmt: skip
 FEWER_SEEDS = {"seeds=100_000": "seeds=1_000"}
 
@@ -151,7 +151,12 @@ def test_own_data():
 def test_coming_from_elsewhere():
     pages.run("docs/coming-from-matlab.md")
     names = pages.run("docs/coming-from-diffrax.md")
-    assert names["many"].shape == (8, 100) and np.all(np.isfinite(names["solution"].ys))
+    assert names["many"].shape == (8, 101) and np.all(np.isfinite(names["solution"].ys))
+
+
+def test_figures_in_given_axes():
+    figure = pages.run("docs/reference/figures.md")["figure"]
+    assert len(figure.axes) == 5 and len(figure.subfigs) == 1
 
 
 def test_scaling():

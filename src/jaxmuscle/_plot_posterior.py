@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from ._posterior import NotMixedError, Posterior
-from ._style import BLUE, ORANGE, PALETTE, SKY, VERMILLION, axes_or_new, canvas, styled
+from ._style import BLUE, ORANGE, PALETTE, PROPORTIONAL, SKY, VERMILLION, axes_or_new, canvas, styled
 
 ORDER = ("corner_frequency", "harmonic_frequency", "harmonic_share", "high_frequency_floor", "coefficient_of_variation")
 MOST, PANEL = 6, 1.25  # quantities, inches
@@ -105,7 +105,7 @@ def predictive(found: Posterior, ax: Axes | None = None) -> Axes:
     ax.plot(f, np.median(expected, axis=0), color=BLUE, lw=1.2, label="model, median")
     ax.plot(f, np.asarray(found.target.proportional_power), color=VERMILLION, marker="o", ms=3, lw=0, label="target")
     ax.set_yscale("log")
-    ax.set(xlabel="Frequency (Hz)", ylabel="Proportional power (fraction per bin)", xlim=(0, f[-1] + f[0]))
+    ax.set(xlabel="Frequency (Hz)", ylabel=PROPORTIONAL, xlim=(0, f[-1] + f[0]))
     ax.set_title(f"{found.target.name}: posterior-predictive χ², p = {found.replicates.p_value:.2g}")
     ax.legend(frameon=False, ncols=2)
     return ax

@@ -36,6 +36,7 @@ STYLE: dict[str, Any] = {
     "figure.dpi": 160.0,
 }
 SIZE = (4.5, 3.0)
+PROPORTIONAL = "Proportional power (fraction per bin)"
 
 P = ParamSpec("P")
 R = TypeVar("R")

@@ -16,9 +16,8 @@ from ._sensitivity import Sensitivity
 from ._spectrum import Spectrum, SpectrumSettings
 from ._style import (
     BLACK,
-    BLUE,
-    GREY,
     PALETTE,
+    PROPORTIONAL,
     axes_or_new,
     canvas,
     density_unit,
@@ -27,6 +26,7 @@ from ._style import (
     output_label,
     styled,
 )  # fmt: skip
+from ._style import STYLE as STYLE
 from ._target import Target
 from ._trajectory import WINDOW, Trajectory
 from ._uncertainty import bin_statistics
@@ -72,31 +72,18 @@ def spectrum(
     _mean_and_band(ax, frequency[shown], mean[shown], each[:, shown], ", ".join(filter(None, (label, kind))))
     frequency_axis(ax, log)
     legend(ax, "lower left" if log else "upper right")
-    ax.set_ylabel(_PROPORTIONAL if proportional else f"Power ({density_unit(spectrum.unit)})")
+    ax.set_ylabel(PROPORTIONAL if proportional else f"Power ({density_unit(spectrum.unit)})")
     return ax
 
 
-@styled
 def estimate(estimate: SpectrumEstimate, ax: Axes | None = None, *, log: bool = False) -> Axes:
     """Draws the proportional power of a `SpectrumEstimate`, with two standard errors either way, and without control.
 
     **Arguments:** `estimate`; `ax`, or a new figure; `log`, both axes logarithmic. **Returns:** the axes.
     """
-    ax = axes_or_new(ax)
-    frequency, whole = np.asarray(estimate.frequency), float(np.sum(estimate.power))
-    shown = slice(None) if not log else frequency > 0
-    rows = [(estimate.power, estimate.stderr, BLUE, "with control variate" if estimate.expected is not None else "mean")]
-    if estimate.expected is not None:
-        rows.append((estimate.plain_power, estimate.plain_stderr, GREY, "without"))
-    for order, (power, stderr, color, name) in enumerate(rows):
-        low, high = ((power + side * stderr)[shown] / whole for side in (-2, 2))
-        ax.fill_between(frequency[shown], low, high, color=color, alpha=0.25, lw=0, zorder=2 - order)
-        label = f"{name} ({estimate.seeds} seeds, ± 2 SE)"
-        ax.plot(frequency[shown], power[shown] / whole, color=color, label=label, zorder=3 - order)
-    frequency_axis(ax, log)
-    legend(ax, "lower left" if log else "upper right")
-    ax.set_ylabel(_PROPORTIONAL)
-    return ax
+    from ._plot_estimate import draw
+
+    return draw(estimate, ax, log)
 
 
 @styled
@@ -124,7 +111,7 @@ def target(target: Target, ax: Axes | None = None, *, log: bool = False) -> Axes
     name = name.lstrip("_").replace("$", r"\$")  # neither hidden from the legend nor read as mathematics
     line.set_label(f"{name} ({target.provenance})")
     frequency_axis(ax, log)
-    ax.set_ylabel(_PROPORTIONAL)
+    ax.set_ylabel(PROPORTIONAL)
     legend(ax, "lower left" if log else "upper right")
     return ax
 
@@ -216,9 +203,6 @@ def sampling_band(target: Target) -> tuple[Float[np.ndarray, " bins"], Float[np.
         return None
     centre = target.proportional_power * np.exp(-statistics.bias)
     return centre * np.exp(-statistics.sd), centre * np.exp(statistics.sd)
-
-
-_PROPORTIONAL = "Proportional power (fraction per bin)"
 
 
 def _finite(rows: Real[np.ndarray, "seeds values"]) -> tuple[Real[np.ndarray, "finite values"], str]:
