@@ -163,11 +163,23 @@ def draw(shown: Shown, names: dict[str, Any], out: Path) -> None:
         made = made[0] if isinstance(made, tuple) else made
         getattr(made, "figure", made).savefig(path, dpi=DPI)
         plt.close("all")
-    picture = Image.open(path if shown.code else drawn(shown)).convert("RGB")
-    commonest = sorted(picture.getcolors(picture.width * picture.height), reverse=True)[:COLOURS]
-    palette = Image.new("P", (1, 1))
-    palette.putpalette([value for _, colour in commonest for value in colour])
-    picture.quantize(palette=palette, dither=Image.Dither.NONE).save(path, optimize=True)
+    few_colours(Image.open(path if shown.code else drawn(shown)).convert("RGB")).save(path, optimize=True)
+
+
+def few_colours(picture: Any) -> Any:
+    """The picture in its commonest colours: lines and areas keep theirs, the edges of letters get the nearest."""
+    import numpy as np
+    from PIL import Image
+
+    pixels = np.asarray(picture)
+    codes = pixels.reshape(-1, 3) @ np.array([1 << 16, 1 << 8, 1])
+    codes, where, counts = np.unique(codes, return_inverse=True, return_counts=True)
+    colours = np.stack([codes >> 16, codes >> 8 & 255, codes & 255], axis=1)
+    kept = colours[np.argsort(-counts, kind="stable")[:COLOURS]]
+    nearest = np.array([np.argmin(np.sum((kept - colour) ** 2, axis=1)) for colour in colours])
+    small = Image.fromarray(nearest[where].astype(np.uint8).reshape(pixels.shape[:2]))
+    small.putpalette(kept.ravel().tolist())
+    return small
 
 
 def main(only: list[str]) -> None:

@@ -72,7 +72,8 @@ def formula(found: re.Match[str]) -> str:
     shown, latex = found[1] is not None, (found[1] or found[2]).strip()
     image = io.BytesIO()
     depth = math_to_image(f"${latex}$", image, prop=FontProperties(size=12), dpi=72, format="svg")
-    data = base64.b64encode(image.getvalue()).decode()
+    paper = b"fill: #ffffff"
+    data = base64.b64encode(image.getvalue().replace(paper, b"fill: none")).decode()
     alt = latex.replace('"', "&quot;")
     tag = f'<img class="math" alt="{alt}" src="data:image/svg+xml;base64,{data}" style="vertical-align: -{depth:.1f}pt">'
     return f"\n\n{tag}\n\n" if shown else tag
