@@ -69,7 +69,6 @@ def readme(tmp_path_factory):
         for seed, name in enumerate("abc"):
             write_spectrum(f"{name}.csv", seed)
         fewer = FEWER_SEEDS | {
-            "key=jax.random.key(2))": "key=jax.random.key(2), draws=400)",
             "jm.goodness(result)": "jm.goodness(result, replicates=199)",
             "jm.bootstrap(result)": "jm.bootstrap(result, replicates=10)",
         }
