@@ -4,7 +4,7 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from ._profile import Profile
-from ._style import BLUE, GREY, ORANGE, axes_or_new, styled
+from ._style import BLUE, GREY, ORANGE, axes_or_new, log_axis, styled
 
 SHOWN = 3.0  # times the threshold
 
@@ -20,7 +20,6 @@ def draw(found: Profile, ax: Axes | None = None) -> Axes:
         ax.axvspan(*ends, color=BLUE, alpha=0.1, lw=0)
     wide = np.all(found.values > 0) and found.values[-1] > 10 * found.values[0]
     if wide:
-        ax.set_xscale("log")
         x = np.geomspace(found.values[0], found.values[-1], 200)
         parabola = (np.log(x / found.value) * found.value / found.stderr) ** 2
     else:
@@ -31,6 +30,8 @@ def draw(found: Profile, ax: Axes | None = None) -> Axes:
         ax.plot(x, parabola, color=ORANGE, lw=0.9, label="by curvature")
     seen = found.values[np.flatnonzero(_beside(found.rise <= top))]
     ax.set(ylim=(0, top), xlim=(seen[0], seen[-1]), ylabel="Rise of -2 ln L")
+    if wide:
+        log_axis(ax)
     ax.set_xlabel(found.name + ("" if found.unit == "1" else f" ({found.unit})"))
     ax.set_title(f"{found.target}: profile likelihood", pad=18)
     if found.low is None or found.high is None:

@@ -105,8 +105,14 @@ def frequency_axis(ax: Axes, log: bool) -> None:
         if ax.get_yscale() == "linear":
             ax.set_ylim(bottom=0, auto=None)
         return
-    ax.set_xscale("log")
     ax.set_yscale("log")
-    ax.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    log_axis(ax)
+
+
+def log_axis(ax: Axes) -> None:
+    """A logarithmic abscissa with plain numbers, as many as have room."""
+    ax.set_xscale("log")
+    low, high = ax.get_xlim()
+    ax.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if high < 1e3 * low else (1.0,)))
     ax.xaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:g}"))
     ax.xaxis.set_minor_formatter(NullFormatter())
