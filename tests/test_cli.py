@@ -12,6 +12,7 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
+import typer
 from test_result import assert_equal, failed_result, made_result
 from typer.testing import CliRunner
 
@@ -434,3 +435,15 @@ def test_the_console_script_is_the_command():
     assert done.returncode == 0 and "vastus-lateralis-26mvc" in done.stdout
     wrong = subprocess.run([script, "tragets"], capture_output=True, text=True)
     assert wrong.returncode == 2 and "tragets" in wrong.stderr
+
+
+COMMANDS = sorted(typer.main.get_group(app).commands)
+
+
+@pytest.mark.parametrize(
+    "arguments", [["--help"], *([name, "--help"] for name in COMMANDS), ["targets"], ["presets"]], ids=" ".join
+)
+def test_output_fits_80_columns(arguments, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    lines = run(*arguments).output.splitlines()
+    assert len(lines) > 4 and max(map(len, lines)) <= 80

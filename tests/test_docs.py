@@ -1,20 +1,18 @@
 """The documentation against the package: every public name described once, links that lead somewhere, a current table."""
 
 import ast
-import importlib.util
+import dataclasses
+import inspect
 import re
+import types
 from collections import Counter
-from pathlib import Path
 
 import pytest
+from pages import PAGES, ROOT, blocks, module, name_of
 
-ROOT = Path(__file__).resolve().parents[1]
+import jaxmuscle as jm
+
 PACKAGE = ROOT / "src" / "jaxmuscle"
-PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
-
-
-def name_of(page):
-    return str(page.relative_to(ROOT))
 
 
 def imports(module):
@@ -27,27 +25,60 @@ def imports(module):
 PUBLIC = imports(PACKAGE / "__init__.pyi")
 
 
-def docstrings(name, module):
-    """Docstrings of every definition of a public name, which a module may itself import from another."""
-    if module is None:
-        return [ast.get_docstring(ast.parse((PACKAGE / f"{name}.py").read_text(encoding="utf-8")))]
-    path = PACKAGE / f"{module}.py"
-    kinds = (ast.ClassDef, ast.FunctionDef)
-    body = ast.parse(path.read_text(encoding="utf-8")).body
-    found = [ast.get_docstring(node) for node in body if isinstance(node, kinds) and node.name == name]
-    return found or docstrings(name, imports(path)[name])
-
-
 def test_reference_describes_every_public_name_once():
     pages = "\n".join(page.read_text(encoding="utf-8") for page in (ROOT / "docs" / "reference").glob("*.md"))
     described = Counter(re.findall(r"^::: jaxmuscle\.(\w+)$", pages, re.MULTILINE))
     assert described == Counter(list(PUBLIC))
 
 
-# Values, whose meaning stands on their page of the reference.
-@pytest.mark.parametrize("name", sorted(set(PUBLIC) - {"__version__", "PARAMETERS"}))
-def test_public_object_has_docstring(name):
-    assert any(docstrings(name, PUBLIC[name]))
+# Values and the module of figures stand on their pages of the reference.
+NAMES = sorted(set(PUBLIC) - {"__version__", "PARAMETERS", "plot"})
+FIGURES = [
+    name for name, value in vars(jm.plot).items() if getattr(value, "__module__", "") == jm.plot.__name__ and name[0] != "_"
+]
+# Of results, which the types of these fields explain.
+EVERYWHERE = {"ax", "seed", "settings", "target", "task", "versions"}
+
+
+def described(thing):
+    """The words of a docstring, of a class also those of its public bases."""
+    family = (
+        [c for c in inspect.getmro(thing) if c.__module__.startswith("jaxmuscle")] if inspect.isclass(thing) else [thing]
+    )
+    return set(re.findall(r"\w+", " ".join(inspect.getdoc(one) or "" for one in family)))
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_public_object_is_documented(name):
+    """A docstring that names every argument or field, and says which errors there are."""
+    thing = getattr(jm, name)
+    assert (inspect.getdoc(thing) or "").strip() and thing.__doc__
+    if not inspect.isclass(thing):
+        given = set(inspect.signature(thing).parameters)
+        source = inspect.getsource(thing)
+        assert "raise " not in source or "aises" in (inspect.getdoc(thing) or "")
+    elif dataclasses.is_dataclass(thing):
+        given = {field.name for field in dataclasses.fields(thing)}
+    else:
+        given = set(getattr(thing, "_fields", ()))
+    words = described(thing)
+    missing = {one for one in given - EVERYWHERE if one not in words and re.sub("_[wz]", "_j", one, count=1) not in words}
+    assert not missing
+
+
+@pytest.mark.parametrize("name", [name for name in NAMES if inspect.isclass(getattr(jm, name))])
+def test_public_methods_are_documented(name):
+    thing = getattr(jm, name)
+    kinds = (types.FunctionType, property, classmethod, staticmethod)
+    public = [attribute for attribute, value in vars(thing).items() if attribute[0] != "_" and isinstance(value, kinds)]
+    assert not [attribute for attribute in public if not inspect.getdoc(getattr(thing, attribute))]
+
+
+@pytest.mark.parametrize("name", FIGURES)
+def test_figures_are_documented(name):
+    """The first argument is what the first line speaks of."""
+    figure = getattr(jm.plot, name)
+    assert set(list(inspect.signature(figure).parameters)[1:]) - EVERYWHERE <= described(figure)
 
 
 @pytest.mark.parametrize("page", PAGES, ids=name_of)
@@ -66,20 +97,23 @@ def test_names_in_pages_are_public(page):
 
 @pytest.mark.parametrize("page", PAGES, ids=name_of)
 def test_python_in_pages_parses(page):
-    for block in re.findall(r"^( *)```python\n(.*?)^ *```", page.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL):
-        indent, code = block
-        ast.parse("".join(line.removeprefix(indent) for line in code.splitlines(keepends=True)))
+    for code in blocks(page):
+        ast.parse(code)
 
 
 def test_every_page_is_in_the_navigation():
     navigation = (ROOT / "mkdocs.yml").read_text(encoding="utf-8")
     pages = {page.relative_to(ROOT / "docs").as_posix() for page in (ROOT / "docs").rglob("*.md")}
-    assert set(re.findall(r"[\w/-]+\.md", navigation)) == pages
+    notebooks = {f"notebooks/{path.stem}.md" for path in (ROOT / "notebooks").glob("*.ipynb")}  # made by docs/notebooks.py
+    assert set(re.findall(r"[\w/-]+\.md", navigation)) == pages | notebooks
+
+
+def test_the_citation_names_the_current_version():
+    about = (PACKAGE / "__about__.py").read_text(encoding="utf-8")
+    (version,) = re.findall(r'^__version__ = "(.+)"$', about, re.MULTILINE)
+    assert f"\nversion: {version}\n" in (ROOT / "CITATION.cff").read_text(encoding="utf-8")
 
 
 def test_parameter_page_is_current():
-    spec = importlib.util.spec_from_file_location("generate", ROOT / "docs" / "generate.py")
-    assert spec is not None and spec.loader is not None
-    generate = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(generate)
+    generate = module(ROOT / "docs" / "generate.py")
     assert generate.PAGE.read_text(encoding="utf-8") == generate.page(), "run `python docs/generate.py`"

@@ -1,13 +1,12 @@
 """A muscle from outside the package, docs/hill_muscle.py: its curves, its mechanics, and all that jaxmuscle does with it."""
 
-import importlib.util
-import re
 import sys
 from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pages
 import pytest
 import references
 import scipy.optimize
@@ -19,16 +18,7 @@ KEY = jax.random.key(7)
 STILL = np.zeros(4)
 
 
-def _load(path):
-    spec = importlib.util.spec_from_file_location(path.stem, path)
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[path.stem] = module
-    spec.loader.exec_module(module)
-    return module
-
-
-hill = _load(DOCS / "hill_muscle.py")
+hill = pages.module(DOCS / "hill_muscle.py")
 HillMuscle = hill.HillMuscle
 
 
@@ -414,12 +404,7 @@ def test_the_page_runs_as_written_and_its_fit_finds_the_muscle(monkeypatch):
     """Every Python block of docs/own-muscle.md, in order, from the root of a checkout."""
     monkeypatch.chdir(DOCS.parent)
     monkeypatch.setattr(sys, "path", [*sys.path])
-    blocks = re.findall(r"^```python\n(.*?)^```", (DOCS / "own-muscle.md").read_text(encoding="utf-8"), re.S | re.M)
-    assert len(blocks) == 5
-    names: dict = {}
-    for block in blocks:
-        exec(compile(block, "docs/own-muscle.md", "exec"), names)
-    result = names["result"]
+    result = pages.run("docs/own-muscle.md")["result"]
     assert result.success, result.message
     found = result.parameters["velocity_max"]
     assert found.identifiable and found.stderr is not None

@@ -29,7 +29,8 @@ from ._trajectory import versions
 from ._uncertainty import bin_statistics
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure, SubFigure
 
 FORMAT = 1
 STARTS = 32
@@ -211,11 +212,11 @@ class Bootstrap(eqx.Module):
         """Write `to_json` atomically."""
         write_text(path, self.to_json())
 
-    def plot(self) -> "Figure":
+    def plot(self, ax: "Axes | None" = None) -> "Figure | SubFigure":
         """The refits of every quantity, with the true value and the interval that the fit states."""
         from ._plot_bootstrap import bootstrap_figure
 
-        return bootstrap_figure(self)
+        return bootstrap_figure(self, ax)
 
 
 def _number(value: Any) -> Any:

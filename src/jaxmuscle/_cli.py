@@ -3,10 +3,12 @@
 import gc
 import os
 import sys
+from typing import Annotated
 
 import typer
 from rich.table import Table
 
+from .__about__ import __version__
 from ._bundled import describe_presets, describe_targets
 from ._cli_analyse import analyse
 from ._cli_compare import compare
@@ -17,13 +19,7 @@ from ._cli_reproduce import reproduce
 from ._cli_simulate import simulate
 from ._console import out, plain
 
-app = typer.Typer(
-    add_completion=False,
-    no_args_is_help=True,
-    rich_markup_mode="markdown",
-    pretty_exceptions_enable=False,
-    help="A stochastic rheological muscle: simulate its force, analyse recordings, fit it to measured force spectra.",
-)
+app = typer.Typer(add_completion=False, no_args_is_help=True, rich_markup_mode="markdown", pretty_exceptions_enable=False)
 app.command()(fit)
 app.command()(simulate)
 app.command()(ensemble)
@@ -34,6 +30,22 @@ app.command()(reproduce)
 app.command()(speed)
 
 
+def show_version(wanted: bool) -> bool:
+    if wanted:
+        out.print(f"jaxmuscle {__version__}", highlight=False)
+        raise typer.Exit
+    return wanted
+
+
+@app.callback()
+def common(
+    version: Annotated[
+        bool, typer.Option("--version", is_eager=True, callback=show_version, help="Show the version and exit.")
+    ] = False,
+) -> None:
+    """A stochastic rheological muscle: simulate its force, analyse recordings, fit it to measured force spectra."""
+
+
 @app.command()
 def targets() -> None:
     """List the bundled targets."""
@@ -41,7 +53,8 @@ def targets() -> None:
     for column in ("name", "provenance", "quantity", "source"):
         table.add_column(column, overflow="fold", no_wrap=column == "name")
     for entry in describe_targets():
-        table.add_row(entry.name, entry.provenance, entry.quantity, plain(entry.source.partition(". ")[0]))
+        first = entry.source.replace("Fig. ", "Fig.\N{NO-BREAK SPACE}").partition(". ")[0]
+        table.add_row(entry.name, entry.provenance, entry.quantity, plain(first))
     out.print(table)
 
 

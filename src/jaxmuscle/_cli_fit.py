@@ -85,7 +85,7 @@ def fit(
 ) -> None:
     """Fit the muscle to a target spectrum, or to those of many people together.
 
-    Writes DIR/fit.json, DIR/fit.png and DIR/spectrum.csv prints a table. Several targets: DIR/TARGET/... and
+    Prints a table and writes DIR/fit.json, DIR/fit.png and DIR/spectrum.csv. Several targets: DIR/TARGET/... and
     DIR/cohort.csv, cohort.png (and differences.csv with groups); fitted in linear response, without its last checks.
 
     Examples:

@@ -21,15 +21,17 @@ from ._trajectory import versions
 
 if TYPE_CHECKING:
     import xarray
-    from matplotlib.figure import Figure
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure, SubFigure
 
 CONFIDENCE = 0.95
 COLUMNS = ("target", "group", "quantity", "value", "stderr", "unit", "determined", "mvc_fraction", "chi2_per_bin", "success")
 
 
 class Difference(eqx.Module):
-    """Mean of `quantity` in group `b` minus that in group `a`, with its 95 % interval (`low`, `high`), all in `unit`.
+    """Mean of `quantity` in group `b` minus that in group `a`, the `difference`, with its 95 % interval (`low`, `high`).
 
+    All in `unit`; `members` is how many the groups have.
     `basis` says what the interval stands on: "people", the spread within the groups (Welch's t; the fits' own errors are
     part of that spread), or "fits", the standard errors of the fits, where a group has one member only.
     """
@@ -115,11 +117,11 @@ class CohortResult(eqx.Module):
         return [_determined(result)[quantity] for name, result in self.results.items()
                 if self.groups.get(name, "") == group and quantity in _determined(result)]  # fmt: skip
 
-    def plot(self, by: str = "person") -> "Figure":
+    def plot(self, by: str = "person", ax: "Axes | None" = None) -> "Figure | SubFigure":
         """Determined quantities with their standard errors, by "person", "group" or "level" (fraction of MVC)."""
         from ._plot_cohort import figure
 
-        return figure(self, by)
+        return figure(self, by, ax)
 
 
 def _or_nan(value: float | None) -> float:
@@ -168,7 +170,8 @@ def fit_cohort(
 
     **Arguments:** `targets`, or names and paths of them; `groups` {target name: group}; `task`, the same kind for all
     (by default what each measured); `noise`, `fix`, and other options (`free`, `residual`, `bounds`, `priors`, `key`,
-    `max_steps`, `coefficient_of_variation`) as in `fit`; `starts` for each target.
+    `max_steps`, `coefficient_of_variation`) as in `fit`; `starts` for each target; `progress`, True or a function of
+    (text, share).
 
     **Returns:** a `CohortResult`. A target that cannot be read, or not be fitted with these options, is
     listed in `failed` with the reason and does not stop the rest.

@@ -18,7 +18,8 @@ from ._trajectory import versions
 
 if TYPE_CHECKING:
     import xarray
-    from matplotlib.figure import Figure
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure, SubFigure
 
 FORMAT = 1
 NEEDED = 6.0
@@ -70,9 +71,11 @@ class Evidence(NamedTuple):
 
 
 class Decision(eqx.Module):
-    """Model `a` against model `b`: how much lower the AIC of `a` is, how much higher its held-out score, with its error.
+    """Model `a` against model `b`.
 
-    The two are told apart if the AIC differs by at least `needed` and the held-out score, if there is one, says the same.
+    How much lower the AIC of `a` is (`aic_gain`), how much higher its held-out score (`score_gain`, `score_stderr`; None
+    if nothing was held out). The two are told apart if the AIC differs by at least `needed` and the held-out score, if there
+    is one, says the same.
     """
 
     a: str
@@ -262,11 +265,11 @@ class Comparison(eqx.Module):
         """Write `to_json` atomically."""
         write_text(path, self.to_json())
 
-    def plot(self) -> "Figure":
+    def plot(self, ax: "Axes | None" = None) -> "Figure | SubFigure":
         """The target with the best fit of each noise, AIC and held-out score of every model."""
         from ._plot_compare import figure
 
-        return figure(self)
+        return figure(self, ax)
 
     def __str__(self) -> str:
         kind = type(next(iter(self.tasks.values()))).__name__

@@ -4,6 +4,7 @@ import contextlib
 import csv
 import io
 import os
+import sys
 from collections.abc import Iterator
 from enum import StrEnum
 from pathlib import Path
@@ -15,7 +16,7 @@ from rich.console import Console
 CONVERGED, NOT_CONVERGED, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
 
 out = Console(soft_wrap=False)
-err = Console(stderr=True, soft_wrap=True)
+err = Console(stderr=True, soft_wrap=not sys.stderr.isatty())  # a message is one line of a log
 
 Output = Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for the results.")]
 Seed = Annotated[int, typer.Option(help="Seed of all random numbers.")]

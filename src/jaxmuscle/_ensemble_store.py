@@ -47,7 +47,8 @@ def create(path: Path, variables: Mapping[str, Variable], coordinates: list[str]
             group.attrs.update(attributes | ({"coordinates": " ".join(labels)} if labels else {}) | {"complete": False})
             for name, v in variables.items():
                 fill = np.nan if np.issubdtype(np.dtype(v.dtype), np.floating) else None
-                array = group.create_array(name, shape=v.shape, chunks=v.chunks, dtype=v.dtype, dimension_names=v.dims,
+                dtype = "string" if np.dtype(v.dtype).kind == "U" else v.dtype  # fixed width is not in the specification
+                array = group.create_array(name, shape=v.shape, chunks=v.chunks, dtype=dtype, dimension_names=v.dims,
                                            fill_value=fill, attributes={"units": v.units} if v.units else {})  # fmt: skip
                 if v.values is not None:
                     array[...] = v.values

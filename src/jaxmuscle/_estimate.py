@@ -51,11 +51,11 @@ class SpectrumEstimate(eqx.Module):
         """How many times more seeds a plain mean would need for the same error, `(plain_stderr / stderr)²`."""
         return (self.plain_stderr / self.stderr) ** 2
 
-    def plot(self, ax: Any = None) -> Any:
-        """Proportional power with its error band. Returns the axes."""
+    def plot(self, ax: Any = None, *, log: bool = False) -> Any:
+        """Proportional power with its error band; `log`: both axes logarithmic. Returns the axes."""
         from . import plot
 
-        return plot.estimate(self, ax)
+        return plot.estimate(self, ax, log=log)
 
 
 def estimated(

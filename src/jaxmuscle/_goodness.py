@@ -21,7 +21,8 @@ from ._trajectory import versions
 from ._uncertainty import BinStatistics, bin_statistics
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure, SubFigure
 
 Rows = Float[np.ndarray, "rows bins"]
 ELSEWHERE = 3
@@ -87,11 +88,11 @@ class Goodness(eqx.Module):
             lines += textwrap.wrap(sentence, WIDTH, initial_indent="- ", subsequent_indent="  ")
         return "\n".join(lines)
 
-    def plot(self) -> "Figure":
+    def plot(self, ax: "Axes | None" = None) -> "Figure | SubFigure":
         """Residuals with what is usual in each bin, and the three checks with their reference distributions."""
         from ._plot_bootstrap import goodness_figure
 
-        return goodness_figure(self)
+        return goodness_figure(self, ax)
 
 
 def _p(value: float) -> str:

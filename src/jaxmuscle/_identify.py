@@ -65,7 +65,7 @@ def identifiability(
 
 
 def standard_designs(result: FitResult, target: Target | None = None) -> tuple[Design, ...]:
-    """The designs that `identifiability` tries by default, to be extended or changed.
+    """The designs that `identifiability(result, target)` tries by default, to be extended or changed.
 
     The coefficient of variation and the mean (to 2 %) of the same recording, if the fit does not have them; of an
     `Isometric` fit the displacement under the load that the sensor had held (`PrescribedForce` at the same operating point,

@@ -12,7 +12,8 @@ from ._store import write_json
 from ._uncertainty import DETERMINED
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure, SubFigure
 
 WIDTH = 80
 COLUMNS = 6
@@ -119,11 +120,11 @@ class IdentifiabilityReport(eqx.Module):
         """Write `to_dict` as JSON, atomically."""
         write_json(path, self.to_dict())
 
-    def plot(self) -> "Figure":
+    def plot(self, ax: "Axes | None" = None) -> "Figure | SubFigure":
         """Singular values, and the standard errors of all quantities, now and with every design."""
         from ._plot_identify import figure
 
-        return figure(self)
+        return figure(self, ax)
 
     def __str__(self) -> str:
         return "\n".join([*_present(self), *_designs(self), *_table(self), *_sentences(self)])

@@ -16,7 +16,8 @@ from ._target import Target
 from ._task import AbstractTask
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure, SubFigure
 
 FORMAT = "joint-1"
 SPECTRUM = ("fitted", "harmonic_share", "residual", "deviation")
@@ -81,11 +82,11 @@ class JointResult(eqx.Module):
         """Names of the fitted parameters."""
         return tuple(name for name, p in self.parameters.items() if p.free)
 
-    def plot(self) -> "Figure":
+    def plot(self, ax: "Axes | None" = None) -> "Figure | SubFigure":
         """One row per target: its spectrum with the fit, and the residuals; below, what was found."""
         from ._plot_joint import figure
 
-        return figure(self)
+        return figure(self, ax)
 
     def save(self, path: str | Path) -> None:
         """Write JSON atomically; `load_joint_result` reads it back equal."""
@@ -163,7 +164,7 @@ def _to_json(result: JointResult) -> dict[str, Any]:
 
 
 def load_joint_result(path: str | Path) -> JointResult:
-    """Read what `JointResult.save` wrote. Raises `ResultError` naming the file and what is wrong with it."""
+    """Read what `JointResult.save` wrote to `path`. Raises `ResultError` naming the file and what is wrong with it."""
     path = Path(path)
     try:
         table = json.loads(path.read_text(encoding="utf-8"))

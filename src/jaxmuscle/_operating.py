@@ -20,7 +20,7 @@ class OperatingPointError(ValueError):
 
 
 def equilibrium(task: AbstractTask, time: float = HOLD) -> Float[Array, " states"]:
-    """State y with `vector_field(time, y, 0) = 0` [m, m/s], by Newton's method; differentiable (implicitly).
+    """State y of `task` with `vector_field(time, y, 0) = 0` [m, m/s], by Newton's method; differentiable (implicitly).
 
     Not finite where there is none: `operating_point` turns that into an error.
     """

@@ -13,7 +13,7 @@ from ._bundled import choices
 
 
 class Parameter(NamedTuple):
-    """One row of the parameter table.
+    """One row of the parameter table: `name`, `symbol`, `unit`, `default`, `meaning`, and the `source` of the default.
 
     `lower` and `upper` bound what is physically possible, `fit_lower` and `fit_upper` what a fit may reach.
     A positive parameter is fitted in log space; `prior_sd` is then the standard deviation of its logarithm,

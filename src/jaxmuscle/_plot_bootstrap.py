@@ -2,13 +2,12 @@
 
 from typing import Any
 
-import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
+from matplotlib.figure import Figure, SubFigure
 from matplotlib.ticker import MaxNLocator
 
-from .plot import BLACK, BLUE, GREY, SKY, VERMILLION, styled
+from ._style import BLACK, BLUE, GREY, SKY, VERMILLION, canvas, styled
 
 TITLES = {"chi2_per_bin": "χ² per bin", "runs": "Runs of equal sign", "largest": "Largest |residual| (SD)"}
 SMALL_P = 0.05
@@ -18,9 +17,9 @@ PALE = "0.80"
 
 
 @styled
-def goodness_figure(found: Any) -> Figure:
+def goodness_figure(found: Any, ax: Axes | None = None) -> Figure | SubFigure:
     """Residuals of every bin over what 95 % of the replicates have there; below, the three checks."""
-    fig = plt.figure(figsize=(7.2, 4.6), layout="constrained")
+    fig = canvas(ax, (7.2, 4.6))
     grid = fig.add_gridspec(2, 3, height_ratios=(1.15, 1.0))
     _residuals(fig.add_subplot(grid[0, :]), found)
     for column, name in enumerate(TITLES):
@@ -78,19 +77,19 @@ def _reference(ax: Axes, found: Any, name: str) -> None:
 
 
 @styled
-def bootstrap_figure(found: Any) -> Figure:
+def bootstrap_figure(found: Any, ax: Axes | None = None) -> Figure | SubFigure:
     """One panel per quantity: refits, the value they were made from, and the interval that the fit states about it."""
     names = list(found.quantities)
     if not names:
         raise ValueError(f"{found.target.name}: fewer than two refits succeeded, so there is nothing to draw")
     across = min(ACROSS, len(names))
     down = -(-len(names) // across)
-    fig, axes = plt.subplots(down, across, figsize=(WIDTH * across + 0.2, HEIGHT * down + 0.6), layout="constrained",
-                             squeeze=False)  # fmt: skip
-    for ax, name in zip(axes.flat, names, strict=False):
-        _refits(ax, found.quantities[name])
-    for ax in axes.flat[len(names) :]:
-        ax.remove()
+    fig = canvas(ax, (WIDTH * across + 0.2, HEIGHT * down + 0.6))
+    axes = fig.subplots(down, across, squeeze=False)
+    for panel, name in zip(axes.flat, names, strict=False):
+        _refits(panel, found.quantities[name])
+    for panel in axes.flat[len(names) :]:
+        panel.remove()
     handles, labels = axes.flat[0].get_legend_handles_labels()
     fig.legend(handles, labels, loc="outside lower center", ncols=4, frameon=False)
     lost = f", {len(found.failed)} failed" if found.failed else ""
@@ -104,7 +103,7 @@ def _refits(ax: Axes, q: Any) -> None:
     ax.axvspan(low, high, color=SKY, alpha=0.25, lw=0, zorder=0, label="stated 95 % interval")
     if len(q.values) >= HISTOGRAM:
         ax.hist(q.values, min(BINS, 2 + len(q.values) // 4), color=GREY, alpha=0.75, zorder=2, label="refits")
-        ax.set_ylabel("refits")
+        ax.set_ylabel("Refits")
         ax.yaxis.set_major_locator(MaxNLocator(4, integer=True))
     else:
         ax.plot(q.values, np.arange(len(q.values)) + 1, "o", ms=3.5, color=GREY, zorder=2, label="refits")

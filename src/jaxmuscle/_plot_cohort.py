@@ -2,12 +2,11 @@
 
 from typing import Any
 
-import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
+from matplotlib.figure import Figure, SubFigure
 
-from .plot import BLUE, GREY, PALETTE, styled
+from ._style import BLUE, GREY, PALETTE, canvas, styled
 
 WAYS = ("person", "group", "level")
 WIDTH, HEIGHT, ACROSS = 3.6, 2.5, 2  # inches, inches, panels
@@ -16,7 +15,7 @@ SHARE = 0.5  # of the targets that must determine a quantity for it to be drawn
 
 
 @styled
-def figure(cohort: Any, by: str = "person") -> Figure:
+def figure(cohort: Any, by: str = "person", ax: Axes | None = None) -> Figure | SubFigure:
     """One panel per quantity that at least half of the targets determine: value and standard error."""
     if by not in WAYS:
         raise ValueError(f"by = {by!r}: choose one of {', '.join(WAYS)}")
@@ -29,12 +28,13 @@ def figure(cohort: Any, by: str = "person") -> Figure:
     if by == "level" and all(row["mvc_fraction"] is None for row in rows):
         raise ValueError("by = 'level': no target states its mvc_fraction")
     down = -(-len(names) // ACROSS)
-    fig, axes = plt.subplots(down, ACROSS, figsize=(WIDTH * ACROSS, HEIGHT * down), layout="constrained", squeeze=False)
+    fig = canvas(ax, (WIDTH * ACROSS, HEIGHT * down))
+    axes = fig.subplots(down, ACROSS, squeeze=False)
     groups = list(dict.fromkeys(cohort.groups.get(name, "") for name in cohort.results))
-    for ax, name in zip(axes.flat, names, strict=False):
-        _panel(ax, [row for row in rows if row["quantity"] == name], list(cohort.results), groups, by)
-    for ax in axes.flat[len(names) :]:
-        ax.remove()
+    for panel, name in zip(axes.flat, names, strict=False):
+        _panel(panel, [row for row in rows if row["quantity"] == name], list(cohort.results), groups, by)
+    for panel in axes.flat[len(names) :]:
+        panel.remove()
     if len(groups) > 1 and by != "group":
         handles, labels = axes.flat[0].get_legend_handles_labels()
         fig.legend(handles, labels, loc="outside upper right", ncols=len(groups), frameon=False)
@@ -61,10 +61,10 @@ def _panel(ax: Axes, rows: list[dict[str, Any]], people: list[str], groups: list
         ax.set_xticks(range(len(groups)), [group or "all" for group in groups])
         ax.set_xlim(-0.6, len(groups) - 0.4)
     elif by == "level":
-        ax.set_xlabel("level (% MVC)")
+        ax.set_xlabel("Level (% MVC)")
     else:
         ax.set_xlim(-0.5, len(people) - 0.5)
         if len(people) <= LABELLED:
             ax.set_xticks(range(len(people)), people, rotation=35, ha="right", rotation_mode="anchor")
         else:
-            ax.set_xlabel("target number")
+            ax.set_xlabel("Target number")

@@ -3,13 +3,13 @@
 import textwrap
 from typing import Any
 
-import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
+from matplotlib.figure import Figure, SubFigure
 
 from ._comparison import NEEDED
-from .plot import BLACK, GREY, PALETTE, styled, target
+from ._style import BLACK, GREY, PALETTE, canvas, styled
+from .plot import target
 
 WIDTH, HEIGHT, LINE = 9.0, 3.0, 0.17  # inches
 SIZES = (1.7, 0.9, 1.0)
@@ -19,11 +19,11 @@ DASHES: tuple[Any, ...] = ("-", (0, (5, 1.5)), (0, (2, 1)), (0, (5, 1, 1, 1)))
 
 
 @styled
-def figure(comparison: Any) -> Figure:
+def figure(comparison: Any, ax: Axes | None = None) -> Figure | SubFigure:
     """The target with the best fit of each noise; AIC and held-out score of every model; the verdict below."""
     lines = _lines(comparison)
     low = LINE * (len(lines) + 0.5)
-    fig = plt.figure(figsize=(WIDTH, HEIGHT + low + 0.3), layout="constrained")
+    fig = canvas(ax, (WIDTH, HEIGHT + low + 0.3))
     parts: Any = fig.subfigures(2, 1, height_ratios=[HEIGHT, low])
     above, below = parts
     spectra, criterion, scores = above.subplots(1, 3, width_ratios=SIZES)

@@ -6,15 +6,15 @@ import textwrap
 from collections.abc import Mapping
 from typing import Any
 
-import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
+from matplotlib.figure import Figure, SubFigure
 
-from .plot import BLACK, BLUE, GREY, ORANGE, VERMILLION, legend, output_label, sampling_band, styled, target
+from ._style import BLACK, BLUE, GREY, ORANGE, VERMILLION, canvas, legend, output_label, styled
+from .plot import sampling_band, target
 
 WIDTH, LINE, FONT = 7.5, 0.165, 7.5  # inches, inches, points
-TABLE = (0.525, 0.54, 0.815)  # where values end, errors begin, units begin
+TABLE = (0.55, 0.565, 0.83)  # where values end, errors begin, units begin
 WRAP = 116  # characters of FONT on a line of WIDTH
 
 ALLOWED = 3.84  # 95 % quantile of χ² with one degree of freedom
@@ -24,7 +24,7 @@ _Line = tuple[str, dict[str, Any]]
 
 
 @styled
-def figure(result: Any) -> Figure:
+def figure(result: Any, ax: Axes | None = None) -> Figure | SubFigure:
     """Header, spectra, residuals and output, tables, notes; each as high as what it has to hold."""
     header, notes = _header(result), _notes(result)
     free = {name: estimate for name, estimate in result.parameters.items() if estimate.free}
@@ -38,8 +38,7 @@ def figure(result: Any) -> Figure:
         LINE * (rows + 1),
         *[LINE * len(notes)] * bool(notes),
     ]
-    fig = plt.figure(figsize=(WIDTH, sum(heights) + 1.25), layout="constrained")
-    fig.set_layout_engine("constrained", w_pad=0.08, h_pad=0.05)
+    fig = canvas(ax, (WIDTH, sum(heights) + 1.25), w_pad=0.08, h_pad=0.05)
     grid = fig.add_gridspec(len(heights), 2, height_ratios=heights)
     _lines(fig.add_subplot(grid[0, :]), header)
     _spectra(fig.add_subplot(grid[1, 0]), result, log=False)

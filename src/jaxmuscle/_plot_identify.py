@@ -3,15 +3,14 @@
 import textwrap
 from typing import Any
 
-import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
+from matplotlib.figure import Figure, SubFigure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from ._identify_report import TOGETHER, Outlook, letter, told
+from ._style import BLACK, BLUE, GREY, VERMILLION, canvas, styled
 from ._uncertainty import DETERMINED
-from .plot import BLACK, BLUE, GREY, VERMILLION, styled
 
 WIDTH, ROW = 7.5, 0.21  # inches
 LEAST, EDGE = 1e-2, 5e-3
@@ -20,7 +19,7 @@ PAIRS = 3
 
 
 @styled
-def figure(report: Any) -> Figure:
+def figure(report: Any, ax: Axes | None = None) -> Figure | SubFigure:
     """Above, singular values of the present data and with each design; below, the error of every quantity."""
     letters = {d.name: letter(i) for i, d in enumerate(report.designs)}
     shown = [report.present, *(d for d in report.designs if d.failed is None), *report.telling_pairs[:PAIRS]]
@@ -29,8 +28,7 @@ def figure(report: Any) -> Figure:
     rows = [_label(mark, o.name) for mark, o in zip(marks, shown, strict=True)]
     lines = sum(row.count("\n") + 1.35 for row in rows)
     heights = [0.15 * lines + 0.2, ROW * len(names) + 0.1]
-    fig = plt.figure(figsize=(WIDTH, sum(heights) + 1.6), layout="constrained")
-    fig.set_layout_engine("constrained", h_pad=0.08)
+    fig = canvas(ax, (WIDTH, sum(heights) + 1.6), h_pad=0.08)
     upper, lower = fig.subplots(2, 1, height_ratios=heights)
     fig.suptitle(f"{report.target}: what the data determine, and what more would", x=0.01, ha="left", weight="bold", size=10)
     _singular_values(upper, shown, rows)
@@ -90,7 +88,7 @@ def _matrix(ax: Axes, shown: list[Outlook], marks: list[str], names: list[str]) 
     ax.tick_params(axis="x", top=True, labeltop=True, bottom=False, labelbottom=False)
     ax.spines[:].set_visible(False)
     ax.set_title("Standard error by data and prior (bold: determined)")
-    bar = plt.colorbar(mesh, ax=ax, fraction=0.04, pad=0.015, aspect=30)
+    bar = ax.figure.colorbar(mesh, ax=ax, fraction=0.04, pad=0.015, aspect=30)
     bar.ax.set_ylim(0, 1)
     bar.set_label("share of the prior's error that is left")
     bar.outline.set_visible(False)

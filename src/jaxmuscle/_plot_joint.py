@@ -3,13 +3,13 @@
 import textwrap
 from typing import Any
 
-import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
+from matplotlib.figure import Figure, SubFigure
 
 from ._plot_fit import quantity
-from .plot import BLACK, BLUE, GREY, ORANGE, VERMILLION, legend, sampling_band, styled, target
+from ._style import BLACK, BLUE, GREY, ORANGE, VERMILLION, canvas, legend, styled
+from .plot import sampling_band, target
 
 WIDTH, PANEL, LINE, FONT = 8.5, 2.1, 0.165, 7.5  # inches, inches, inches, points
 WRAP = 126
@@ -17,7 +17,7 @@ PLACES = (0.58, 0.60, 0.85)
 
 
 @styled
-def figure(result: Any) -> Figure:
+def figure(result: Any, ax: Axes | None = None) -> Figure | SubFigure:
     """Header; for each target its spectrum, linear and logarithmic, and residuals; parameters and derived quantities."""
     header = _header(result)
     free = {name: p for name, p in result.parameters.items() if p.free}
@@ -30,8 +30,7 @@ def figure(result: Any) -> Figure:
         LINE * (rows + 1),
         *[LINE * len(notes)] * bool(notes),
     ]
-    fig = plt.figure(figsize=(WIDTH, sum(heights) + 0.9), layout="constrained")
-    fig.set_layout_engine("constrained", w_pad=0.06, h_pad=0.05)
+    fig = canvas(ax, (WIDTH, sum(heights) + 0.9), w_pad=0.06, h_pad=0.05)
     grid = fig.add_gridspec(len(heights), 2, height_ratios=heights)
     _text(fig.add_subplot(grid[0, :]), header)
     for row, (name, part) in enumerate(result.parts.items(), start=1):

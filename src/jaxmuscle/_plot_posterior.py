@@ -1,12 +1,12 @@
 """Figures of a posterior: corner, predictive spectra, traces."""
 
-import matplotlib.pyplot as plt
+from typing import Any
+
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
 from ._posterior import NotMixedError, Posterior
-from .plot import BLUE, GREY, ORANGE, PALETTE, SKY, VERMILLION, styled
+from ._style import BLUE, ORANGE, PALETTE, PROPORTIONAL, SKY, VERMILLION, axes_or_new, canvas, styled
 
 ORDER = ("corner_frequency", "harmonic_frequency", "harmonic_share", "high_frequency_floor", "coefficient_of_variation")
 MOST, PANEL = 6, 1.25  # quantities, inches
@@ -23,7 +23,7 @@ def chosen(found: Posterior) -> list[str]:
 
 
 @styled
-def corner(found: Posterior) -> Figure:
+def corner(found: Posterior, ax: Axes | None = None) -> Any:
     """Densities of the determined quantities and of each pair (50, 80 and 95 % regions)."""
     if not found.success:
         raise NotMixedError(f"{found.target.name}: {found.message}")
@@ -34,25 +34,26 @@ def corner(found: Posterior) -> Figure:
     draws = [found.quantities[name].ravel() for name in names]
     limits = [np.quantile(x, CUT) for x in draws]
     size = max(PANEL * count + 0.6, 3.4)
-    fig, axes = plt.subplots(count, count, figsize=(size, size), squeeze=False, layout="constrained")
+    fig = canvas(ax, (size, size))
+    axes = fig.subplots(count, count, squeeze=False)
     for i in range(count):
         for j in range(count):
-            ax = axes[i, j]
+            panel = axes[i, j]
             if j > i:
-                ax.remove()
+                panel.remove()
                 continue
-            ax.set_xlim(*limits[j])
-            ax.locator_params(nbins=3)
-            ax.tick_params(labelbottom=i == count - 1, labelleft=j == 0 and i > 0)
+            panel.set_xlim(*limits[j])
+            panel.locator_params(nbins=3)
+            panel.tick_params(labelbottom=i == count - 1, labelleft=j == 0 and i > 0)
             if i == j:
-                _density(ax, draws[i])
+                _density(panel, draws[i])
             else:
-                _pair(ax, draws[j], draws[i], limits[j], limits[i])
+                _pair(panel, draws[j], draws[i], limits[j], limits[i])
             if i == count - 1:
-                ax.set_xlabel(_label(found, names[j]))
-                ax.tick_params(axis="x", rotation=30)
+                panel.set_xlabel(_label(found, names[j]))
+                panel.tick_params(axis="x", rotation=30)
             if j == 0 and i > 0:
-                ax.set_ylabel(_label(found, names[i]))
+                panel.set_ylabel(_label(found, names[i]))
     fig.align_labels()
     kind = f"{type(found.task).__name__}, {type(found.task.noise).__name__}"
     fig.suptitle(f"Posterior: {found.target.name} ({kind})", x=0.01, ha="left", fontsize=9, fontweight="bold")
@@ -72,7 +73,7 @@ def _density(ax: Axes, x: np.ndarray) -> None:
     ax.axvspan(float(low), float(high), color=BLUE, alpha=0.08, lw=0)
     ax.set_yticks([])
     ax.spines["left"].set_visible(False)
-    ax.set_title(f"{middle:.3g} ({low:.3g} to {high:.3g})", fontsize=6.5, fontweight="normal", loc="center", pad=3)
+    ax.set_title(f"{middle:.3g}\n{low:.3g} to {high:.3g}", fontsize=6.5, fontweight="normal", loc="center", pad=3)
 
 
 def _pair(ax: Axes, x: np.ndarray, y: np.ndarray, wide: np.ndarray, high: np.ndarray) -> None:
@@ -94,8 +95,7 @@ def predictive(found: Posterior, ax: Axes | None = None) -> Axes:
     """The target among spectra that the posterior predicts: 50 and 95 % of them, and of the model itself."""
     if not found.success:
         raise NotMixedError(f"{found.target.name}: {found.message}")
-    if ax is None:
-        _, ax = plt.subplots(figsize=(4.5, 3.0), layout="constrained")
+    ax = axes_or_new(ax)
     f = np.asarray(found.target.frequency)
     power = found.replicates.power.reshape(-1, len(f))
     expected = found.replicates.expected.reshape(-1, len(f))
@@ -105,29 +105,31 @@ def predictive(found: Posterior, ax: Axes | None = None) -> Axes:
     ax.plot(f, np.median(expected, axis=0), color=BLUE, lw=1.2, label="model, median")
     ax.plot(f, np.asarray(found.target.proportional_power), color=VERMILLION, marker="o", ms=3, lw=0, label="target")
     ax.set_yscale("log")
-    ax.set(xlabel="Frequency (Hz)", ylabel="Proportional power", xlim=(0, f[-1] + f[0]))
+    ax.set(xlabel="Frequency (Hz)", ylabel=PROPORTIONAL, xlim=(0, f[-1] + f[0]))
     ax.set_title(f"{found.target.name}: posterior-predictive χ², p = {found.replicates.p_value:.2g}")
     ax.legend(frameon=False, ncols=2)
     return ax
 
 
 @styled
-def traces(found: Posterior) -> Figure:
+def traces(found: Posterior, ax: Axes | None = None) -> Any:
     """Every chain's draws of what the data determine; also of chains that did not mix."""
     names = chosen(found) or list(found.samples)[:MOST]
-    fig, axes = plt.subplots(len(names), 1, figsize=(6.5, 1.1 * len(names) + 0.5), sharex=True, squeeze=False,
-                             layout="constrained")  # fmt: skip
-    for ax, name in zip(axes[:, 0], names, strict=True):
+    fig = canvas(ax, (6.5, 1.1 * len(names) + 0.5))
+    axes = fig.subplots(len(names), 1, sharex=True, squeeze=False)
+    for panel, name in zip(axes[:, 0], names, strict=True):
         for number, chain in enumerate(found.quantities[name]):
-            ax.plot(chain, lw=0.3, color=PALETTE[number % len(PALETTE)])
+            panel.plot(chain, lw=0.3, color=PALETTE[number % len(PALETTE)])
         r_hat, bulk, _ = found.diagnostics[name]
-        ax.set_title(f"{name.replace('_', ' ')}: R-hat {r_hat:.3f}, effective sample size {bulk:.0f}", fontweight="normal")
-        ax.set_ylabel("" if found.unit(name) == "1" else f"({found.unit(name)})")
+        panel.set_title(
+            f"{name.replace('_', ' ')}: R-hat {r_hat:.3f}, effective sample size {bulk:.0f}", fontweight="normal"
+        )
+        panel.set_ylabel("(ratio)" if found.unit(name) == "1" else f"({found.unit(name)})")
         for draw in np.unique(np.nonzero(found.chains.diverging)[1]):
-            ax.axvline(draw, color=ORANGE, lw=0.5, zorder=0)
+            panel.axvline(draw, color=ORANGE, lw=0.5, zorder=0)
     axes[-1, 0].set_xlabel("Draw")
     if not found.success:
         fig.suptitle(f"NOT MIXED: {found.message}", x=0.01, ha="left", fontsize=7.5, color=VERMILLION, wrap=True)
     else:
-        fig.suptitle(f"{found.target.name}: chains", x=0.01, ha="left", fontsize=9, fontweight="bold", color=GREY)
+        fig.suptitle(f"{found.target.name}: chains", x=0.01, ha="left", fontsize=9, fontweight="bold")
     return fig

@@ -1,11 +1,10 @@
 """The figure of a profile likelihood."""
 
-import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
 
 from ._profile import Profile
-from .plot import BLUE, GREY, ORANGE, styled
+from ._style import BLUE, GREY, ORANGE, axes_or_new, log_axis, styled
 
 SHOWN = 3.0  # times the threshold
 
@@ -13,8 +12,7 @@ SHOWN = 3.0  # times the threshold
 @styled
 def draw(found: Profile, ax: Axes | None = None) -> Axes:
     """Rise of -2 ln L, the bound of the interval, the interval, and the parabola by the curvature."""
-    if ax is None:
-        _, ax = plt.subplots(figsize=(4.5, 3.0), layout="constrained")
+    ax = axes_or_new(ax)
     ax.plot(found.values, found.rise, color=BLUE, marker="o", ms=2.5, lw=1.2, label="profile")
     ax.axhline(found.threshold, color=GREY, lw=0.8, ls=(0, (4, 2)), label=f"{100 * found.level:g} %")
     for low, high in found.intervals:
@@ -22,7 +20,6 @@ def draw(found: Profile, ax: Axes | None = None) -> Axes:
         ax.axvspan(*ends, color=BLUE, alpha=0.1, lw=0)
     wide = np.all(found.values > 0) and found.values[-1] > 10 * found.values[0]
     if wide:
-        ax.set_xscale("log")
         x = np.geomspace(found.values[0], found.values[-1], 200)
         parabola = (np.log(x / found.value) * found.value / found.stderr) ** 2
     else:
@@ -31,11 +28,20 @@ def draw(found: Profile, ax: Axes | None = None) -> Axes:
     top = min(SHOWN * found.threshold, 1.05 * max(float(found.rise.max()), 1.2 * found.threshold))
     if found.name != "harmonic_frequency":
         ax.plot(x, parabola, color=ORANGE, lw=0.9, label="by curvature")
-    ax.set(ylim=(0, top), xlim=(found.values[0], found.values[-1]), ylabel="Rise of -2 ln L")
+    seen = found.values[np.flatnonzero(_beside(found.rise <= top))]
+    ax.set(ylim=(0, top), xlim=(seen[0], seen[-1]), ylabel="Rise of -2 ln L")
+    if wide:
+        log_axis(ax)
     ax.set_xlabel(found.name + ("" if found.unit == "1" else f" ({found.unit})"))
-    ax.set_title(f"{found.target}: profile likelihood")
+    ax.set_title(f"{found.target}: profile likelihood", pad=18)
     if found.low is None or found.high is None:
         side = "on both sides" if found.low is found.high else "downwards" if found.low is None else "upwards"
         ax.text(0.99, 0.97, f"open {side}", transform=ax.transAxes, color=GREY, fontsize=7, ha="right", va="top")
-    ax.legend(frameon=True, loc="upper center")
+    ax.legend(frameon=False, loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=3, borderaxespad=0.0)
     return ax
+
+
+def _beside(inside: np.ndarray) -> np.ndarray:
+    """What is inside, and its neighbours."""
+    padded = np.pad(inside, 1)
+    return padded[:-2] | inside | padded[2:]

@@ -2,27 +2,28 @@
 
 from typing import Any
 
-import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
+from matplotlib.figure import Figure, SubFigure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from ._spectrum import Spectrum, SpectrumSettings
-from .plot import BLACK, BLUE, GREY, ORANGE, SKY, legend, sampling_band, styled
+from ._style import BLACK, BLUE, GREY, ORANGE, SKY, canvas, legend, styled
+from .plot import sampling_band
 
 
 @styled
-def figure(recording: Any, settings: SpectrumSettings | None = None) -> Figure:
+def figure(recording: Any, settings: SpectrumSettings | None = None, ax: Axes | None = None) -> Figure | SubFigure:
     """Trace with the window, the window enlarged, and power (Welch with its error, FFT), linear and logarithmic."""
-    fig, axes = plt.subplots(2, 2, figsize=(9.0, 5.6), layout="constrained")
+    fig = canvas(ax, (9.0, 5.6))
+    axes = fig.subplots(2, 2)
     _trace(axes[0, 0], recording)
     _window(axes[0, 1], recording, settings)
     welch, fft = recording.spectrum(settings), recording.fft_spectrum(settings)
     target = recording.target("welch", quantity="force", settings=settings)
     band = [edge * np.sum(welch.power) for edge in sampling_band(target) or ()]
-    for ax, log in ((axes[1, 0], False), (axes[1, 1], True)):
-        _spectra(ax, welch, fft, band, log)
+    for panel, log in ((axes[1, 0], False), (axes[1, 1], True)):
+        _spectra(panel, welch, fft, band, log)
     words = f"{recording.segments(settings)} Welch segments"
     fig.suptitle(f"{recording.source}; {words}", x=0.01, ha="left", fontsize=8.0, parse_math=False)
     return fig

@@ -16,8 +16,8 @@ from ._reproduce import Experiment, Reproduction, Tuned
 from ._reproduce_readings import HIGH, LOW, Reading
 from ._spectrum import Spectrum
 from ._store import replacing
+from ._style import BLACK, BLUE, GREEN, GREY, PALETTE, VERMILLION, styled
 from ._trajectory import Trajectory
-from .plot import BLACK, BLUE, GREEN, GREY, PALETTE, VERMILLION, styled
 
 SIZE = (4.2, 2.9)  # inches: letters of 8 points are 10 pixels high on a phone of 390
 DPI = 200
@@ -58,6 +58,7 @@ def _run(run: Trajectory, quantity: str, cutoff: float, words: str) -> Figure:
     whole.axvspan(*WINDOW, color="0.93", lw=0, zorder=0)
     whole.text(WINDOW[1] - 0.1, 0.05, "analysed", ha="right", va="bottom", color=GREY, transform=whole.get_xaxis_transform())
     whole.set_xlim(0, WINDOW[1])
+    whole.set_xlabel("Time (s)")
     whole.set_ylabel(f"{quantity} / mean")
     time = WINDOW[0] + np.arange(held.size) / run.rate
     percent = 100 * (held / held.mean() - 1)
@@ -190,9 +191,8 @@ def fig7(found: Reproduction) -> Figure:
         step = float(np.diff(spectra[0].frequency)[0])
         ax.set_title(f"{_source(people)}: {title}, {step:.4f} Hz")
         _frequency(ax, log=True)
-        ax.set_ylabel(PROPORTIONAL)
+        ax.set_ylabel(f"{PROPORTIONAL} (per bin)")
     axes[1, 0].legend(loc="lower left")
-    axes[0, 0].set_xlabel("")
     return figure
 
 
@@ -201,6 +201,7 @@ def fig8(found: Reproduction) -> Figure:
     """One person's power against another's, and the Spearman correlation."""
     people = found.experiment
     figure, axes = _panels(3, 2, height=6.2)
+    figure.set_layout_engine("constrained", w_pad=0.12)  # tick labels stand beyond the ends of equal axes
     kinds = (("FFT", people.fft, people.rho_fft), ("Welch", people.welch, people.rho_welch))
     for column, (title, spectra, rho) in zip(axes.T, kinds, strict=True):
         for ax, (i, j), value in zip(column, people.pairs, rho, strict=True):

@@ -121,7 +121,7 @@ def _from_table(key: str, value: Any, where: str) -> Any:
 
 
 def load_preset(name_or_path: str | Path) -> AbstractTask:
-    """The task of a bundled preset, of a preset file (.toml), or of a `fit.json`.
+    """The task of a bundled preset, of a preset file (.toml), or of a `fit.json`: `name_or_path`.
 
     **Raises:** `PresetError` naming the file or the nearest bundled name, and what is wrong.
     """
@@ -154,6 +154,6 @@ def _read(path: Path) -> dict[str, Any]:
 
 
 def save_preset(path: str | Path, task: AbstractTask, *, description: str = "", fit: dict[str, Any] | None = None) -> None:
-    """Write a task as a preset: TOML with a description, the fit that made it and the task table."""
+    """Write a task to `path` as a preset: TOML with a description, the fit that made it and the task table."""
     table: dict[str, Any] = {"description": description} | ({"fit": fit} if fit else {})
     write_text(path, tomli_w.dumps(table | {"task_table": task_to_table(task)}))

@@ -36,7 +36,7 @@ class Profile(eqx.Module):
 
     `value` at the maximum; `stderr`, by the curvature there; `intervals`, where `rise` is below the χ² quantile of `level`
     with one degree of freedom, None for an end that the data leave open; `with_priors`, whether the priors count as data;
-    `unit`, `target`.
+    `name` and `unit` of the quantity; `target`.
     """
 
     name: str

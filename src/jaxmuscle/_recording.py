@@ -290,11 +290,11 @@ class Recording(eqx.Module):
     def _window_words(self) -> str:
         return "all of it" if self.window is None else f"window {self.window[0]:g} s to {self.window[1]:g} s"
 
-    def plot(self, settings: SpectrumSettings | None = None) -> Any:
+    def plot(self, settings: SpectrumSettings | None = None, ax: Any = None) -> Any:
         """Draw the trace with its window, and the spectra (Welch, FFT), linear and logarithmic; returns the figure."""
         from ._plot_recording import figure
 
-        return figure(self, settings)
+        return figure(self, settings, ax)
 
     def __str__(self) -> str:
         what = "recording" if self.quantity is None else self.quantity

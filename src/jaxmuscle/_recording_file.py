@@ -55,6 +55,7 @@ def load_recording(
 
     **Arguments:**
 
+    - `path`: the file; its suffix says the format.
     - `column`: name (case and a unit in brackets may be left out) or number from 0; needed if there are several.
     - `rate` [Hz]: needed if the file does not state it.
     - `units`: as in `Recording`; by default what the file states, else N. Nothing is converted.

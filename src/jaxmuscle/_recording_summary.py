@@ -10,7 +10,12 @@ from ._metrics import Peaks
 
 
 class RecordingSummary(eqx.Module):
-    """Numbers of a window: times in s, levels in `unit`, ratios without unit, entropies with m = 2 and r = 0.2 σ."""
+    """Numbers of a window.
+
+    Its `duration` [s] and Welch `segments`; `mean` and `standard_deviation` in `unit`; without unit
+    `coefficient_of_variation`, its inverse `signal_to_noise`, `approximate_entropy` and `sample_entropy` (m = 2,
+    r = 0.2 σ); `peaks` of the spectrum [Hz].
+    """
 
     unit: str
     duration: float

@@ -15,7 +15,8 @@ from ._target import Target
 from ._task import AbstractTask
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure, SubFigure
 
 FORMAT = 1
 
@@ -25,7 +26,10 @@ class ResultError(ValueError):
 
 
 class Estimate(eqx.Module):
-    """A number with its unit and standard error; `stderr` is None where the data do not determine it."""
+    """A number, its `value` in `unit`, with its standard error; `stderr` is None where the data do not determine it.
+
+    `free`, whether it was fitted; `identifiable`, whether the data determine it.
+    """
 
     value: float
     unit: str
@@ -110,11 +114,11 @@ class FitResult(eqx.Module):
             said.append(f"the harmonic is {word}: p = {self.harmonic_p_value:.2g} by bootstrap without it")
         return tuple(said)
 
-    def plot(self) -> "Figure":
+    def plot(self, ax: "Axes | None" = None) -> "Figure | SubFigure":
         """The figure of the fit."""
         from . import plot
 
-        return plot.fit(self)
+        return plot.fit(self, ax)
 
     def save(self, path: str | Path) -> None:
         """Write JSON atomically; `load_result` reads it back equal. The file also serves wherever a preset does."""
@@ -203,7 +207,7 @@ def _task_name(task: AbstractTask) -> str:
 
 
 def load_result(path: str | Path) -> FitResult:
-    """Read a `fit.json`. Raises `ResultError` naming the file and what is wrong with it."""
+    """Read the `fit.json` at `path`. Raises `ResultError` naming the file and what is wrong with it."""
     path = Path(path)
     try:
         table = json.loads(path.read_text(encoding="utf-8"))

@@ -21,7 +21,7 @@ SIZES_OF_A_SIGNAL = ("level", "initial", "final")
 
 
 def relative_variation(mvc_fraction: Scalar, *, steadiest: Scalar = 0.3, contrast: Scalar = 1.0) -> Scalar:
-    """Coefficient of variation of force at a level L of contraction over that at the steadiest level L*.
+    """Coefficient of variation of force at a level L (`mvc_fraction`) over that at the steadiest level L* (`steadiest`).
 
         g(L) = (L*/L · exp(L/L* - 1))^contrast
 

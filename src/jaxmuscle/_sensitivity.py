@@ -24,7 +24,7 @@ class Sensitivity(eqx.Module):
     """`d ln p_k / d ln v_j` of proportional power p_k with respect to parameters v_j, shape (parameters, bins).
 
     Where a parameter is zero, or may be negative and so has no logarithm, it is `d ln p_k / d v_j`: see `relative`.
-    `power` has the same of absolute power; `frequency` [Hz]; `values` and `units` of the parameters.
+    `power` has the same of absolute power; `frequency` [Hz]; `names`, `values` and `units` of the parameters.
     """
 
     names: tuple[str, ...] = eqx.field(static=True)

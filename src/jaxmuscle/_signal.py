@@ -121,7 +121,7 @@ class Decay(AbstractSignal):
 class Sampled(AbstractSignal):
     """`level` times the quintic spline through samples (four continuous derivatives), held beyond its ends.
 
-    Build it with `Sampled.through(times, values)`.
+    Build it with `Sampled.through(times, values)`, which makes `breaks` [s] and `coefficients` (pieces, 6) of its pieces.
     """
 
     breaks: Float[np.ndarray | Array, " pieces_plus_one"]

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import PRNGKeyArray
+from jaxtyping import Array, Int, PRNGKeyArray
 
 from ._lanes import Recipe, run_seeds
 from ._linear import LinearTask, check_equilibrium, linearised
@@ -32,7 +32,7 @@ def simulate(
     task: AbstractTask,
     key: PRNGKeyArray,
     *,
-    seed: int = 0,
+    seed: int | Int[Array, ""] = 0,
     duration: float = DURATION,
     dt: float = DT,
     rate: float | None = None,

@@ -189,11 +189,11 @@ class Spectrum(eqx.Module):
         power = jnp.mean(power, axis=tuple(range(power.ndim - 1)))
         return Spectrum(self.frequency, power, self.settings, self.unit)
 
-    def plot(self, ax: Any = None) -> Any:
-        """Draws proportional power over frequency and returns the axes, see `jaxmuscle.plot.spectrum`."""
+    def plot(self, ax: Any = None, *, log: bool = False, proportional: bool = True, label: str | None = None) -> Any:
+        """Draws power over frequency and returns the axes, see `jaxmuscle.plot.spectrum`."""
         from . import plot
 
-        return plot.spectrum(self, ax)
+        return plot.spectrum(self, ax, log=log, proportional=proportional, label=label)
 
 
 def floating(signal: Real[Array | np.ndarray, "*batch times"]) -> Float[Array, "*batch times"]:

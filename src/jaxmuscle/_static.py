@@ -138,7 +138,7 @@ def _held_force(muscle: AbstractMuscle, x_z: Array, P_w: Array) -> Array:
 def _draw(curves: StaticCharacteristics, ax: "Sequence[Axes] | None") -> "tuple[Axes, Axes, Axes]":
     import matplotlib.pyplot as plt
 
-    from .plot import styled
+    from ._style import styled
 
     def panels() -> "tuple[Axes, Axes, Axes]":
         axes: Any = plt.subplots(1, 3, figsize=(9.0, 3.0), layout="constrained")[1] if ax is None else ax
@@ -152,7 +152,7 @@ def _draw(curves: StaticCharacteristics, ax: "Sequence[Axes] | None") -> "tuple[
 
 
 def _coefficients(curves: StaticCharacteristics, stiffness: "Axes", damping: "Axes") -> None:
-    from .plot import BLUE, VERMILLION
+    from ._style import BLUE, VERMILLION
 
     x = 1e3 * curves.displacement
     for j, colour, tissue, width in (("w", BLUE, "active tissue", 3.0), ("z", VERMILLION, "passive tissue", 1.5)):
@@ -170,7 +170,7 @@ def _coefficients(curves: StaticCharacteristics, stiffness: "Axes", damping: "Ax
 
 
 def _forces(curves: StaticCharacteristics, ax: "Axes") -> None:
-    from .plot import BLUE, GREEN, GREY, VERMILLION
+    from ._style import BLUE, GREEN, GREY, VERMILLION
 
     x = 1e3 * curves.displacement
     ax.plot(x, curves.F_w, color=BLUE, lw=3.0, label="spring of the active tissue")

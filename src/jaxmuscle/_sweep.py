@@ -105,7 +105,7 @@ def _parts(task: AbstractTask) -> str:
 
 
 class Population(eqx.Module):
-    """Ensembles of every point of a sweep: `population[i]` is the `Trajectory` of point i."""
+    """Ensembles of every point of `sweep`: `population[i]`, which is `members[i]`, is the `Trajectory` of point i."""
 
     sweep: Sweep
     members: tuple[Trajectory, ...]

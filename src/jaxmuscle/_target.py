@@ -27,7 +27,7 @@ class Target(eqx.Module):
     **Arguments:**
 
     - `name`: how reports call it.
-    - `proportional_power`: p_k > 0, shape `(bins,)`; divided by its sum.
+    - `proportional_power`: p_k > 0, shape `(bins,)`; divided by its sum. At `frequency` [Hz] afterwards.
     - `bins`: bin numbers on the grid of `settings`, increasing; all selected bins by default.
     - `quantity`: what was recorded; torque is fitted as force, since p has no scale.
     - `provenance`, `source`: how and from where the numbers were obtained.
@@ -132,11 +132,11 @@ class Target(eqx.Module):
         bins = np.rint(np.asarray(fields.pop("frequency_hz")) / settings.resolution).astype(int)
         return cls(**fields, bins=bins, settings=settings)
 
-    def plot(self, ax: Any = None) -> Any:
-        """Draw the spectrum, see `jaxmuscle.plot.target`; returns the axes."""
+    def plot(self, ax: Any = None, *, log: bool = False) -> Any:
+        """Draw the spectrum, see `jaxmuscle.plot.target`; `log`: both axes logarithmic. Returns the axes."""
         from . import plot
 
-        return plot.target(self, ax)
+        return plot.target(self, ax, log=log)
 
     def __str__(self) -> str:
         peak = int(np.argmax(self.proportional_power))
@@ -175,6 +175,7 @@ def load_target(
 
     **Arguments:**
 
+    - `name_or_path`: see `list_targets` for the names.
     - `quantity` and `segments` (Welch segments of each trial) replace what the file says.
     - `dataset`: which of several datasets of a figure.
     - `axis`: `"log-log"` if a figure's points are log10 of frequency [Hz] and of power, calibrated in decades.

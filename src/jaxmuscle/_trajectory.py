@@ -113,11 +113,11 @@ class Trajectory(eqx.Module):
             )
         return output[..., ::every]
 
-    def plot(self, ax: Any = None) -> Any:
-        """Output against time: one line, or mean and quantile band over seeds. Returns the axes."""
+    def plot(self, ax: Any = None, *, window: tuple[float, float] | None = None) -> Any:
+        """Output against time, or in a window [s]: one line, or mean and quantile band over seeds. Returns the axes."""
         from .plot import trajectory
 
-        return trajectory(self, ax)
+        return trajectory(self, ax, window=window)
 
     def to_xarray(self) -> "xarray.Dataset":
         """A Dataset with dimensions (seed,) time; units, parameters, settings and versions as attributes."""

@@ -1,0 +1,199 @@
+"""Draws the gallery and writes its page: `python docs/gallery.py` (minutes), or only `python docs/gallery.py FILE ...`."""
+
+import os
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any, NamedTuple
+
+HERE = Path(__file__).parent
+PAGE = HERE / "gallery.md"
+DPI, COLOURS = 130, 256
+PAPER = {
+    "fig2": "Force tuned to reference 30",
+    "fig3": "Its spectrum",
+    "fig4a": "Proportional power",
+    "fig4b": "The same, logarithmic",
+    "fig5": "Displacement at constant force",
+    "fig6a": "Force tuned to reference 12",
+    "fig6b": "Displacement spectrum",
+    "fig7": "FFT above Welch",
+    "fig8": "One person against another",
+}
+
+
+class Shown(NamedTuple):
+    """A figure: its file, the expression that draws it (empty: the setup does), words, where to read more."""
+
+    file: str
+    code: str
+    words: str
+    link: str
+
+
+class Section(NamedTuple):
+    title: str
+    setup: str
+    figures: tuple[Shown, ...]
+
+
+HEAD = """---
+hide: [navigation]
+---
+
+# Gallery
+
+Every figure of jaxmuscle with the code that draws it, the blocks being run one after another; `docs/gallery.py` makes this
+page and its figures. Each is a function of [`jm.plot`](reference/figures.md) that draws into axes of yours as well. Click on
+one to see it whole.
+"""
+TAIL = """
+## A Hill-type muscle
+
+`python docs/hill_muscle.py` draws a muscle written outside the package, and its spectrum with two colours of noise:
+[your own muscle](own-muscle.md).
+
+[![Force-length, force-velocity and tendon curves; isometric force spectrum](hill.png)](hill.png)
+"""
+
+FIT = """
+import jax
+import jaxmuscle as jm
+
+key = jax.random.key(0)
+target = jm.load_target("vastus-lateralis-26mvc")
+result = jm.fit(jm.task_for(target), target)
+"""
+SIMULATED = """
+runs = jm.ensemble(result.task, key, seeds=200)
+summary = jm.ensemble(result.task, key, seeds=2000, reduce=True)
+sweep = jm.Sweep.grid(result.task, c_w=[50.0, 100.0, 200.0])
+ax = None
+for task, run in zip(sweep, jm.ensemble(sweep, key, seeds=100), strict=True):
+    ax = run.spectrum().mean().plot(ax, label=f"c_w = {task['c_w']:g} N s³/m³")
+"""
+SURE = """
+found = jm.posterior(result, target, key=jax.random.key(2))
+"""
+PEOPLE = """
+import numpy as np
+
+held = jm.simulate(jm.settled(result.task), key, duration=40.0, rate=1000.0).output
+ramp = np.linspace(0.0, float(held[0]), 3000)
+np.savetxt("trial.csv", np.concatenate([ramp, held, ramp[::-1]]), header="force", comments="")
+recording = jm.load_recording("trial.csv", column="force", rate=1000, units="N")
+
+people = {}
+for i, name in enumerate(["ann", "ben", "eve", "jim", "kim", "tom"]):
+    one = jm.at_level(jm.Isometric().replace(noise_K_w=0.12 + 0.04 * (i % 2)), 0.2 + 0.1 * i, reference=0.26)
+    power = np.asarray(jm.ensemble(one, jax.random.key(i), seeds=6).spectrum().mean().proportional, float)
+    people[name] = jm.Target(name, power, segments=[6] * 6, mvc_fraction=0.2 + 0.1 * i)
+cohort = jm.fit_cohort(list(people.values()), groups={name: "ab"[i % 2] for i, name in enumerate(people)})
+pair = {name: jm.at_level(jm.Isometric(), people[name].mvc_fraction, reference=0.26) for name in ("ann", "eve")}
+"""
+SECTIONS = (
+    Section("A fit", FIT, (
+        Shown("fit.png", "result.plot()", "A fit; grey rows are not determined", "tutorial.md#4-read-it"),
+        Shown("gallery/target.png", "target.plot(log=True)", "A target, the sampling error of its bins", "digitise.md"),
+    )),
+    Section("Simulations", SIMULATED, (
+        Shown("gallery/simulation.png", "jm.plot.simulation(runs)", "Output, its analysed window, spectra", "model.md"),
+        Shown("gallery/trajectory.png", "runs.plot(window=(10, 15))", "200 seeds: mean, 90 % band, three", "model.md"),
+        Shown("gallery/spectrum.png", "runs.spectrum().plot(log=True, proportional=False)", "Their spectra", "model.md"),
+        Shown("gallery/estimate.png", "runs.mean_spectrum().plot(log=True)", "Their mean, with and without control variate",
+              "model.md"),
+        Shown("gallery/moments.png", "summary.plot()", "Moments of 2000 seeds, none of them kept", "ensembles.md"),
+        Shown("gallery/sweep.png", "ax", "A sweep: three dampings, the same noise", "ensembles.md"),
+        Shown("gallery/sensitivity.png", "jm.sensitivity(result.task).plot()", "Every bin, every parameter", "model.md"),
+        Shown("gallery/static.png", "jm.static_characteristics(result.task).plot()", "Stiffness, damping, force at rest",
+              "scaling.md"),
+    )),
+    Section("How sure is it, and is it right", SURE, (
+        Shown("gallery/profile.png", 'jm.profile(result, "corner_frequency").plot()', "A profile", "uncertainty.md"),
+        Shown("gallery/posterior.png", "found.plot()", "The posterior of what the data determine", "uncertainty.md"),
+        Shown("gallery/chains.png", "found.plot_chains()", "Its chains", "uncertainty.md"),
+        Shown("gallery/predictive.png", "found.plot_predictive()", "The spectra that it predicts", "uncertainty.md"),
+        Shown("identifiability.png", "jm.identifiability(result).plot()", "What further measurements would determine",
+              "identifiability.md"),
+        Shown("gallery/goodness.png", "jm.goodness(result).plot()", "Residuals, and what is usual", "goodness.md"),
+        Shown("gallery/bootstrap.png", "jm.bootstrap(result).plot()", "Refits against the stated errors", "goodness.md"),
+        Shown("gallery/comparison.png", "jm.compare_noise(jm.Isometric(), target).plot()", "Which noise", "noise-colour.md"),
+    )),
+    Section("Recordings, people, several measurements", PEOPLE, (
+        Shown("gallery/recording.png", "recording.steady().plot()", "A recording and its steady window", "recordings.md"),
+        Shown("gallery/cohort.png", "cohort.plot()", "What six people's spectra determine", "fitting.md#many-targets"),
+        Shown("gallery/groups.png", 'cohort.plot(by="group")', "The same by group", "fitting.md#many-targets"),
+        Shown("gallery/levels.png", 'cohort.plot(by="level")', "The same by level", "fitting.md#many-targets"),
+        Shown("gallery/joint.png", "jm.fit_joint({name: people[name] for name in pair}, tasks=pair).plot()",
+              "Two measurements fitted together", "identifiability.md#a-joint-fit"),
+    )),
+    Section("The paper's figures", '\njm.reproduce("paper")\n', tuple(
+        Shown(f"gallery/paper-{name}.png", "", words, "reproduce.md") for name, words in PAPER.items()
+    )),
+)  # fmt: skip
+
+
+def page() -> str:
+    """The text of the page."""
+    parts = [HEAD]
+    for section in SECTIONS:
+        parts.append(f'\n## {section.title}\n\n```python{section.setup}```\n\n<div class="gallery" markdown>\n')
+        for shown in section.figures:
+            code = f"`{shown.code}`" if shown.code else f"`{drawn(shown)}`"
+            parts.append(f"\n<figure markdown>\n[![{shown.words}]({shown.file})]({shown.file})\n")
+            parts.append(f"<figcaption markdown>{code}<br>[{shown.words}]({shown.link})</figcaption>\n</figure>\n")
+        parts.append("\n</div>\n")
+    return "".join(parts) + TAIL
+
+
+def drawn(shown: Shown) -> str:
+    """The file that the setup of a section wrote."""
+    return "paper/" + shown.file.removeprefix("gallery/paper-")
+
+
+def draw(shown: Shown, names: dict[str, Any], out: Path) -> None:
+    """Evaluates the expression of a figure and stores the picture, in few colours."""
+    import matplotlib.pyplot as plt
+    from PIL import Image
+
+    path = out / shown.file
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if shown.code:
+        made = eval(shown.code, names)
+        made = made[0] if isinstance(made, tuple) else made
+        getattr(made, "figure", made).savefig(path, dpi=DPI)
+        plt.close("all")
+    few_colours(Image.open(path if shown.code else drawn(shown)).convert("RGB")).save(path, optimize=True)
+
+
+def few_colours(picture: Any) -> Any:
+    """The picture in its commonest colours: lines and areas keep theirs, the edges of letters get the nearest."""
+    import numpy as np
+    from PIL import Image
+
+    pixels = np.asarray(picture)
+    codes = pixels.reshape(-1, 3) @ np.array([1 << 16, 1 << 8, 1])
+    codes, where, counts = np.unique(codes, return_inverse=True, return_counts=True)
+    colours = np.stack([codes >> 16, codes >> 8 & 255, codes & 255], axis=1)
+    kept = colours[np.argsort(-counts, kind="stable")[:COLOURS]]
+    nearest = np.array([np.argmin(np.sum((kept - colour) ** 2, axis=1)) for colour in colours])
+    small = Image.fromarray(nearest[where].astype(np.uint8).reshape(pixels.shape[:2]))
+    small.putpalette(kept.ravel().tolist())
+    return small
+
+
+def main(only: list[str]) -> None:
+    PAGE.write_text(page(), encoding="utf-8")
+    names: dict[str, Any] = {}
+    os.chdir(tempfile.mkdtemp())
+    for section in SECTIONS:
+        wanted = [shown for shown in section.figures if not only or shown.file in only]
+        if wanted or "result" not in names:
+            exec(section.setup, names)
+        for shown in wanted:
+            draw(shown, names, HERE)
+            print(shown.file, (HERE / shown.file).stat().st_size // 1024, "KiB", flush=True)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

@@ -1,0 +1,33 @@
+"""The figure of a sensitivity."""
+
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import SymLogNorm
+
+from ._sensitivity import Sensitivity
+from ._style import styled
+
+
+@styled
+def draw(sensitivity: Sensitivity, ax: Axes | None = None) -> Axes:
+    """A heat map of the parameters that do something."""
+    table = np.asarray(sensitivity.proportional)
+    shown = np.flatnonzero(np.max(np.abs(table), axis=1) > 1e-6)
+    if ax is None:
+        ax = plt.figure(figsize=(6.5, 1.3 + 0.22 * len(shown)), layout="constrained").add_subplot()
+    frequency = np.asarray(sensitivity.frequency)
+    half = 0.5 * (frequency[1] - frequency[0]) if len(frequency) > 1 else 0.5
+    edges = np.append(frequency - half, frequency[-1] + half)
+    largest = float(np.max(np.abs(table[shown]), initial=1e-6))
+    # Logarithmic beyond a tenth: a frequency moves its own bins hundreds of times as much as anything else does.
+    scale = SymLogNorm(min(0.1, largest), vmin=-largest, vmax=largest)
+    mesh = ax.pcolormesh(edges, np.arange(len(shown) + 1), table[shown], cmap="RdBu_r", norm=scale)
+    labels = [sensitivity.names[i] + ("" if sensitivity.relative[i] else " *") for i in shown]
+    ax.set_yticks(np.arange(len(shown)) + 0.5, labels)
+    ax.invert_yaxis()
+    ax.set_xlabel("Frequency (Hz)")
+    ax.figure.colorbar(mesh, ax=ax, label="d ln p / d ln parameter")
+    if not np.all(sensitivity.relative[shown]):
+        ax.set_title("* d ln p / d parameter, in its own unit", size="small")
+    return ax

@@ -1,0 +1,118 @@
+"""The style of all figures: colours that colour-blind readers can tell apart, sizes for print, axes with their units."""
+
+import functools
+from collections.abc import Callable
+from typing import Any, Literal, ParamSpec, TypeVar, cast
+
+import matplotlib
+import matplotlib.pyplot as plt
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure, SubFigure
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+# Okabe & Ito 2008, Color Universal Design: told apart with any common form of colour vision.
+BLUE, VERMILLION, GREEN, PURPLE = "#0072B2", "#D55E00", "#009E73", "#CC79A7"
+ORANGE, SKY, BLACK, GREY = "#E69F00", "#56B4E9", "#000000", "#767676"
+PALETTE = (BLUE, VERMILLION, GREEN, PURPLE, ORANGE, SKY)
+
+STYLE: dict[str, Any] = {
+    "font.size": 8.0,
+    "axes.titlesize": 8.0,
+    "axes.titlelocation": "left",
+    "axes.titleweight": "bold",
+    "axes.labelsize": 8.0,
+    "axes.linewidth": 0.6,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "xtick.labelsize": 7.5,
+    "ytick.labelsize": 7.5,
+    "xtick.major.width": 0.6,
+    "ytick.major.width": 0.6,
+    "legend.fontsize": 7.5,
+    "legend.facecolor": "white",
+    "legend.edgecolor": "none",
+    "legend.framealpha": 0.85,
+    "lines.linewidth": 1.5,
+    "figure.dpi": 160.0,
+}
+SIZE = (4.5, 3.0)
+PROPORTIONAL = "Proportional power (fraction per bin)"
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+
+def styled(draw: Callable[P, R]) -> Callable[P, R]:
+    """Runs a drawing function in this module's style; the caller's rcParams are the same before and after."""
+
+    @functools.wraps(draw)
+    def inside(*args: P.args, **kwargs: P.kwargs) -> R:
+        # Not rc_context: it also restores what a notebook's backend sets about itself while the first figure is made.
+        params = cast(Any, matplotlib.rcParams)
+        before = {name: params[name] for name in STYLE}
+        params.update(STYLE)
+        try:
+            return draw(*args, **kwargs)
+        finally:
+            params.update(before)
+
+    return inside
+
+
+def canvas(ax: Axes | None, size: tuple[float, float], **pads: float) -> Figure | SubFigure:
+    """What several panels are drawn into: a new figure of `size` [inches], or the place that `ax` has in its figure."""
+    if ax is None:
+        figure = plt.figure(figsize=size, layout="constrained")
+        figure.set_layout_engine("constrained", **pads)
+        return figure
+    place, whole = ax.get_subplotspec(), ax.get_figure()
+    if place is None or whole is None:
+        raise ValueError("ax has no place in a grid: give one made by plt.subplots or add_subplot")
+    ax.remove()
+    return whole.add_subfigure(place)
+
+
+def output_label(name: str, unit: str) -> str:
+    """Axis label of a task's output, as `Force $F_\\mathrm{ext}$ (N)`."""
+    quantity = {"N": "Force ", "m": "Displacement "}.get(unit, "")
+    base, _, index = name.partition("_")
+    symbol = rf"${base}_\mathrm{{{index}}}$" if base.isalpha() and index.isalnum() else name
+    return f"{quantity}{symbol} ({unit})"
+
+
+def density_unit(unit: str) -> str:
+    return f"{unit}²/Hz" if unit.isalpha() else f"({unit})²/Hz"
+
+
+def axes_or_new(ax: Axes | None) -> Axes:
+    return plt.subplots(figsize=SIZE, layout="constrained")[1] if ax is None else ax
+
+
+def legend(ax: Axes, place: Literal["upper right", "lower left", "above"]) -> None:
+    """A legend in a fixed place, if there is anything to name: the best place is slow to find among many lines."""
+    if not ax.get_legend_handles_labels()[0]:
+        return
+    if place == "above":
+        ax.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2, borderaxespad=0.0)
+    else:
+        ax.legend(loc=place)
+
+
+def frequency_axis(ax: Axes, log: bool) -> None:
+    ax.set_xlabel("Frequency (Hz)")
+    if not log:
+        ax.set_xlim(left=0, auto=None)
+        if ax.get_yscale() == "linear":
+            ax.set_ylim(bottom=0, auto=None)
+        return
+    ax.set_yscale("log")
+    log_axis(ax)
+
+
+def log_axis(ax: Axes) -> None:
+    """A logarithmic abscissa with plain numbers, as many as have room."""
+    ax.set_xscale("log")
+    low, high = ax.get_xlim()
+    ax.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if high < 1e3 * low else (1.0,)))
+    ax.xaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:g}"))
+    ax.xaxis.set_minor_formatter(NullFormatter())

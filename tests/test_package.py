@@ -1,0 +1,120 @@
+"""Wheel and sdist as a user gets them: built, installed into an empty environment, and used there."""
+
+import email
+import json
+import os
+import re
+import subprocess
+import sys
+import tarfile
+import venv
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import jaxmuscle as jm
+
+ROOT = Path(__file__).parents[1]
+TARGET = "vastus-lateralis-26mvc"
+
+pytestmark = pytest.mark.slow
+
+
+def run(*command, cwd, **environment):
+    kept = {name: value for name, value in os.environ.items() if not name.startswith(("PYTHON", "PIP_"))}
+    done = subprocess.run(
+        [str(c) for c in command], cwd=cwd, env=kept | environment, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+@pytest.fixture(scope="module")
+def built(tmp_path_factory):
+    """A folder with the sdist of the checkout and the wheel built from that sdist alone."""
+    folder = tmp_path_factory.mktemp("dist")
+    run(sys.executable, "-m", "hatchling", "build", "-t", "sdist", "-d", folder, cwd=ROOT)
+    (archive,) = folder.glob("*.tar.gz")
+    with tarfile.open(archive) as sdist:
+        sdist.extractall(folder / "unpacked", filter="data")
+    (source,) = (folder / "unpacked").iterdir()
+    run(sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", folder, cwd=source)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def installed(built, tmp_path_factory):
+    """An environment with the wheel; what it depends on is borrowed from this one, whose editable install is not."""
+    folder = tmp_path_factory.mktemp("installed")
+    venv.create(folder / "clean", symlinks=True)
+    (wheel,) = built.glob("*.whl")
+    python = folder / "clean" / "bin" / "python"
+    run(sys.executable, "-m", "pip", "--python", python, "install", "--no-deps", "--no-index", wheel, cwd=folder)
+    purelib = run(python, "-c", "import sysconfig; print(sysconfig.get_path('purelib'))", cwd=folder).strip()
+    # A .pth file is not read in a folder that another .pth file names: the editable install stays behind.
+    borrowed = [path for path in sys.path if Path(path).name == "site-packages"]
+    Path(purelib, "borrowed.pth").write_text("\n".join(borrowed), encoding="utf-8")
+    return folder
+
+
+def test_wheel_holds_the_package_and_its_data_and_nothing_else(built):
+    (wheel,) = built.glob("*.whl")
+    names = set(zipfile.ZipFile(wheel).namelist())
+    package = ROOT / "src" / "jaxmuscle"
+    wanted = {f"jaxmuscle/{path.relative_to(package).as_posix()}" for path in package.rglob("*") if path.is_file()}
+    wanted = {name for name in wanted if "__pycache__" not in name}
+    assert {name for name in names if ".dist-info/" not in name} == wanted
+    assert {"jaxmuscle/py.typed", f"jaxmuscle/targets/{TARGET}.toml", "jaxmuscle/presets/zagrodny-slifkin.toml"} <= wanted
+
+
+def test_metadata_of_the_wheel(built):
+    (wheel,) = built.glob("*.whl")
+    archive = zipfile.ZipFile(wheel)
+    folder = f"jaxmuscle-{jm.__version__}.dist-info"
+    data = email.message_from_bytes(archive.read(f"{folder}/METADATA"))
+    assert (data["Name"], data["Version"], data["License-Expression"]) == ("jaxmuscle", jm.__version__, "Apache-2.0")
+    assert data["Description-Content-Type"] == "text/markdown"
+    assert set(data.get_all("Provides-Extra", [])) == {"all", "c3d", "notebooks", "posterior"}
+    assert f"{folder}/licenses/LICENSE" in archive.namelist()
+    assert archive.read(f"{folder}/entry_points.txt").decode().split() == [
+        "[console_scripts]", "jaxmuscle", "=", "jaxmuscle._cli:main",
+    ]  # fmt: skip
+
+
+def test_sdist_holds_what_users_and_packagers_need(built):
+    (archive,) = built.glob("*.tar.gz")
+    with tarfile.open(archive) as sdist:
+        names = {name.partition("/")[2] for name in sdist.getnames()}
+    assert {"README.md", "LICENSE", "CHANGELOG.md", "CITATION.cff", "Makefile", "pyproject.toml", "mkdocs.yml"} <= names
+    assert {"tests/conftest.py", "docs/index.md", "notebooks/01-first-fit.ipynb", "fitting/expected.py"} <= names
+    assert not [name for name in names if re.match(r"(\.venv|out|site|\.test-out|\.git)(/|$)", name)]
+
+
+def test_the_installed_package_is_the_wheels_and_has_one_version(installed):
+    program = """
+import importlib.metadata, json, sys, jaxmuscle as jm
+version = importlib.metadata.version("jaxmuscle")
+print(json.dumps([sys.prefix, jm.__file__, version, jm.__version__, jm.list_targets(), jm.list_presets()]))
+"""
+    python = installed / "clean" / "bin" / "python"
+    prefix, file, *rest = json.loads(run(python, "-c", program, cwd=installed))
+    assert Path(prefix) == installed / "clean" and Path(file).is_relative_to(prefix)
+    assert rest == [jm.__version__, jm.__version__, list(jm.list_targets()), list(jm.list_presets())]
+
+
+def test_the_installed_command_fits_a_bundled_target(installed):
+    command = installed / "clean" / "bin" / "jaxmuscle"
+    assert run(command, "--version", cwd=installed).split() == ["jaxmuscle", jm.__version__]
+    printed = run(
+        command, "fit", TARGET, "--starts", "20", "--out", "out", cwd=installed, XDG_CACHE_HOME=str(installed / "cache")
+    )
+    assert max(map(len, printed.splitlines())) <= 80
+    assert TARGET in printed and "Written: out/fit.json" in printed
+    result = jm.load_result(installed / "out" / "fit.json")
+    assert result.success and result.target == jm.load_target(TARGET)
+    assert result.chi2_per_bin is not None and result.chi2_per_bin <= 1.3
+    table = np.genfromtxt(installed / "out" / "spectrum.csv", delimiter=",", names=True)
+    np.testing.assert_allclose(table["target"], result.target.proportional_power, rtol=1e-5)
+    assert (installed / "out" / "fit.png").read_bytes().startswith(b"\x89PNG")

@@ -1,0 +1,229 @@
+"""The Python of README and documentation does what it says; commands in them have the options that they are given."""
+
+import contextlib
+import functools
+import io
+import re
+from pathlib import Path
+
+import jax
+import matplotlib.pyplot as plt
+import numpy as np
+import pages
+import pytest
+import typer
+
+import jaxmuscle as jm
+from jaxmuscle._cli import app
+
+TRUTH = jm.Isometric().replace(harmonic_frequency=6.0, harmonic_amplitude=0.012)
+ELSEWHERE = {"docs/digitise.md": "test_digitised.py", "docs/own-muscle.md": "test_hill.py"}
+BELOW = {"docs/gallery.md"}  # its program is read instead
+RUN_HERE = {
+    "README.md", "docs/coming-from-diffrax.md", "docs/coming-from-matlab.md", "docs/ensembles.md", "docs/fit-a-csv.md",
+    "docs/identifiability.md", "docs/index.md", "docs/recordings.md", "docs/reference/figures.md", "docs/scaling.md",
+    "docs/tutorial.md", "docs/uncertainty.md",
+}  # fmt: skip
+FEWER_SEEDS = {"seeds=100_000": "seeds=1_000"}
+
+
+@pytest.fixture(autouse=True)
+def in_a_folder_of_its_own(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    yield
+    plt.close("all")
+
+
+def write_recording(path):
+    """A trial as a force sensor writes it: 2048 Hz, rest, ramp, hold of a known task, release."""
+    run = jm.simulate(jm.settled(TRUTH), jax.random.key(5), duration=40.0, rate=1000.0)
+    held = np.interp(np.arange(40 * 2048) / 2048, run.time, np.asarray(run.output, dtype=float))
+    level = held.mean()
+    force = np.concatenate([np.zeros(4096), level * np.linspace(0, 1, 4096), held, level * np.linspace(1, 0, 2048)])
+    rows = "".join(f"{k / 2048:.6f},{f:.6f}\n" for k, f in enumerate(force))
+    Path(path).write_text("time,force\n" + rows, encoding="utf-8")
+
+
+def write_spectrum(path, seed=0, task=None):
+    """Twelve Welch segments of a known task."""
+    expected = np.asarray(jm.expected_spectrum(TRUTH if task is None else task).proportional)
+    power = expected * np.random.default_rng(seed).chisquare(24, expected.size) / 24
+    frequency = jm.SpectrumSettings().frequency
+    rows = "".join(f"{f:.6f},{p:.6g}\n" for f, p in zip(frequency, power / power.sum(), strict=True))
+    Path(path).write_text("frequency_hz,proportional_power\n" + rows, encoding="utf-8")
+
+
+def test_every_page_with_python_is_run():
+    with_python = {pages.name_of(page) for page in pages.PAGES if pages.blocks(page)}
+    assert with_python == RUN_HERE | BELOW | set(ELSEWHERE)
+    for page, test in ELSEWHERE.items():
+        assert f'pages.run("{page}"' in (Path(__file__).with_name(test)).read_text(encoding="utf-8")
+
+
+@pytest.fixture(scope="module")
+def readme(tmp_path_factory):
+    """What the README leaves behind."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(tmp_path_factory.mktemp("readme"))
+        write_recording("trial.csv")
+        for seed, name in enumerate("abc"):
+            write_spectrum(f"{name}.csv", seed)
+        fewer = FEWER_SEEDS | {
+            "jm.goodness(result)": "jm.goodness(result, replicates=199)",
+            "jm.bootstrap(result)": "jm.bootstrap(result, replicates=10)",
+        }
+        returned: dict = {}
+        for name in ("posterior", "identifiability", "compare_noise", "goodness", "bootstrap"):
+            patch.setattr(jm, name, remembering(name, returned))
+        with contextlib.redirect_stdout(io.StringIO()) as printed:
+            return pages.run("README.md", {"printed": printed, "returned": returned}, fewer)
+
+
+def remembering(name, returned):
+    """The public function, whose result is kept."""
+    function = getattr(jm, name)
+
+    @functools.wraps(function)
+    def inside(*given, **options):
+        returned[name] = function(*given, **options)
+        return returned[name]
+
+    return inside
+
+
+@pytest.mark.slow
+def test_readme(readme):
+    """The programs of the design document, as the README has them."""
+    result, mine, found = readme["result"], readme["mine"], readme["found"]
+    assert result.success and result.chi2_per_bin <= 1.3
+    assert mine.success and abs(mine.parameters["harmonic_frequency"].value - 6.0) < 0.25 * 0.390625
+    variation = mine.derived["coefficient_of_variation"]
+    expected = jm.ensemble(jm.settled(TRUTH), jax.random.key(0), seeds=32).between()
+    spread = np.mean(np.std(np.asarray(expected), axis=1)) / np.mean(expected)
+    assert variation.stderr is not None and abs(variation.value - spread) < 3 * variation.stderr
+    assert "left out: white" in readme["printed"].getvalue()
+    assert found.divergences == 0
+    summary = found.summary()
+    for name, derived in result.derived.items():
+        if derived.stderr is not None:  # the least-squares estimate lies in the bulk of the posterior
+            assert summary[name]["low"] < derived.value < summary[name]["high"], name
+            assert summary[name]["r_hat"] <= 1.01, name
+
+
+@pytest.mark.slow
+def test_ensembles(readme):
+    pages.run("docs/ensembles.md", readme, FEWER_SEEDS | {"seeds=5_000": "seeds=100"})
+    assert Path("runs.zarr").exists() and Path("persons.zarr").exists()
+
+
+@pytest.mark.slow
+def test_uncertainty(readme, monkeypatch):
+    monkeypatch.setattr(jm, "posterior", lambda *_, **__: readme["found"])  # the same draws, which take a minute
+    assert "jm.posterior(result, target, key=jax.random.key(2))" in "".join(pages.blocks(pages.ROOT / "README.md"))
+    pages.run("docs/uncertainty.md")
+    assert Path("posterior.nc").exists()
+
+
+@pytest.mark.slow
+def test_tutorial_and_front_page():
+    names = pages.run("docs/tutorial.md")
+    assert "harmonic_frequency" in names["sharper"].free and jm.load_result("mine.json").success
+    assert pages.run("docs/index.md")["result"].success
+
+
+@pytest.mark.slow
+def test_identifiability():
+    write_spectrum("displacement.csv", task=TRUTH.as_task(jm.PrescribedForce, P_w=TRUTH.P_w, F_ext=2.93))
+    names = pages.run("docs/identifiability.md")
+    assert len(names["report"].designs) == 4 and jm.load_joint_result("joint.json").success
+
+
+@pytest.mark.slow
+def test_own_data():
+    write_spectrum("mine.csv")
+    assert pages.run("docs/fit-a-csv.md")["target"].segments == (6,) * 10
+    write_recording("trial.csv")
+    assert pages.run("docs/recordings.md")["result"].success
+    assert Path("trial.png").exists()
+
+
+def test_coming_from_elsewhere():
+    pages.run("docs/coming-from-matlab.md")
+    names = pages.run("docs/coming-from-diffrax.md")
+    assert names["many"].shape == (8, 101) and np.all(np.isfinite(names["solution"].ys))
+
+
+def test_figures_in_given_axes():
+    figure = pages.run("docs/reference/figures.md")["figure"]
+    assert len(figure.axes) == 5 and len(figure.subfigs) == 1
+
+
+def test_scaling():
+    names = pages.run("docs/scaling.md", {"jm": jm, "task": jm.Isometric()})
+    assert names["weak"]["P_w"] < names["strong"]["P_w"]
+
+
+OPTIONS = {
+    name: {option for parameter in command.params for option in parameter.opts}
+    for name, command in typer.main.get_group(app).commands.items()
+}
+
+
+@pytest.mark.parametrize("page", pages.PAGES, ids=pages.name_of)
+def test_commands_in_pages_exist_with_their_options(page):
+    text = page.read_text(encoding="utf-8")
+    for line in re.findall(r"(?:^ +|`)jaxmuscle (?!COMMAND)([a-z][^`\n]*)", text, re.MULTILINE):
+        command, _, rest = line.partition("  #")[0].partition(" ")
+        unknown = set(re.findall(r"(?<!\S)\[?(--[a-z][\w-]*)", rest)) - OPTIONS[command] - {"--help"}
+        assert not unknown, line
+
+
+# --- the gallery
+
+GALLERY = pages.module(pages.ROOT / "docs" / "gallery.py")
+FIGURES = [figure for section in GALLERY.SECTIONS for figure in section.figures]
+
+
+def test_the_gallery_shows_every_figure():
+    assert GALLERY.PAGE.read_text(encoding="utf-8") == GALLERY.page(), "run `python docs/gallery.py`"
+    public = {name for name, value in vars(jm.plot).items() if getattr(value, "__module__", "") == jm.plot.__name__}
+    shown = {Path(figure.file).stem for figure in FIGURES}
+    assert {name for name in public if name[0] != "_"} - {"sampling_band"} <= shown
+    sizes = [(GALLERY.HERE / figure.file).stat().st_size for figure in FIGURES]
+    assert max(sizes) < 200_000 and sum(sizes) < 2_000_000
+
+
+def unlabelled(figure):
+    """Axes with numbers but no words at them."""
+    figure.canvas.draw()
+    for ax in figure.get_axes():
+        for axis in (ax.xaxis, ax.yaxis) if ax.axison else ():
+            texts = [tick.label1.get_text() for tick in axis.get_major_ticks() if tick.label1.get_visible()]
+            numbers = [text for text in texts if any(c.isdigit() for c in text) and not any(c.isalpha() for c in text)]
+            if numbers and not axis.get_label().get_text():
+                yield ax.get_title("left") or ax.get_title(), axis.axis_name, numbers
+
+
+@pytest.mark.slow
+def test_the_gallery_is_drawn_by_its_code_with_units_and_in_given_axes(readme, monkeypatch):
+    """The statements of the README's results are those of the gallery: what takes minutes is not done twice."""
+    for name, found in readme["returned"].items():
+        monkeypatch.setattr(jm, name, lambda *_, found=found, **__: found)
+    names = dict(readme)
+    for section in GALLERY.SECTIONS[:-1]:
+        exec(section.setup, names)
+        for figure in section.figures:
+            made = eval(figure.code, names)
+            whole = getattr(made[0] if isinstance(made, tuple) else made, "figure", made)
+            assert not list(unlabelled(whole)), figure.file
+            plt.close("all")
+    for draw, result in (
+        ("fit", names["result"]), ("simulation", names["runs"]), ("posterior", names["found"]), ("chains", names["found"]),
+        ("comparison", jm.compare_noise()), ("identifiability", jm.identifiability()), ("goodness", jm.goodness()),
+        ("bootstrap", jm.bootstrap()), ("cohort", names["cohort"]), ("recording", names["recording"]),
+    ):  # fmt: skip
+        figure, (mine, place) = plt.subplots(1, 2, figsize=(20.0, 12.0), layout="constrained")
+        part = getattr(jm.plot, draw)(result, ax=place)
+        figure.canvas.draw()
+        assert part.figure is figure and mine in figure.axes and place not in figure.axes and len(figure.axes) > 2, draw
+        plt.close(figure)
