@@ -153,6 +153,15 @@ def test_text_shows_what_is_known_and_what_is_not():
     assert "no chi2" in str(made_result(chi2_per_bin=None))
 
 
+def test_text_fits_a_terminal():
+    """Also with long sentences: nothing is lost, and what goes on is further in."""
+    text = str(made_result(notices=("word " * 40,), message="a long message " * 10))
+    assert max(map(len, text.splitlines())) <= 80 and text.count("word") == 40
+    assert all(line.startswith("    word") for line in text.splitlines() if line.strip().startswith("word"))
+    for name in jm.list_targets():
+        assert max(map(len, str(jm.load_target(name)).splitlines())) <= 80
+
+
 def test_free_names_are_those_of_the_parameters():
     assert set(made_result().free) == {"c_w", "k_w"}
 

@@ -2,7 +2,6 @@
 
 import json
 import math
-import textwrap
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -27,6 +26,7 @@ from ._store import write_text
 from ._target import Target
 from ._trajectory import versions
 from ._uncertainty import bin_statistics
+from ._words import folded
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -37,7 +37,6 @@ STARTS = 32
 TOGETHER = 50
 REACH = float(scipy.stats.norm.ppf(0.975))
 DOUBT = 0.01
-WIDTH = 80
 SIMULATED = "recordings simulated nonlinearly"
 DRAWN = "spectra drawn from the Gaussian law of their sigma, not simulated: the target states no segments"
 
@@ -179,7 +178,7 @@ class Bootstrap(eqx.Module):
 
     def __str__(self) -> str:
         done = self.replicates - len(self.failed)
-        lines = textwrap.wrap(f"{self.target.name}: {done} refits of data made from the fit", WIDTH)
+        lines = [f"{self.target.name}: {done} refits of data made from the fit"]
         head = f"  {'':<24}{'true':>9} {'stated':>8} {'spread/stated':>14} {'bias':>9} {'in 95 %':>7}"
         lines.append(head)
         for q in self.quantities.values():
@@ -188,8 +187,8 @@ class Bootstrap(eqx.Module):
             lines.append(f"  {q.name:<24}{q.true:>9.4g} {q.stated:>8.2g} {q.ratio:>7.2f} ± {q.ratio_stderr:<4.2f} "
                          f"{q.bias:>9.1g} {share:>7}{mark}")  # fmt: skip
         for sentence in self.sentences:
-            lines += textwrap.wrap(sentence, WIDTH, initial_indent="- ", subsequent_indent="  ")
-        return "\n".join(lines)
+            lines.append(f"- {sentence}")
+        return folded(lines)
 
     def to_json(self) -> str:
         """Everything but the task as JSON."""

@@ -2,7 +2,6 @@
 
 import json
 import math
-import textwrap
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
@@ -15,6 +14,7 @@ from ._store import write_text
 from ._target import Target
 from ._task import AbstractTask
 from ._trajectory import versions
+from ._words import folded
 
 if TYPE_CHECKING:
     import xarray
@@ -23,7 +23,6 @@ if TYPE_CHECKING:
 
 FORMAT = 1
 NEEDED = 6.0
-WIDTH = 80
 NUMBERS = ("log_likelihood", "parameters", "aic", "delta_aic", "weight", "score", "score_difference", "score_stderr",
            "chi2_per_bin")  # fmt: skip
 COLUMNS = ("noise", "harmonic", *NUMBERS, "success")
@@ -284,8 +283,8 @@ class Comparison(eqx.Module):
             lines.append(f"{line}  {held if row.success else 'failed'}")
         said = [f"left out: {noise}: {why}" for noise, why in self.left_out.items()]
         for sentence in (*self.verdict, *said):
-            lines += textwrap.wrap(sentence, WIDTH, initial_indent="- ", subsequent_indent="  ")
-        return "\n".join(lines)
+            lines.append(f"- {sentence}")
+        return folded(lines)
 
 
 def _short(value: Any) -> str:

@@ -14,6 +14,7 @@ from ._spectrum import SpectrumSettings
 from ._sweep import Sweep
 from ._tally import Tally, quantiles
 from ._task import AbstractTask
+from ._words import folded
 
 if TYPE_CHECKING:
     import xarray
@@ -145,7 +146,7 @@ class EnsembleSummary(eqx.Module):
         if self.spectra and not swept:
             value, error = self.coefficient_of_variation
             lines.append(f"  coefficient of variation {100 * value:.4g} % +- {100 * error:.2g} %")
-        return "\n".join(lines)
+        return folded(lines)
 
 
 def summarised(

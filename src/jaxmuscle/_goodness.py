@@ -1,6 +1,5 @@
 """Is the fit as good as the scatter of the data allows? Chi², runs and the largest residual, by bootstrap with refits."""
 
-import textwrap
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import equinox as eqx
@@ -19,6 +18,7 @@ from ._result import FitResult
 from ._target import Target
 from ._trajectory import versions
 from ._uncertainty import BinStatistics, bin_statistics
+from ._words import folded
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -29,7 +29,6 @@ ELSEWHERE = 3
 LINE_SHAPE = np.array([0.25, 1.0, 0.25])
 SMALL_P, LARGE_P = 0.05, 0.975
 CHECKS = ("chi2_per_bin", "runs", "largest")
-WIDTH = 80
 
 
 class Goodness(eqx.Module):
@@ -83,10 +82,10 @@ class Goodness(eqx.Module):
     def __str__(self) -> str:
         done = "foretold by fits of" if self.foretold else "each fitted anew,"
         head = f"{self.target.name}: against {len(self.residuals)} spectra drawn from the fit, {done} {self.law} law"
-        lines = textwrap.wrap(head, WIDTH)
+        lines = [head]
         for sentence in self.sentences + ((f"{self.lost} refits were not finite and are left out",) if self.lost else ()):
-            lines += textwrap.wrap(sentence, WIDTH, initial_indent="- ", subsequent_indent="  ")
-        return "\n".join(lines)
+            lines.append(f"- {sentence}")
+        return folded(lines)
 
     def plot(self, ax: "Axes | None" = None) -> "Figure | SubFigure":
         """Residuals with what is usual in each bin, and the three checks with their reference distributions."""

@@ -10,12 +10,12 @@ from jaxtyping import Float
 
 from ._store import write_json
 from ._uncertainty import DETERMINED
+from ._words import WIDTH
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure, SubFigure
 
-WIDTH = 80
 COLUMNS = 6
 PAIRS_TOLD = 3
 TOGETHER = " together with "

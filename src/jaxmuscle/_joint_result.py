@@ -14,6 +14,7 @@ from ._result import Estimate, ResultError, Start
 from ._store import write_json
 from ._target import Target
 from ._task import AbstractTask
+from ._words import folded
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -114,7 +115,7 @@ class JointResult(eqx.Module):
         if self.undetermined:
             lines.append("  all targets together leave open (the prior keeps these near their default):")
             lines += [f"    - {sentence}" for sentence in self.undetermined]
-        return "\n".join(lines)
+        return folded(lines)
 
 
 def _list(values: Any) -> list[Any] | None:

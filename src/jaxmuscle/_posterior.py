@@ -26,6 +26,7 @@ from ._store import write_json
 from ._target import Target
 from ._task import AbstractTask
 from ._trajectory import versions
+from ._words import folded
 
 if TYPE_CHECKING:
     import xarray
@@ -134,7 +135,7 @@ class Posterior(eqx.Module):
             if len(self.modes) > 1:
                 told = ", ".join(f"{middle:.2f} Hz ({100 * share:.0f} %)" for _, middle, _, share in self.modes)
                 lines.append(f"  harmonic_frequency has several modes: {told}")
-        return "\n".join(lines)
+        return folded(lines)
 
 
 class Summary(eqx.Module):

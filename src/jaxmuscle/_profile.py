@@ -18,6 +18,7 @@ from ._likelihood import Likelihood
 from ._problem import Setup
 from ._result import FitResult
 from ._target import Target
+from ._words import folded
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -79,7 +80,7 @@ class Profile(eqx.Module):
         else:
             span = f"{percent} interval " + " and ".join(_in_words(*ends, unit) for ends in self.intervals)
         kind = "profile of likelihood and prior" if self.with_priors else "profile likelihood"
-        return f"{self.name} = {self.value:.4g}{unit}: {span} ({kind}); ± {self.stderr:.2g} by curvature"
+        return folded([f"{self.name} = {self.value:.4g}{unit}: {span} ({kind}); ± {self.stderr:.2g} by curvature"])
 
 
 def _in_words(low: float | None, high: float | None, unit: str) -> str:

@@ -18,6 +18,7 @@ from ._recording_summary import RecordingSummary
 from ._spectrum import Spectrum, SpectrumSettings, lowpass, require, spectrum_of
 from ._target import Target
 from ._target_check import Quantity
+from ._words import folded
 
 RECORDED = SpectrumSettings(filter_direction="both")
 LOWEST_RATE = 24.0  # Hz; half of it lies above bin 30
@@ -304,7 +305,7 @@ class Recording(eqx.Module):
             f"  time      {self.start:g} s to {self.stop:g} s; {self._window_words()}",
             f"  range     {np.min(self.samples):.4g} to {np.max(self.samples):.4g} {self.unit}",
         ]
-        return "\n".join(lines + [f"  notice    {notice}" for notice in self.notices])
+        return folded(lines + [f"  notice    {notice}" for notice in self.notices])
 
 
 def _rate(rate: Any) -> float:

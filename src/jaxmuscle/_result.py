@@ -13,6 +13,7 @@ from ._preset import task_from_table, task_to_table
 from ._store import write_json
 from ._target import Target
 from ._task import AbstractTask
+from ._words import folded
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -139,11 +140,11 @@ class FitResult(eqx.Module):
             lines.append(f"  {title:<24}{'value':>12}   {'std. error':<14} unit")
             for name, p in table.items():
                 error = p.error_in_words(3)
-                lines.append(f"  {name:<24}{p.value:>12.5g}   {error:<14} {'' if p.unit == '1' else p.unit}")
+                lines.append(f"  {name:<24}{p.value:>12.5g}   {error:<14} {'' if p.unit == '1' else p.unit}".rstrip())
         if self.undetermined:
             lines.append("  the data leave open (the prior keeps these near their default):")
             lines += [f"    - {sentence}" for sentence in self.undetermined]
-        return "\n".join(lines)
+        return folded(lines)
 
 
 def _estimate(p: Estimate) -> dict[str, Any]:

@@ -16,6 +16,7 @@ from ._bundled import TargetError
 from ._spectrum import SpectrumSettings
 from ._target_check import GRID_TOLERANCE, PIXEL_OF_LOG, PIXEL_TOLERANCE, Provenance, Quantity
 from ._target_file import KEYS, Raw, read_target
+from ._words import folded
 
 # A sum this near to 1 is rounding of the printed numbers, not another scale.
 SUM_TOLERANCE = 1e-3
@@ -154,7 +155,7 @@ class Target(eqx.Module):
             lines.append(f"  coefficient of variation  {variation}")
         if self.mvc_fraction is not None:
             lines.append(f"  level     {100 * self.mvc_fraction:.4g} % MVC")
-        return "\n".join(lines + [f"  notice    {notice}" for notice in self.notices])
+        return folded(lines + [f"  notice    {notice}" for notice in self.notices])
 
 
 def load_target(
