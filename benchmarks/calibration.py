@@ -1,7 +1,7 @@
 """Do the error bars hold? Recordings of known muscles, simulated nonlinearly; how often intervals cover the truth.
 
-    python benchmarks/calibration.py --recordings 200 --seconds 10 --out out/calibration-10.json
-    python benchmarks/calibration.py --recordings 200 --seconds 60 --draws 600 --warmup 400 --out out/calibration-60.json
+    python benchmarks/calibration.py --recordings 200 --seconds 10 --draws 200 --warmup 200 --out out/calibration-10.json
+    python benchmarks/calibration.py --recordings 200 --seconds 60 --draws 250 --warmup 250 --out out/calibration-60.json
 
 Truths are drawn from the prior of the fit itself (simulation-based calibration, Talts et al. 2018, arXiv:1804.06788), about
 muscles whose perturbations are a third of the default, so that nearly all respond linearly. Interrupted runs go on where
