@@ -98,7 +98,7 @@ SECTIONS = (
     )),
     Section("Simulations", SIMULATED, (
         Shown("gallery/simulation.png", "jm.plot.simulation(runs)", "Output, its analysed window, spectra", "model.md"),
-        Shown("gallery/trajectory.png", "runs.plot(window=(10, 15))", "200 seeds: mean, 90 % band, three", "model.md"),
+        Shown("gallery/trajectory.png", "runs.plot(window=(10.0, 15.0))", "200 seeds: mean, 90 % band, three", "model.md"),
         Shown("gallery/spectrum.png", "runs.spectrum().plot(log=True, proportional=False)", "Their spectra", "model.md"),
         Shown("gallery/estimate.png", "runs.mean_spectrum().plot(log=True)", "Their mean, with and without control variate",
               "model.md"),

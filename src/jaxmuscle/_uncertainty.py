@@ -81,18 +81,18 @@ def bin_statistics(target: Target, line_share: Float[np.ndarray, " bins"] | None
 def target_variation(target: Target, task: AbstractTask | None = None) -> tuple[Any, Any] | None:
     """Log coefficient of variation of a target and its standard deviation.
 
-    With a task and where the target states its segments: `log_variation_sd` of recordings that give so many. Else half the
-    relative error of the power in the bins, `½ √(pᵀ V p)` with V the covariance of the log powers, which is too much where
-    power lies elsewhere or in a harmonic. The standard error over trials where there are several and it is larger.
+    With a task and where the target states its segments: `log_variation_sd` of recordings that give so many. Else, and for
+    measured and published targets, whose force was filtered as that of the model is not, half the relative error of the
+    power in the bins, `½ √(pᵀ V p)` with V the covariance of the log powers, which is too much where power
+    lies elsewhere or in a harmonic. The standard error over trials where there are several and it is larger.
     """
     values = target.coefficient_of_variation
     if values is None:
         return None
-    logs = np.log(np.asarray(values))
-    if task is None or target.segments is None:
-        p = np.asarray(target.proportional_power)
-        sd: Any = 0.5 * np.sqrt(p @ bin_statistics(target).covariance @ p)
-    else:
+    logs, filtered = np.log(np.asarray(values)), target.provenance != "user"
+    p = np.asarray(target.proportional_power)
+    sd: Any = 0.5 * np.sqrt(p @ bin_statistics(target).covariance @ p)
+    if task is not None and target.segments is not None and not filtered:
         settings, counts, arrays = target.settings, target.segments, as_arrays(task)
         whole = settings.length - settings.step // 2  # a recording is half a step longer than its segments, on the average
         each = {k: log_variation_sd(arrays, settings, whole + k * settings.step) for k in set(counts)}

@@ -16,7 +16,6 @@ from ._sensitivity import Sensitivity
 from ._spectrum import Spectrum, SpectrumSettings
 from ._style import (
     BLACK,
-    PALETTE,
     PROPORTIONAL,
     axes_or_new,
     canvas,
@@ -26,7 +25,14 @@ from ._style import (
     output_label,
     styled,
 )  # fmt: skip
+from ._style import BLUE as BLUE
+from ._style import GREEN as GREEN
+from ._style import ORANGE as ORANGE
+from ._style import PALETTE as PALETTE
+from ._style import PURPLE as PURPLE
+from ._style import SKY as SKY
 from ._style import STYLE as STYLE
+from ._style import VERMILLION as VERMILLION
 from ._target import Target
 from ._trajectory import WINDOW, Trajectory
 from ._uncertainty import bin_statistics
@@ -43,7 +49,6 @@ if TYPE_CHECKING:
     from ._recording import Recording
     from ._static import StaticCharacteristics
 
-VERMILLION, GREEN, PURPLE, ORANGE, SKY = PALETTE[1:]
 QUANTILES = (0.05, 0.95)
 _MODEL = "jaxmuscle-model"
 
