@@ -89,7 +89,7 @@ for i, name in enumerate(["ann", "ben", "eve", "jim", "kim", "tom"]):
     power = np.asarray(jm.ensemble(one, jax.random.key(i), seeds=6).spectrum().mean().proportional, float)
     people[name] = jm.Target(name, power, segments=[6] * 6, mvc_fraction=0.2 + 0.1 * i)
 cohort = jm.fit_cohort(list(people.values()), groups={name: "ab"[i % 2] for i, name in enumerate(people)})
-pair = {name: jm.at_level(jm.Isometric(), people[name].mvc_fraction, reference=0.26) for name in ("ann", "eve")}
+pair = {name: jm.Isometric().replace(P_w=5.0 * people[name].mvc_fraction / 0.26) for name in ("ann", "eve")}
 """
 SECTIONS = (
     Section("A fit", FIT, (
