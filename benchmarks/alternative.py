@@ -102,11 +102,15 @@ def simulate(
     return _forces(tuple(v[n] for n in order), P_w, np.outer(wave, base * [1, 1, 0, 0]), scale, noise, DT, EVERY)
 
 
-def welch(forces: Float[np.ndarray, "seeds samples"], settings: Any) -> Float[np.ndarray, "seeds bins"]:
-    """Power of each seed: low-pass, window, Welch."""
+def low_passed(forces: Float[np.ndarray, "seeds samples"], settings: Any) -> Float[np.ndarray, "seeds times"]:
+    """What the low-pass lets through, in the window."""
     sections = scipy.signal.butter(settings.filter_order, settings.filter_cutoff, fs=settings.rate, output="sos")
     low_pass = scipy.signal.sosfiltfilt if settings.filter_direction == "both" else scipy.signal.sosfilt
-    held = low_pass(sections, forces)[:, round(WINDOW[0] * settings.rate) : round(WINDOW[1] * settings.rate)]
+    return low_pass(sections, forces)[:, round(WINDOW[0] * settings.rate) : round(WINDOW[1] * settings.rate)]
+
+
+def welch(held: Float[np.ndarray, "seeds times"], settings: Any) -> Float[np.ndarray, "seeds bins"]:
+    """Power of each seed."""
     _, power = scipy.signal.welch(held, settings.rate, window=settings.window, nperseg=settings.length)
     return power[:, settings.first_bin : settings.last_bin + 1]
 
@@ -131,10 +135,10 @@ def fit(target: jm.Target, noise: Float[np.ndarray, "seeds points channels"]) ->
         nonlocal simulations
         simulations += 1
         forces = simulate(values(theta), noise)
-        power = welch(forces, target.settings).mean(axis=0)
+        held = low_passed(forces, target.settings)
+        power = welch(held, target.settings).mean(axis=0)
         rows = [standardised(target.proportional_power, power, statistics), theta]
         if variation is not None:
-            held = forces[:, round(WINDOW[0] * RATE) : round(WINDOW[1] * RATE)]
             spread = np.sqrt(held.var(axis=1).mean()) / abs(held.mean())
             rows.append([(np.log(spread) - variation[0]) / variation[1]])
         return np.concatenate(rows)
@@ -151,7 +155,7 @@ def check(task: jm.AbstractTask, noise: Float[np.ndarray, "seeds points channels
     ours = jax.jit(jax.vmap(lambda path: respond(as_arrays(task), path, grid, "instant")[1]))(paths)
     tolerance = EPSILONS * float(jnp.finfo(float).eps)
     difference = require_equal("numba loop", forces[:, start:, None], ours[:, start:, None], tolerance)
-    power = welch(forces, task.settings)
+    power = welch(low_passed(forces, task.settings), task.settings)
     error = power.std(axis=0, ddof=1) / np.sqrt(SEEDS)
     away = float(np.max(np.abs(power.mean(axis=0) - np.asarray(jm.expected_spectrum(task).power)) / error))
     bound = float(scipy.stats.t.isf(0.5 * (1 - (1 - DOUBT) ** (1 / power.shape[1])), SEEDS - 1))

@@ -58,7 +58,7 @@ def recorded(task: jm.AbstractTask, number: int, seconds: float) -> jm.Target:
     runs = jm.ensemble(jm.settled(task), key, seeds=1, duration=START + seconds, control=False)
     settings, window = task.settings, (START, START + seconds)
     power = np.asarray(runs.spectrum(settings, window).proportional)[0]
-    held = np.asarray(runs.between(window))[0]
+    held = runs.filtered(settings, window)[0]
     segments = settings.segments(round(seconds * settings.rate))
     variation = float(held.std() / abs(held.mean()))
     return jm.Target(f"truth-{number}", power, segments=segments, coefficient_of_variation=variation)

@@ -27,7 +27,7 @@ from jaxmuscle._likelihood import Likelihood, welch_law
 from jaxmuscle._operating import equilibrium
 from jaxmuscle._parameter import DEFAULT_FREE, PARAMETERS, as_arrays
 from jaxmuscle._trajectory import WINDOW
-from jaxmuscle._uncertainty import target_variation
+from jaxmuscle._uncertainty import samples_of, target_variation
 
 TRUTH = jm.Isometric().replace(harmonic_amplitude=0.012, harmonic_frequency=5.0)
 LOADED = TRUTH.as_task(jm.PrescribedForce, P_w=0.0)
@@ -53,7 +53,7 @@ def fitted(task=TRUTH, free=DEFAULT_FREE, settings: dict[str, Any] | None = None
 
 def moments_of(task):
     with jax.enable_x64(True):
-        found = expected_moments(as_arrays(task), task.settings, WINDOW)[0]
+        found = expected_moments(as_arrays(task), task.settings, WINDOW, samples_of(SEGMENTS, task.settings))[0]
         return type(found)(*(np.asarray(x) for x in found))
 
 

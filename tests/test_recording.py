@@ -147,6 +147,17 @@ def test_summary_against_its_sources():
     assert "coefficient of variation" in str(summary) and summary.to_dict()["peaks"]["maximum"]["bin"] >= 1
 
 
+def test_a_target_says_that_most_of_its_variation_is_drift():
+    time = np.arange(40960) / 2048
+    steady = Recording(noisy(), 2048).target()
+    drifting = Recording(noisy() + 0.5 * (time - time.mean()), 2048).target()
+    assert not any("drift" in notice for notice in steady.notices)
+    (said,) = (notice for notice in drifting.notices if "drift" in notice)
+    with_it, without = (target.coefficient_of_variation[0] for target in (drifting, steady))
+    assert f"{with_it:.3g} with it" in said and with_it > 2 * without
+    assert float(said.split(" with it, ")[1].split(" ")[0]) == pytest.approx(without, rel=0.01)
+
+
 def test_target_carries_what_is_known(tmp_path):
     part = Recording(noisy(), 2048, name="trial", source="a file").steady((2, 18))
     target = part.target(mvc=100.0)

@@ -56,7 +56,7 @@ def _runs(task: Any, setup: Setup, segments: int, trial: int, numbers: np.ndarra
             return {}
         halves = np.array_split(numbers, 2)
         return {n: x for half in halves for n, x in _runs(task, setup, segments, trial, half, failed).items()}
-    power, held = np.asarray(runs.spectrum(settings, window).power), np.asarray(runs.between(window))
+    power, held = np.asarray(runs.spectrum(settings, window).power), runs.filtered(settings, window)
     variation = held.std(axis=1) / np.abs(held.mean(axis=1))
     return {int(n): (power[i], float(variation[i]), float(held[i].mean())) for i, n in enumerate(numbers)}
 

@@ -38,14 +38,14 @@ def controlled_moments(runs: Trajectory, settings: SpectrumSettings, window: Win
 
     With a control variate a seed's power is `e + p_i - l_i` (see `Trajectory.mean_spectrum`), and so is its variance.
     """
-    held = np.asarray(runs.between(window))
+    held = runs.filtered(settings, window)
     power, variance = np.asarray(runs.spectrum(settings, window).power), held.var(axis=1)
     expected = None
     if runs.linear is not None:
         expected = jax.tree.map(np.asarray, expected_moments(as_arrays(runs.task), settings, window)[0])
         beside = runs.beside()
         power = expected.power + power - np.asarray(beside.spectrum(settings, window).power)
-        variance = expected.variance + variance - np.asarray(beside.between(window)).var(axis=1)
+        variance = expected.variance + variance - beside.filtered(settings, window).var(axis=1)
     line = np.zeros_like(power) if expected is None else np.broadcast_to(expected.line, power.shape)
     return Moments(power, line, held.mean(axis=1), variance), expected
 

@@ -58,7 +58,7 @@ def _simulate(model: "AbstractTask", seeds: int, seed: int, folder: Path) -> Non
                "proportional_power": np.asarray(mean.proportional), "quantile_05": low, "quantile_95": high}  # fmt: skip
     write_text(folder / "spectrum.csv", csv_text(columns))
     save_figure(plot.simulation(runs), folder / "simulate.png")
-    held = np.asarray(runs.between())
+    held = runs.filtered()
     found = peaks(mean)
     unit = model.output_unit
     out.print(f"{type(model).__name__}, {seeds} seeds of {runs.time[-1]:g} s: {model.output_name} "

@@ -18,6 +18,7 @@ from ._search import Plan, search_together
 from ._target import Target, load_target
 from ._task import AbstractTask
 from ._trajectory import versions
+from ._uncertainty import trial_samples
 
 if TYPE_CHECKING:
     import xarray
@@ -220,8 +221,9 @@ def _loaded(targets: Iterable[Target | str | PathLike[str]]) -> tuple[dict[str, 
 
 
 def _alike(plan: Plan) -> Any:
-    """Equal for fits that differ in their data only."""
+    """Equal for fits that differ in their data only, and in the length of their recordings by less than a half."""
     setup = plan.setup
+    length = round(2 * np.log2(trial_samples(setup.target)))
     present = tuple(extra is not None for extra in setup.extra)
     values = tuple(as_numbers(setup.task.parameters).items())
-    return type(setup.task), type(setup.task.noise), values, setup.target.settings, tuple(setup.target.bins), present
+    return type(setup.task), type(setup.task.noise), values, setup.target.settings, tuple(setup.target.bins), present, length

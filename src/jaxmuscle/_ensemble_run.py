@@ -36,7 +36,7 @@ from ._processes import agreed, meet, rank_and_count
 from ._simulate import SimulationError
 from ._sweep import Sweep
 from ._tally import CELLS, add, count_cells, empty, set_cells
-from ._trajectory import WINDOW, run_attributes, versions
+from ._trajectory import run_attributes, versions
 
 if TYPE_CHECKING:
     import xarray
@@ -137,11 +137,7 @@ def _rows(layout: Layout, found: dict[str, np.ndarray], row: int) -> np.ndarray:
         return output.astype(float)
     power = found["power"][row]
     left = power - found["linear_power"][row] if layout.linear is not None else np.zeros_like(power)
-    window = slice(*(round(edge * layout.plan.rate) for edge in WINDOW))
-    held = output[:, window].astype(float)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        variation = held.std(axis=1) / np.abs(held.mean(axis=1))
-    return np.concatenate([output, power, left, variation[:, None]], axis=1, dtype=float)
+    return np.concatenate([output, power, left, found["variation"][row][:, None]], axis=1, dtype=float)
 
 
 def _keeper(path: Path, name: str) -> Callable[[Reduced], None]:

@@ -30,7 +30,7 @@ class EnsembleSummary(eqx.Module):
     """An ensemble reduced to its moments; of a sweep all arrays have a leading axis `point`.
 
     `mean` and `variance` of the output at every `time` [s] over the seeds that stayed finite, `quantile` at `levels`;
-    `coefficient_of_variation` of single seeds in the analysed window with its standard error, `spectra` (one
+    `coefficient_of_variation` of single seeds, low-passed, in the analysed window with its standard error, `spectra` (one
     `SpectrumEstimate` per point): NaN and empty if the run does not cover the window; `seeds` per point; `failed`, rows
     (point, seed) of those that did not stay finite and were left out; `success`, whether there are none; `about`, how it
     was run.

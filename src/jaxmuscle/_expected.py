@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.signal
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from ._law import Scalar
 from ._line import bin_rows, harmonic_line
@@ -20,10 +20,14 @@ from ._task import AbstractTask
 
 TAIL = 1e-13
 WINDOW = (5.0, 15.0)
+LONGEST = 2**17  # samples of a recording; longer ones count as that long
 
 
 class Moments(NamedTuple):
-    """What a fit compares: Welch power per bin, that of the harmonic alone, mean and variance in the window."""
+    """What a fit compares: Welch power per bin, that of the harmonic alone, mean and variance of a recording.
+
+    The variance is that of the low-passed output, as a recording's: what lies above the low-pass is not in it.
+    """
 
     power: Float[Array | np.ndarray, " bins"]
     line: Float[Array | np.ndarray, " bins"]
@@ -106,22 +110,22 @@ class _Autocovariance(NamedTuple):
             rows = jnp.concatenate([rows, rows @ power])
         return jnp.concatenate([self.zero[None], (rows @ columns).reshape(-1)])[:lags]
 
-    def mean_variance(self, samples: int) -> Float[Array, ""]:
+    def mean_variance(self, samples: Int[Array | np.ndarray, ""] | int) -> Float[Array, ""]:
         """Variance of the mean of that many successive samples, `Σ_l 2 (n - l) / n² r(lΔ) + r(0) / n`, l = 1 ... n - 1.
 
-        Sums of `Φ^m v` and of `m Φ^m v` double their length from power to power.
+        Sums of `Φ^m v` and of `m Φ^m v` double their length from power to power; a block counts if its bit of n - 1 is set.
         """
-        count, length = samples - 1, 1
+        n, count, length = jnp.asarray(samples, self.row.dtype), jnp.asarray(samples) - 1, 1
         sum_all, rise_all = jnp.zeros_like(self.next), jnp.zeros_like(self.next)
         sum_here, rise_here = self.next, jnp.zeros_like(self.next)
-        for power in self.powers[: count.bit_length()]:
-            if count & length:  # this block, then what is there already
-                rise_all = rise_here + power @ (rise_all + length * sum_all)
-                sum_all = sum_here + power @ sum_all
+        for power in self.powers:
+            counts = (count // length) % 2 == 1  # this block, then what is there already
+            rise_all = jnp.where(counts, rise_here + power @ (rise_all + length * sum_all), rise_all)
+            sum_all = jnp.where(counts, sum_here + power @ sum_all, sum_all)
             rise_here = rise_here + power @ (rise_here + length * sum_here)
             sum_here = sum_here + power @ sum_here
             length *= 2
-        return self.zero / samples + 2 / samples**2 * self.row @ (count * sum_all - rise_all)
+        return self.zero / n + 2 / n**2 * self.row @ ((n - 1) * sum_all - rise_all)
 
 
 def _autocovariance(system: _Covariances, interval: float, lags: int, sampling: str) -> _Autocovariance:
@@ -147,77 +151,111 @@ def _autocovariance(system: _Covariances, interval: float, lags: int, sampling: 
 
 
 @functools.cache
-def covariance_operator(settings: SpectrumSettings) -> Float[np.ndarray, "bins lags"]:
+def low_pass_spread(settings: SpectrumSettings) -> Float[np.ndarray, " lags"]:
+    """ρ, the autocorrelation of the low-pass's impulse response at lags -m ... m: it turns r into `r * ρ`."""
+    if settings.sections is None:
+        return np.ones(1)
+    impulse = scipy.signal.sosfilt(settings.sections, np.eye(1, 64 * settings.length)[0])
+    spread = scipy.signal.correlate(impulse, impulse, method="fft")
+    if settings.filter_direction == "both":
+        spread = scipy.signal.correlate(spread, spread, method="fft")
+    centre = len(spread) // 2
+    reach = int(np.max(np.flatnonzero(np.abs(spread) > TAIL * np.abs(spread).max())) - centre)
+    return spread[centre - reach : centre + reach + 1]
+
+
+@functools.cache
+def covariance_operator(settings: SpectrumSettings) -> Float[np.ndarray, "bins_and_two lags"]:
     """M with expected Welch power `E_k = Σ_l M_kl r(l Δ)`: low-pass, detrending, taper and transform.
 
-    The low-pass turns r into `r * ρ`, ρ the autocorrelation of its impulse response; a bin is `Σ_l α_k(l) r(l)`, α_k the
-    autocorrelation of its row of `bin_rows`. Both are folded onto lags l >= 0.
+    The low-pass turns r into `r * ρ` (`low_pass_spread`); a bin is `Σ_l α_k(l) r(l)`, α_k the autocorrelation of its row of
+    `bin_rows`. Both are folded onto lags l >= 0. Two more rows: the variance of what has passed, (r * ρ)(0); and
+    `Σ_l ((|·| * ρ)(l) - |l|) r(l)`, by which the low-pass lowers n² times the variance of the mean of n samples
+    (`Σ_l (n - |l|) / n² r(l)` without it; where r has decayed at the n-th lag).
     """
-    rows, reach = bin_rows(settings), 1
-    spread = np.ones(1)
-    if settings.sections is not None:
-        impulse = scipy.signal.sosfilt(settings.sections, np.eye(1, 64 * settings.length)[0])
-        spread = scipy.signal.correlate(impulse, impulse, method="fft")
-        if settings.filter_direction == "both":
-            spread = scipy.signal.correlate(spread, spread, method="fft")
-        centre = len(spread) // 2
-        reach = int(np.max(np.flatnonzero(np.abs(spread) > TAIL * np.abs(spread).max())) - centre)
-        spread = spread[centre - reach : centre + reach + 1]
+    rows, spread = bin_rows(settings), low_pass_spread(settings)
     lagged = np.array([scipy.signal.correlate(row, row, method="fft").real for row in rows])
+    lagged = np.concatenate([lagged, np.eye(1, lagged.shape[1], lagged.shape[1] // 2)])
     full = np.array([scipy.signal.convolve(row, spread, method="fft") for row in lagged])
-    centre = full.shape[1] // 2
+    centre, reach = full.shape[1] // 2, len(spread) // 2
+    lag = np.arange(-2 * reach, 2 * reach + 1)
+    lowered = np.convolve(np.abs(lag), spread, mode="valid") - np.abs(lag[reach : lag.size - reach])
+    full = np.concatenate([full, np.pad(lowered, centre - reach)[None]])
     folded = full[:, centre:].copy()
     folded[:, 1:] += full[:, centre - 1 :: -1]
     return folded
 
 
 def noise_response(
-    task: AbstractTask, system: Linearisation, settings: SpectrumSettings, window: tuple[float, float]
+    task: AbstractTask, system: Linearisation, settings: SpectrumSettings, samples: Int[Array | np.ndarray, ""] | int
 ) -> tuple[Float[Array, " bins"], Float[Array, ""]]:
-    """Expected Welch power and variance in the window without the harmonic."""
-    samples = round(window[1] * settings.rate) - round(window[0] * settings.rate)
+    """Expected Welch power, and variance of so many low-passed samples about their mean, without the harmonic."""
     operator = covariance_operator(settings)
     lags = operator.shape[1]
-    r = _autocovariance(_covariances(task, system), 1 / settings.rate, max(lags, samples), settings.sampling)
-    return jnp.asarray(operator, r.zero.dtype) @ r.lagged(lags), r.zero - r.mean_variance(samples)
+    r = _autocovariance(_covariances(task, system), 1 / settings.rate, max(lags, LONGEST), settings.sampling)
+    found = jnp.asarray(operator, r.zero.dtype) @ r.lagged(lags)
+    return found[:-2], found[-2] - r.mean_variance(samples) + found[-1] / jnp.asarray(samples, found.dtype) ** 2
 
 
 def noise_variance(task: AbstractTask, system: Linearisation) -> Float[Array, ""]:
-    """Stationary variance of the output without the harmonic, at an instant."""
+    """Stationary variance of the output without the harmonic, at an instant, before any low-pass."""
     found = _covariances(task, system)
     return found.row @ found.start
 
 
-def response(task: AbstractTask, settings: SpectrumSettings, window: tuple[float, float]) -> tuple[Moments, Linearisation]:
-    """Expected moments of the linearised task in the window, and the linearisation. Not finite where it is unstable."""
+def response(
+    task: AbstractTask,
+    settings: SpectrumSettings,
+    window: tuple[float, float],
+    samples: Int[Array | np.ndarray, ""] | int | None = None,
+) -> tuple[Moments, Linearisation]:
+    """Expected moments of the linearised task in the window, and the linearisation. Not finite where it is unstable.
+
+    The variance is that of so many samples from the window's begin on, by default as many as it has.
+    """
+    samples = samples_in(window, settings) if samples is None else samples
     system = linearise(task)
-    noise, variance = noise_response(task, system, settings, window)
-    line, swing = harmonic_line(task, system, settings, window)
+    noise, variance = noise_response(task, system, settings, samples)
+    line, swing = harmonic_line(task, system, settings, window, samples)
     return Moments(noise + line, line, system.rest, variance + swing), system
 
 
-@eqx.filter_jit
+def samples_in(window: tuple[float, float], settings: SpectrumSettings) -> int:
+    """How many samples a window has."""
+    return round(window[1] * settings.rate) - round(window[0] * settings.rate)
+
+
+_compiled_response = eqx.filter_jit(response)
+
+
 def expected_moments(
-    task: AbstractTask, settings: SpectrumSettings, window: tuple[float, float]
+    task: AbstractTask,
+    settings: SpectrumSettings,
+    window: tuple[float, float],
+    samples: Int[Array | np.ndarray, ""] | int | None = None,
 ) -> tuple[Moments, Linearisation]:
-    """`response`, compiled."""
-    return response(task, settings, window)
+    """`response`, compiled once for all numbers of samples."""
+    samples = samples_in(window, settings) if samples is None else samples
+    return _compiled_response(task, settings, window, jnp.asarray(samples))
 
 
 @eqx.filter_jit
 def log_variation_sd(task: AbstractTask, settings: SpectrumSettings, samples: int) -> Float[Array, ""]:
     """Standard deviation of the log of the coefficient of variation of so many successive samples, in linear response.
 
-    For Gaussian noise of autocovariance r and a line of mean square h at the frequency f, whose sum has the variance s²,
+    For low-passed Gaussian noise of autocovariance r and a line of mean square h at the frequency f, s² that of both,
 
         Var s² = 2/n Σ_l (1 - |l|/n) r̃(lΔ)² + 4h/n Σ_l (1 - |l|/n) r̃(lΔ) cos(2πf lΔ),    r̃ = r - Var(mean),
 
     and sd(ln CV) = √(Var s²) / (2 s²). How the mean scatters is left out: it counts as CV² beside this.
     """
     system = linearise(task)
-    found = _autocovariance(_covariances(task, system), 1 / settings.rate, samples, settings.sampling)
-    r = found.lagged(samples) - found.mean_variance(samples)
-    _, swing = harmonic_line(task, system, settings, (WINDOW[0], WINDOW[0] + samples / settings.rate))
+    spread = jnp.asarray(low_pass_spread(settings), system.A.dtype)
+    reach = len(spread) // 2
+    found = _autocovariance(_covariances(task, system), 1 / settings.rate, samples + reach, settings.sampling)
+    r = found.lagged(samples + reach)
+    r = jnp.convolve(jnp.concatenate([r[reach:0:-1], r]), spread, mode="valid") - found.mean_variance(samples)
+    _, swing = harmonic_line(task, system, settings, WINDOW, samples)
     lag = jnp.arange(samples, dtype=r.dtype)
     weight = jnp.where(lag > 0, 2.0, 1.0) * (1 - lag / samples) / samples
     turning = jnp.cos(2 * np.pi * task.harmonic.frequency * lag / settings.rate)

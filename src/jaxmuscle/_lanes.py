@@ -12,9 +12,10 @@ from jax.sharding import Mesh
 from jax.sharding import PartitionSpec as P
 from jaxtyping import Array, Int, PRNGKeyArray
 
+from ._metrics import coefficient_of_variation
 from ._noise import AbstractNoise, Realisation
 from ._path import Grid, observe, solve
-from ._spectrum import SpectrumSettings, filtered_power
+from ._spectrum import SpectrumSettings, lowpass, welch
 from ._task import AbstractTask
 
 DRAWN = 8
@@ -22,7 +23,7 @@ LANES = 1024
 
 
 class Recipe(eqx.Module):
-    """What is computed of every seed: on which grid, sampled how, with or without states, and the Welch power over `edges`.
+    """What is computed of a seed: on which grid, sampled how, with states or not, Welch power and variation over `edges`.
 
     A device simulates at most `lanes` seeds side by side, what is more one block after the other. `every` is the ratio of
     the run's rate to the spectrum's; `edges` [samples] are None where no spectrum is asked for.
@@ -76,13 +77,16 @@ def _responses(task: AbstractTask, linear: Any, path: Realisation, recipe: Recip
 
     found = jax.vmap(one)(path)
     if recipe.edges is not None:
-        found["power"] = _power(found["output"], recipe)
-        found["linear_power"] = None if linear is None else _power(found["linear"], recipe)
+        found["power"], found["variation"] = _seen(found["output"], recipe)
+        found["linear_power"] = None if linear is None else _seen(found["linear"], recipe)[0]
     return found
 
 
-def _power(output: Array, recipe: Recipe) -> Array:
-    return filtered_power(output[:, :: recipe.every], recipe.settings, recipe.edges)
+def _seen(output: Array, recipe: Recipe) -> tuple[Array, Array]:
+    """Welch power and coefficient of variation of what the low-pass lets through."""
+    assert recipe.edges is not None
+    passed = lowpass(output[:, :: recipe.every], recipe.settings)[:, slice(*recipe.edges)]
+    return welch(passed, recipe.settings), coefficient_of_variation(passed)
 
 
 def _dispatched(program: Callable) -> Callable:

@@ -20,7 +20,7 @@ from ._spectrum import SpectrumSettings
 from ._target import Target
 from ._task import AbstractTask
 from ._trajectory import WINDOW
-from ._uncertainty import target_variation
+from ._uncertainty import target_variation, trial_samples
 
 Powers = Float[Array | np.ndarray, " bins"]
 NEWTON = 12
@@ -203,8 +203,8 @@ def _gaussian(residuals: Float[Array | np.ndarray, " rows"]) -> Scalar:
 
 
 @eqx.filter_jit
-def _target_likelihood(task, bins, chosen, variation, window):
-    moments = expected_moments(task, task.settings, window)[0]
+def _target_likelihood(task, bins, chosen, variation, samples):
+    moments = expected_moments(task, task.settings, WINDOW, samples)[0]
     found = log_marginal(bins, moments.power[chosen], moments.line[chosen])
     if variation is not None:
         found += _gaussian(((jnp.log(moments.variation) - variation[0]) / variation[1])[None]) - jnp.log(variation[1])
@@ -242,7 +242,8 @@ def log_likelihood(task: AbstractTask, data: Target | Recording) -> Scalar:
         task = task.with_parts(settings=data.settings)
         bins = jax.tree.map(jnp.asarray, measured_bins(data))
         variation = target_variation(data, task)
-        return _target_likelihood(as_arrays(task), bins, data.bins - data.settings.first_bin, variation, WINDOW)
+        samples = jnp.asarray(trial_samples(data))
+        return _target_likelihood(as_arrays(task), bins, data.bins - data.settings.first_bin, variation, samples)
     whole = data.fft_spectrum(task.settings.replace(window="boxcar"))
     duration = whole.settings.length / whole.settings.rate
     return _whittle(as_arrays(task), whole.settings, jnp.asarray(whole.power), (0.0, duration))

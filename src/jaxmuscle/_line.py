@@ -6,12 +6,12 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Complex, Float
+from jaxtyping import Array, Complex, Float, Int
 
 from ._linear import Linearisation
 from ._muscle import Perturbation
 from ._signal import Constant
-from ._spectrum import SpectrumSettings, spectrum_of
+from ._spectrum import SpectrumSettings, lowpass, spectrum_of
 from ._task import AbstractTask
 
 
@@ -66,8 +66,8 @@ def _sample_mean(angle: Float[Array, ""], sampling: str) -> Complex[Array, ""]:
 class LineTable(NamedTuple):
     """What a line `Im(r e^(iωt))` of one frequency gives.
 
-    Welch power `|r|² level - Re(r² turning)` in every bin, low-pass, phase and leakage included; variance in the window
-    `½ |r|² passed - ½ Re(r² twice) - Im(r once)²`.
+    Welch power `|r|² level - Re(r² turning)` in every bin, phase and leakage included; variance of a recording
+    `½ |r|² passed - ½ Re(r² twice) - Im(r once)²`; both after the low-pass.
     """
 
     level: Float[Array, "*frequencies bins"]
@@ -82,12 +82,28 @@ class LineTable(NamedTuple):
         return jnp.maximum(jnp.abs(r) ** 2 * self.level - jnp.real(r**2 * self.turning), 0.0)
 
     def variance(self, reply: Complex[Array, "*frequencies"]) -> Float[Array, "*frequencies"]:
-        """Variance in the window."""
+        """Variance of the recording."""
         return 0.5 * (jnp.abs(reply) ** 2 * self.passed - jnp.real(reply**2 * self.twice)) - jnp.imag(reply * self.once) ** 2
 
 
-def line_table(settings: SpectrumSettings, window: tuple[float, float], frequency: Float[Array, ""]) -> LineTable:
-    """The table for one frequency [Hz]: the line is sampled, low-passed, cut into segments, tapered and transformed."""
+def _turns(turns: Float[Array, ""], start: int, samples: Int[Array | np.ndarray, ""] | int) -> Complex[Array, ""]:
+    """Mean of `exp(2πi turns m)` over so many successive m from `start` on."""
+    n = jnp.asarray(samples, turns.dtype)
+    size = jnp.sinc(n * turns) / jnp.sinc(turns)
+    spin = _turn(2 * jnp.pi * turns * (start + 0.5 * (n - 1)))
+    return spin * size.astype(spin.dtype)
+
+
+def line_table(
+    settings: SpectrumSettings,
+    window: tuple[float, float],
+    frequency: Float[Array, ""],
+    samples: Int[Array | np.ndarray, ""] | int,
+) -> LineTable:
+    """The table for one frequency [Hz]: the line is sampled, low-passed, cut into segments, tapered and transformed.
+
+    Segments are those of the window; its variance is that of so many samples from the window's begin on.
+    """
     angle = 2 * jnp.pi * frequency / settings.rate
     turn, gain = _turn(angle), _sample_mean(angle, settings.sampling)
     start, stop = (round(edge * settings.rate) for edge in window)
@@ -98,19 +114,26 @@ def line_table(settings: SpectrumSettings, window: tuple[float, float], frequenc
     through = gain * _low_pass(settings, turn)
     level = 0.25 * jnp.abs(through) ** 2 * (jnp.abs(ahead) ** 2 + jnp.abs(behind) ** 2)
     turning = 0.5 * through**2 * jnp.mean(_turn(2 * angle * begins.astype(angle.dtype))) * ahead * jnp.conj(behind)
-    course = gain * _turn(angle * np.arange(start, stop, dtype=angle.dtype))
-    return LineTable(level, turning, jnp.abs(gain) ** 2, jnp.mean(course), jnp.mean(course**2))
+    once, twice = (through**k * _turns(k * frequency / settings.rate, start, samples) for k in (1, 2))
+    return LineTable(level, turning, jnp.abs(through) ** 2, once, twice)
 
 
 def harmonic_line(
-    task: AbstractTask, system: Linearisation, settings: SpectrumSettings, window: tuple[float, float]
+    task: AbstractTask,
+    system: Linearisation,
+    settings: SpectrumSettings,
+    window: tuple[float, float],
+    samples: Int[Array | np.ndarray, ""] | int,
 ) -> tuple[Float[Array, " bins"], Float[Array, ""]]:
-    """Welch power of the harmonic's response, phase and leakage included, and its variance in the window."""
+    """Welch power of the harmonic's response, phase and leakage included, and its variance in a recording.
+
+    With an envelope that changes, its variance in the window.
+    """
     harmonic = task.harmonic
     if not isinstance(harmonic.envelope, Constant):
         return _enveloped_line(task, system, settings, window)
     frequency = jnp.asarray(harmonic.frequency, system.A.dtype)
-    table = line_table(settings, window, frequency)
+    table = line_table(settings, window, frequency, samples)
     reply = harmonic_size(task, system.A.dtype) * _transfer(system, task.harmonic_base(), 2 * jnp.pi * frequency)
     return table.power(reply), table.variance(reply)
 
@@ -157,4 +180,4 @@ def _enveloped_line(
     through, ahead = system.D @ base, system.E @ base
     direct = jax.lax.complex(through * level + ahead * slope, ahead * omega * level)
     z = jnp.asarray(harmonic.amplitude, dtype) * jnp.imag((Y @ system.C.astype(Y.dtype) + direct) * around)
-    return jnp.asarray(spectrum_of(z, settings, window).power), jnp.var(z[start:stop])
+    return jnp.asarray(spectrum_of(z, settings, window).power), jnp.var(lowpass(z, settings)[start:stop])

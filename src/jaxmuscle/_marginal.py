@@ -20,6 +20,7 @@ from ._parameter import CHANNELS
 from ._problem import Setup
 from ._signal import Constant
 from ._trajectory import WINDOW
+from ._uncertainty import trial_samples
 
 PER_BIN = 3
 BEYOND = 2.0  # bins
@@ -165,7 +166,7 @@ class Marginal(eqx.Module):
         model: Any = problem.model
         chosen, correction = model.chosen, model.correction
         system = linearise(task) if system is None else system
-        power, variance = noise_response(task, system, task.settings, WINDOW)
+        power, variance = noise_response(task, system, task.settings, model.samples)
         base = task.harmonic_base()
         top, below = _rational(system.A, system.B @ base, system.C, system.D @ base, system.E @ base)
         size = harmonic_size(task, system.A.dtype)
@@ -222,7 +223,8 @@ def marginal_of(setup: Setup, likelihood: Likelihood, theta: Float[np.ndarray, "
         log_weight = _log_weight(setup, frequency)
         settings = setup.target.settings
         chosen = setup.target.bins - settings.first_bin
-        table = jax.jit(jax.vmap(lambda f: line_table(settings, WINDOW, f)))(jnp.asarray(frequency))
+        samples = jnp.asarray(trial_samples(setup.target))
+        table = jax.jit(jax.vmap(lambda f: line_table(settings, WINDOW, f, samples)))(jnp.asarray(frequency))
         table = jax.tree.map(np.asarray, table._replace(level=table.level[:, chosen], turning=table.turning[:, chosen]))
     s, offset = coordinates.from_theta(peak.theta[best]), likelihood.bins is not None
     stretch = np.append(coordinates.stretch(s), 1.0)

@@ -7,17 +7,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.signal
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 from scipy.special import expit
 
-from ._expected import Moments, expected_moments, response
+from ._expected import Moments, expected_moments, response, samples_in
 from ._lanes import respond
 from ._law import Scalar
 from ._linear import LinearTask, settled
 from ._noise import Realisation
 from ._parameter import PARAMETERS, Parameter, set_parameters
 from ._path import Grid
-from ._spectrum import SpectrumSettings
+from ._spectrum import SpectrumSettings, lowpass
 from ._task import AbstractTask
 
 Numbers = TypeVar("Numbers", bound=Float[Array | np.ndarray, "*batch free"])
@@ -151,15 +151,21 @@ def welch_operator(
 
 
 class Linear(eqx.Module):
-    """The expected spectrum of a task in linear response, times a `correction` (of a nonlinear simulation, say)."""
+    """The expected spectrum of a task in linear response, times a `correction` (of a nonlinear simulation, say).
+
+    Its variance is that of a recording of so many `samples`.
+    """
 
     chosen: np.ndarray
     correction: Moments
+    samples: Int[Array | np.ndarray, ""]
     window: tuple[float, float] = eqx.field(static=True)
 
     def moments(self, task: AbstractTask) -> Moments:
         """Expected moments of the task's output."""
-        found = expected_moments(task, task.settings, self.window)[0]  # compiled apart, so that it is traced once
+        found = expected_moments(task, task.settings, self.window, self.samples)[
+            0
+        ]  # compiled apart, so that it is traced once
         found = found._replace(power=found.power[self.chosen], line=found.line[self.chosen])
         return jax.tree.map(jnp.multiply, found, self.correction)
 
@@ -176,19 +182,24 @@ class MonteCarlo(eqx.Module):
     noise: Any
     operator: Float[Array, "parts samples"]
     chosen: np.ndarray
+    samples: Int[Array | np.ndarray, ""]
     grid: Grid
     window: tuple[float, float] = eqx.field(static=True)
     control: bool = eqx.field(static=True)
 
     @classmethod
     def of(cls, task: AbstractTask, normals: Any, grid: Grid, chosen: np.ndarray, window: tuple[float, float], *,
-           colour_free: bool, control: bool) -> "MonteCarlo":  # fmt: skip
-        """Prepare for the task's settings; `chosen` are the positions of the compared bins among the settings' bins."""
+           colour_free: bool, control: bool, samples: int | None = None) -> "MonteCarlo":  # fmt: skip
+        """Prepare for the task's settings; `chosen` are the positions of the compared bins among the settings' bins.
+
+        With a control variate the variance is that of a recording of so many `samples`, by default as many as simulated.
+        """
         if not control:
             normals = jnp.concatenate([jnp.zeros_like(normals[:1]), normals])
         noise = normals if colour_free else jax.jit(jax.vmap(lambda z: task.noise.realise(z, grid.dt)))(normals)
         operator = welch_operator(task.settings, grid.steps // grid.every + 1, window)
-        return cls(noise, jnp.asarray(operator), chosen, grid, window, control)
+        samples = samples_in(window, task.settings) if samples is None else samples
+        return cls(noise, jnp.asarray(operator), chosen, jnp.asarray(samples), grid, window, control)
 
     @property
     def seeds(self) -> int:
@@ -208,17 +219,21 @@ class MonteCarlo(eqx.Module):
             return jax.vmap(one)(self.noise)
 
         task = settled(task) if self.control else task
+
+        def swing(seen):
+            return jnp.var(lowpass(seen, settings)[..., start:stop], axis=-1)
+
         seen = outputs(task)
         mean = jnp.mean(seen[int(not self.control) :, start:stop])
         if self.control:
-            exact, system = response(task, settings, self.window)
+            exact, system = response(task, settings, self.window, self.samples)
             beside = outputs(LinearTask.of(task, system))
             power = exact.power[self.chosen] + jnp.mean(self._power(seen, settings) - self._power(beside, settings), 0)
-            spread = jnp.var(seen[:, start:stop], axis=1) - jnp.var(beside[:, start:stop], axis=1)
-            return Moments(power, exact.line[self.chosen], mean, exact.variance + jnp.mean(spread))
+            spread = jnp.mean(swing(seen) - swing(beside))
+            return Moments(power, exact.line[self.chosen], mean, exact.variance + spread)
         quiet, noisy = seen[:1], seen[1:] - seen[:1]
         line, random = jnp.mean(self._power(quiet, settings), 0), jnp.mean(self._power(noisy, settings), 0)
-        variance = jnp.var(quiet[0, start:stop]) + jnp.mean(jnp.var(noisy[:, start:stop], axis=1))
+        variance = swing(quiet[0]) + jnp.mean(swing(noisy))
         return Moments(line + random, line, mean, variance)
 
     def _power(self, outputs: Float[Array, "seeds samples"], settings: SpectrumSettings) -> Float[Array, "seeds bins"]:

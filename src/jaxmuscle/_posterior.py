@@ -30,7 +30,8 @@ from ._words import folded
 
 if TYPE_CHECKING:
     import xarray
-    from matplotlib.figure import Figure
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure, SubFigure
 
 ROWS = 256
 CREDIBLE = (0.025, 0.975)
@@ -107,19 +108,19 @@ class Posterior(eqx.Module):
         else:
             write_netcdf(path, self)
 
-    def plot(self) -> "Figure":
+    def plot(self, ax: "Axes | None" = None) -> "Figure | SubFigure":
         """Corner figure of what the data determine. Raises `NotMixedError` if the chains did not mix."""
         from ._plot_posterior import corner
 
-        return corner(self)
+        return corner(self, ax)
 
-    def plot_chains(self) -> "Figure":
+    def plot_chains(self, ax: "Axes | None" = None) -> "Figure | SubFigure":
         """Traces of the chains, also of those that did not mix."""
         from ._plot_posterior import traces
 
-        return traces(self)
+        return traces(self, ax)
 
-    def plot_predictive(self, ax: Any = None) -> Any:
+    def plot_predictive(self, ax: "Axes | None" = None) -> "Axes":
         """The target among the spectra that the posterior predicts. Returns the axes."""
         from ._plot_posterior import predictive
 

@@ -22,7 +22,7 @@ from ._simulate import DURATION, MAX_RATE_STEP, whole
 from ._target import Target
 from ._task import AbstractTask
 from ._trajectory import WINDOW
-from ._uncertainty import BinStatistics, bin_statistics, shares_map, target_variation
+from ._uncertainty import BinStatistics, bin_statistics, shares_map, target_variation, trial_samples
 
 MOST_SUBSTEPS = 16
 
@@ -134,7 +134,8 @@ class Setup:
         if correction is None:
             ones = np.ones(len(chosen))
             correction = Moments(ones, ones, np.ones(()), np.ones(()))
-        return self._with_model(Linear(chosen, jax.tree.map(jnp.asarray, correction), WINDOW), line_share)
+        samples = jnp.asarray(trial_samples(self.target))
+        return self._with_model(Linear(chosen, jax.tree.map(jnp.asarray, correction), samples, WINDOW), line_share)
 
     def montecarlo(self, seeds: int, line_share: np.ndarray | None = None) -> Problem:
         """The problem on the first `seeds` noise paths."""
@@ -144,7 +145,8 @@ class Setup:
         normals = draw(task.noise, jax.random.fold_in(self.key, 0), jnp.arange(seeds), grid.steps)
         colour = any(name in ("noise_cutoff", "noise_correlation_time") for name in self.coordinates.names)
         chosen = self.target.bins - settings.first_bin
-        model = MonteCarlo.of(task, normals, grid, chosen, WINDOW, colour_free=colour, control=self.control)
+        model = MonteCarlo.of(task, normals, grid, chosen, WINDOW, colour_free=colour, control=self.control,
+                              samples=trial_samples(self.target))  # fmt: skip
         return self._with_model(model, line_share)
 
     def _with_model(self, model: Linear | MonteCarlo, line_share: np.ndarray | None) -> Problem:

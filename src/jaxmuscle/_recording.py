@@ -21,6 +21,7 @@ from ._target_check import Quantity
 from ._words import folded
 
 RECORDED = SpectrumSettings(filter_direction="both")
+DRIFT = 0.5  # share of the variance
 LOWEST_RATE = 24.0  # Hz; half of it lies above bin 30
 SEGMENTS = 2  # a steady part holds at least this many
 UNITS: dict[str, Quantity | None] = {
@@ -260,8 +261,8 @@ class Recording(eqx.Module):
     ) -> Target:
         """The window's proportional power as a `Target` for `jaxmuscle.fit`.
 
-        It states the Welch segments, the settings, and for a force or torque the coefficient of variation, which fixes
-        the scale of the noise.
+        It states the Welch segments, the settings, and for a force or torque the coefficient of variation of what the
+        low-pass lets through, which fixes the scale of the noise; and says so if most of that is a straight drift.
 
         **Arguments:** `name`, or that of the recording; `quantity`, or that of the unit; `provenance`; `mvc` [`unit`], the
         maximal voluntary contraction, for the level (a recording in % MVC needs none); `settings` as for `spectrum`.
@@ -275,6 +276,7 @@ class Recording(eqx.Module):
         mean, variation = float(np.mean(x)), float(np.std(x)) / max(abs(float(np.mean(x))), 1e-300)
         full = 100.0 if mvc is None and self.unit == "% MVC" else mvc
         require(full is None or 0 < abs(mean) <= full < math.inf, "mvc", mvc, f"give a force above the mean, {mean:.4g}")
+        varying = quantity != "displacement" and variation <= 1
         return Target(
             self.name if name is None else name,
             power / np.sum(power),
@@ -282,10 +284,10 @@ class Recording(eqx.Module):
             provenance=provenance,
             source=f"{self.source}, {self._window_words()}",
             segments=self.segments(settings),
-            coefficient_of_variation=variation if quantity != "displacement" and variation <= 1 else None,
+            coefficient_of_variation=variation if varying else None,
             mvc_fraction=None if full is None else abs(mean) / full,
             settings=settings,
-            notices=self.notices,
+            notices=(*self.notices, *(_drift(x) if varying else ())),
         )
 
     def _window_words(self) -> str:
@@ -306,6 +308,17 @@ class Recording(eqx.Module):
             f"  range     {np.min(self.samples):.4g} to {np.max(self.samples):.4g} {self.unit}",
         ]
         return folded(lines + [f"  notice    {notice}" for notice in self.notices])
+
+
+def _drift(x: Float[np.ndarray, " times"]) -> tuple[str, ...]:
+    """What to say where a straight line makes more than half of the variance; the model has none."""
+    before, after = np.std(x), np.std(scipy.signal.detrend(x))
+    if after**2 > DRIFT * before**2:
+        return ()
+    mean = abs(float(np.mean(x)))
+    return (f"a straight drift makes {1 - (after / before) ** 2:.0%} of the variance: coefficient of variation "
+            f"{before / mean:.3g} with it, {after / mean:.3g} without; the model knows no drift, so remove it first "
+            "(scipy.signal.detrend, and add the mean), or choose a steadier window",)  # fmt: skip
 
 
 def _rate(rate: Any) -> float:

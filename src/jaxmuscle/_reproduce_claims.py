@@ -163,7 +163,7 @@ CLAIMS: tuple[Claim, ...] = (
           "both presets, by construction", _if(lambda *a: np.allclose(a, (0.0016, 0.0016, 0.0001, 0.0001)))),
     Claim("variation", "the paper", "these amplitudes give a coefficient of variation near 0.1 to 0.2 %",
           lambda r: (r.slifkin.variation, r.hamilton.variation, r.readings[1].force.std() / r.readings[1].force.mean()),
-          "force in Task 1: {0:.3%} and {1:.3%}; isometric (reading B): {2:.2%}",
+          "low-passed force in Task 1: {0:.3%} and {1:.3%}; isometric (reading B): {2:.2%}",
           "expected, presets zagrodny-slifkin and zagrodny-hamilton; one run of reading B",
           _if(lambda *v: all(0.001 <= x <= 0.0025 for x in v)), "because most of P_w in Task 1 holds against spring, load, "
           "steadily; isometric force is in the range (measured while designing jaxmuscle, the paper does not state it)"),

@@ -90,10 +90,11 @@ def axes_or_new(ax: Axes | None) -> Axes:
 
 def legend(ax: Axes, place: Literal["upper right", "lower left", "above"]) -> None:
     """A legend in a fixed place, if there is anything to name: the best place is slow to find among many lines."""
-    if not ax.get_legend_handles_labels()[0]:
+    named = len(ax.get_legend_handles_labels()[0])
+    if not named:
         return
     if place == "above":
-        ax.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2, borderaxespad=0.0)
+        ax.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=min(named, 3), borderaxespad=0.0, columnspacing=1.2)
     else:
         ax.legend(loc=place)
 

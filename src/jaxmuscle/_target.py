@@ -35,7 +35,8 @@ class Target(eqx.Module):
     - `reason`: what a reconstruction assumes.
     - `sigma`: standard deviation of p_k, scaled together with it.
     - `segments`: Welch segments K of each trial averaged.
-    - `coefficient_of_variation`: standard deviation over mean of each trial, a fraction.
+    - `coefficient_of_variation`: standard deviation over mean of each trial, a fraction; of the force as the spectrum sees
+      it, low-passed as `settings` say.
     - `mvc_fraction`: mean level as a fraction of the maximum voluntary contraction.
     - `settings`: how the spectrum was estimated, and thus how the model's is.
     - `notices`: what was done to the numbers, in sentences.

@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float, Int
 from ._estimate import SpectrumEstimate, estimated
 from ._expected import WINDOW, expected_spectrum
 from ._parameter import PARAMETERS, as_numbers, is_concrete
-from ._spectrum import Spectrum, SpectrumSettings, spectrum_of
+from ._spectrum import Spectrum, SpectrumSettings, lowpass, spectrum_of
 from ._task import AbstractTask
 
 if TYPE_CHECKING:
@@ -61,10 +61,28 @@ class Trajectory(eqx.Module):
 
     def between(self, window: tuple[float, float] = WINDOW) -> Float[Array | np.ndarray, "*seeds samples"]:
         """The output inside a window (start s, stop s), by default the analysed 5 s to 15 s."""
-        start, stop = round(window[0] * self.rate), round(window[1] * self.rate)
-        if not 0 <= start < stop <= self.output.shape[-1]:
-            raise ValueError(f"window {window} s does not lie in the simulated 0 to {self.time[-1]} s")
+        start, stop = self._edges(window, self.rate)
         return self.output[..., start:stop]
+
+    def _edges(self, window: tuple[float, float], rate: float) -> tuple[int, int]:
+        start, stop = round(window[0] * rate), round(window[1] * rate)
+        if not 0 <= start < stop <= self.output.shape[-1] * rate / self.rate:
+            raise ValueError(f"window {window} s does not lie in the simulated 0 to {self.time[-1]} s")
+        return start, stop
+
+    def filtered(
+        self, settings: SpectrumSettings | None = None, window: tuple[float, float] = WINDOW
+    ) -> Float[np.ndarray, "*seeds times"]:
+        """What the spectra are made of: the output at the rate of the settings, low-passed from t = 0, cut to the window.
+
+        Its coefficient of variation is what a `Target` states and what a fit compares (see `Recording.filtered`).
+
+        **Arguments:** `settings` (the task's by default; their rate must divide this trajectory's); `window` [s].
+        """
+        settings = self.task.settings if settings is None else settings
+        passed = lowpass(self._at_rate_of(settings, self.output), settings)
+        start, stop = self._edges(window, settings.rate)
+        return np.asarray(passed)[..., start:stop]
 
     def spectrum(self, settings: SpectrumSettings | None = None, window: tuple[float, float] = WINDOW) -> Spectrum:
         """Welch spectrum of the output per seed (see `Spectrum.mean`), low-pass filtered from t = 0, then windowed.

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.special import digamma, polygamma
 
-from ._expected import log_variation_sd
+from ._expected import LONGEST, WINDOW, log_variation_sd, samples_in
 from ._parameter import as_arrays, is_concrete
 from ._spectrum import SpectrumSettings
 from ._target import Target
@@ -78,24 +78,34 @@ def bin_statistics(target: Target, line_share: Float[np.ndarray, " bins"] | None
     return BinStatistics(np.zeros(n), np.ones(n), np.eye(n), False)
 
 
+def samples_of(segments: int, settings: SpectrumSettings) -> int:
+    """Samples of a recording with so many Welch segments: half a step more than these take, on the average."""
+    return min(settings.length - settings.step // 2 + segments * settings.step, LONGEST)
+
+
+def trial_samples(target: Target) -> int:
+    """Samples of a trial of a target, the average of several; of 10 s where it states no segments."""
+    if target.segments is None:
+        return samples_in(WINDOW, target.settings)
+    return round(np.mean([samples_of(k, target.settings) for k in target.segments]))
+
+
 def target_variation(target: Target, task: AbstractTask | None = None) -> tuple[Any, Any] | None:
     """Log coefficient of variation of a target and its standard deviation.
 
-    With a task and where the target states its segments: `log_variation_sd` of recordings that give so many. Else, and for
-    measured and published targets, whose force was filtered as that of the model is not, half the relative error of the
-    power in the bins, `½ √(pᵀ V p)` with V the covariance of the log powers, which is too much where power
-    lies elsewhere or in a harmonic. The standard error over trials where there are several and it is larger.
+    With a task and where the target states its segments: `log_variation_sd` of recordings that give so many. Else half the
+    relative error of the power in the bins, `½ √(pᵀ V p)` with V the covariance of the log powers, which is too much where
+    power lies elsewhere or in a harmonic. The standard error over trials where there are several and it is larger.
     """
     values = target.coefficient_of_variation
     if values is None:
         return None
-    logs, filtered = np.log(np.asarray(values)), target.provenance != "user"
+    logs = np.log(np.asarray(values))
     p = np.asarray(target.proportional_power)
     sd: Any = 0.5 * np.sqrt(p @ bin_statistics(target).covariance @ p)
-    if task is not None and target.segments is not None and not filtered:
+    if task is not None and target.segments is not None:
         settings, counts, arrays = target.settings, target.segments, as_arrays(task)
-        whole = settings.length - settings.step // 2  # a recording is half a step longer than its segments, on the average
-        each = {k: log_variation_sd(arrays, settings, whole + k * settings.step) for k in set(counts)}
+        each = {k: log_variation_sd(arrays, settings, samples_of(k, settings)) for k in set(counts)}
         sd = sum(each[k] ** 2 for k in counts) ** 0.5 / len(counts)
     if len(logs) > 1:
         sd = jnp.maximum(sd, logs.std(ddof=1) / np.sqrt(len(logs)))
