@@ -12,13 +12,12 @@ from ._linear import linearised
 from ._parameter import as_arrays
 from ._problem import Problem, Setup
 from ._result import Estimate
-from ._spectrum import SpectrumSettings
 from ._starts import contenders, harmonic_frequencies
+from ._target import Target
 from ._task import AbstractTask
 from ._trajectory import WINDOW, Trajectory
-from ._uncertainty import BinStatistics
+from ._uncertainty import BinStatistics, trial_samples
 
-Window = tuple[float, float]
 AMBIGUOUS = 1.92
 NONLINEAR = 0.1
 LEFT = 1e-3
@@ -33,19 +32,22 @@ class Stage(NamedTuple):
     descent: Descent
 
 
-def controlled_moments(runs: Trajectory, settings: SpectrumSettings, window: Window) -> tuple[Moments, Moments | None]:
+def controlled_moments(runs: Trajectory, target: Target) -> tuple[Moments, Moments | None]:
     """Moments of every seed, whose mean has the expectation of the nonlinear model, and those of the linear response.
 
-    With a control variate a seed's power is `e + p_i - l_i` (see `Trajectory.mean_spectrum`), and so is its variance.
+    With a control variate a seed's power is `e + p_i - l_i` (see `Trajectory.mean_spectrum`), and so is its variance, e
+    being that of a recording as long as the target's.
     """
-    held = runs.filtered(settings, window)
-    power, variance = np.asarray(runs.spectrum(settings, window).power), held.var(axis=1)
+    settings = target.settings
+    held = runs.filtered(settings)
+    power, variance = np.asarray(runs.spectrum(settings).power), held.var(axis=1)
     expected = None
     if runs.linear is not None:
-        expected = jax.tree.map(np.asarray, expected_moments(as_arrays(runs.task), settings, window)[0])
+        exact, _ = expected_moments(as_arrays(runs.task), settings, WINDOW, trial_samples(target))
+        expected = jax.tree.map(np.asarray, exact)
         beside = runs.beside()
-        power = expected.power + power - np.asarray(beside.spectrum(settings, window).power)
-        variance = expected.variance + variance - beside.filtered(settings, window).var(axis=1)
+        power = expected.power + power - np.asarray(beside.spectrum(settings).power)
+        variance = expected.variance + variance - beside.filtered(settings).var(axis=1)
     line = np.zeros_like(power) if expected is None else np.broadcast_to(expected.line, power.shape)
     return Moments(power, line, held.mean(axis=1), variance), expected
 

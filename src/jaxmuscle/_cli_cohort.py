@@ -4,6 +4,7 @@ import csv
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
 from ._cli_fit import write_fit
@@ -112,7 +113,8 @@ def _columns(rows: list[dict[str, Any]]) -> dict[str, list[Any]]:
 
 
 def _show(cohort: "CohortResult", folder: Path) -> None:
-    table = Table(title=f"{len(cohort.results)} targets, in linear response", title_justify="left")
+    title = f"{len(cohort.results)} targets, in linear response; in brackets: not determined"
+    table = Table(title=title, title_justify="left", box=SIMPLE_HEAD, padding=0)
     table.add_column("target", overflow="fold")
     grouped = bool(cohort.groups)
     for column in [*["group"] * grouped, *SHOWN.values(), "chi²"]:
@@ -133,4 +135,4 @@ def _show(cohort: "CohortResult", folder: Path) -> None:
 def _cell(estimate: Any) -> str:
     if estimate is None:
         return ""
-    return f"{estimate.value:.3g}" + (f" ± {estimate.stderr:.1g}" if estimate.stderr is not None else " (open)")
+    return f"({estimate.value:.3g})" if estimate.stderr is None else f"{estimate.value:.3g}±{estimate.stderr:.1g}"

@@ -60,10 +60,10 @@ def _simulate(model: "AbstractTask", seeds: int, seed: int, folder: Path) -> Non
     save_figure(plot.simulation(runs), folder / "simulate.png")
     held = runs.filtered()
     found = peaks(mean)
-    unit = model.output_unit
-    out.print(f"{type(model).__name__}, {seeds} seeds of {runs.time[-1]:g} s: {model.output_name} "
-              f"{held.mean():.4g} {unit}, coefficient of variation "
-              f"{100 * np.mean(held.std(axis=1) / np.abs(held.mean(axis=1))):.3g} %", highlight=False)  # fmt: skip
+    variation = 100 * np.mean(held.std(axis=1) / np.abs(held.mean(axis=1)))
+    out.print(f"{type(model).__name__}, {seeds} seeds of {runs.time[-1]:g} s", highlight=False)
+    level = f"{held.mean():.4g} {model.output_unit}"
+    out.print(f"{model.output_name}: mean {level}, coefficient of variation {variation:.3g} %", highlight=False)
     locals_ = ", ".join(f"{p.frequency:.3f}" for p in found.local_maxima) or "none"
     out.print(f"Spectrum: maximum at {found.maximum.frequency:.3f} Hz, local maxima at {locals_} Hz", highlight=False)
     out.print(f"Written: {folder}/trajectories.nc, spectrum.csv, simulate.png", highlight=False)

@@ -141,7 +141,7 @@ def _simulated(setup: Setup, task: Any, seeds: int) -> tuple[Moments, np.ndarray
     """Moments of fresh seeds of the nonlinear model on the target's bins, the expected powers, a stretch of output."""
     still = as_numbers(settled(as_arrays(task))) if setup.control else task
     runs = ensemble(still, jax.random.fold_in(setup.key, 1), seeds=seeds)
-    each, expected = controlled_moments(runs, setup.target.settings, WINDOW)
+    each, expected = controlled_moments(runs, setup.target)
     chosen = setup.target.bins - setup.target.settings.first_bin
     each = each._replace(power=np.asarray(each.power)[:, chosen])
     start = round((runs.time[-1] - STRETCH) * runs.rate)

@@ -18,7 +18,6 @@ from ._report import report_fit
 from ._result import FitResult
 from ._simulate import SimulationError
 from ._starts import contenders, starting_points
-from ._trajectory import WINDOW
 
 FIRST_STEPS = 12
 MOST_RIVALS = 3
@@ -160,7 +159,7 @@ def correction_at(setup: Setup, theta: Float[np.ndarray, " free"]) -> Moments | 
     except (SimulationError, ValueError):
         return None  # the check on fresh seeds meets the same error and reports it
     chosen = setup.target.bins - setup.target.settings.first_bin
-    each, expected = controlled_moments(runs, setup.target.settings, WINDOW)
+    each, expected = controlled_moments(runs, setup.target)
     if expected is None:
         return None
     mean = jax.tree.map(lambda x: np.asarray(x).mean(axis=0), each)
