@@ -82,7 +82,7 @@ def _write(recording: "Recording", folder: Path, save_target: Path | None) -> No
     save_figure(recording.plot(), folder / "analysis.png")
     write_text(folder / "spectrum.csv", csv_text(columns))
     write_json(folder / "analysis.json", record)
-    for notice in recording.notices:
+    for notice in recording.notices if target is None else target.notices:
         err.print(f"[yellow]notice:[/] {plain(notice)}", highlight=False)
     table = Table(title=plain(recording.source), title_justify="left", show_header=False)
     for name, value in summary.rows():
