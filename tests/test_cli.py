@@ -376,8 +376,10 @@ def test_an_interruption_before_the_first_step_writes_nothing(tmp_path, monkeypa
 def test_ctrl_c(tmp_path):
     """A real signal, once the first steps have been taken."""
     code = """
-import contextlib
+import contextlib, signal
 from jaxmuscle import _cli, _cli_fit
+
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs ignore it
 
 @contextlib.contextmanager
 def loud(title):
