@@ -1,6 +1,5 @@
 """The result of a joint fit: shared and separate parameters, and every target's spectrum."""
 
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -8,9 +7,8 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from ._bundled import choices
 from ._preset import task_from_table, task_to_table
-from ._result import Estimate, ResultError, Start
+from ._result import Estimate, Start, estimate_from_table, estimate_to_table, read_saved
 from ._store import write_json
 from ._target import Target
 from ._task import AbstractTask
@@ -126,21 +124,13 @@ def _array(values: list[Any] | None) -> Any:
     return None if values is None else np.array([np.nan if v is None else v for v in values], dtype=float)
 
 
-def _number(value: float | None) -> float | None:
-    return None if value is None or not np.isfinite(value) else float(value)
-
-
-def _estimate(p: Estimate) -> dict[str, Any]:
-    return {"value": _number(p.value), "unit": p.unit, "stderr": p.stderr, "free": p.free, "identifiable": p.identifiable}
-
-
 def _to_json(result: JointResult) -> dict[str, Any]:
     return {
         "format": FORMAT,
         "success": result.success,
         "message": result.message,
-        "parameters": {name: _estimate(p) for name, p in result.parameters.items()},
-        "derived": {name: _estimate(p) for name, p in result.derived.items()},
+        "parameters": {name: estimate_to_table(p) for name, p in result.parameters.items()},
+        "derived": {name: estimate_to_table(p) for name, p in result.derived.items()},
         "correlation": result.correlation,
         "undetermined": list(result.undetermined),
         "singular_values": _list(result.singular_values),
@@ -166,25 +156,10 @@ def _to_json(result: JointResult) -> dict[str, Any]:
 
 def load_joint_result(path: str | Path) -> JointResult:
     """Read what `JointResult.save` wrote to `path`. Raises `ResultError` naming the file and what is wrong with it."""
-    path = Path(path)
-    try:
-        table = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise ResultError(f"{path}: cannot be read: {error.strerror}") from None
-    except ValueError as error:
-        raise ResultError(f"{path}: is not JSON: {error}") from None
-    if not isinstance(table, dict) or table.get("format") != FORMAT:
-        raise ResultError(f"{path}: is not a joint result of format {FORMAT}; write it with JointResult.save")
-    try:
-        return _from_json(table)
-    except KeyError as error:
-        raise ResultError(f"{path}: has no entry {error}; {choices(str(error.args[0]), table)}") from None
+    return read_saved(path, _from_json, FORMAT, "a joint result", "JointResult.save")
 
 
 def _from_json(table: dict[str, Any]) -> JointResult:
-    def estimate(p: dict[str, Any]) -> Estimate:
-        return Estimate(np.nan if p["value"] is None else p["value"], p["unit"], p["stderr"], p["free"], p["identifiable"])
-
     def part(p: dict[str, Any]) -> JointPart:
         spectra = {field: _array(p[field]) for field in SPECTRUM}
         return JointPart(
@@ -196,8 +171,8 @@ def _from_json(table: dict[str, Any]) -> JointResult:
         success=table["success"],
         message=table["message"],
         parts={name: part(p) for name, p in table["parts"].items()},
-        parameters={name: estimate(p) for name, p in table["parameters"].items()},
-        derived={name: estimate(p) for name, p in table["derived"].items()},
+        parameters={name: estimate_from_table(p) for name, p in table["parameters"].items()},
+        derived={name: estimate_from_table(p) for name, p in table["derived"].items()},
         correlation=table["correlation"],
         undetermined=tuple(table["undetermined"]),
         singular_values=_array(table["singular_values"]),

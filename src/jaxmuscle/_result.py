@@ -1,8 +1,9 @@
 """The result of a fit: what was found, how sure it is, and what it cannot say."""
 
 import json
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import equinox as eqx
 import numpy as np
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure, SubFigure
 
+R = TypeVar("R")
 FORMAT = 1
 
 
@@ -147,9 +149,16 @@ class FitResult(eqx.Module):
         return folded(lines)
 
 
-def _estimate(p: Estimate) -> dict[str, Any]:
-    value = p.value if np.isfinite(p.value) else None
+def estimate_to_table(p: Estimate) -> dict[str, Any]:
+    """For JSON, which knows no infinite numbers."""
+    value = float(p.value) if np.isfinite(p.value) else None
     return {"value": value, "unit": p.unit, "stderr": p.stderr, "free": p.free, "identifiable": p.identifiable}
+
+
+def estimate_from_table(table: dict[str, Any]) -> Estimate:
+    """The reverse of `estimate_to_table`."""
+    value = np.nan if table["value"] is None else table["value"]
+    return Estimate(value, table["unit"], table["stderr"], table["free"], table["identifiable"])
 
 
 def _numbers(values: Any) -> list[Any]:
@@ -169,8 +178,8 @@ def _to_json(result: FitResult) -> dict[str, Any]:
         "provenance": result.target.provenance,
         "task": _task_name(result.task),
         "method": result.method,
-        "parameters": {name: _estimate(p) for name, p in result.parameters.items()},
-        "derived": {name: _estimate(p) for name, p in result.derived.items()},
+        "parameters": {name: estimate_to_table(p) for name, p in result.parameters.items()},
+        "derived": {name: estimate_to_table(p) for name, p in result.derived.items()},
         "correlation": result.correlation,
         "undetermined": list(result.undetermined),
         "singular_values": _numbers(result.singular_values),
@@ -209,6 +218,11 @@ def _task_name(task: AbstractTask) -> str:
 
 def load_result(path: str | Path) -> FitResult:
     """Read the `fit.json` at `path`. Raises `ResultError` naming the file and what is wrong with it."""
+    return read_saved(path, _from_json, FORMAT, "a fit result", "FitResult.save")
+
+
+def read_saved(path: str | Path, made: Callable[[dict[str, Any]], R], stamp: int | str, what: str, writer: str) -> R:
+    """What is `made` of a JSON file of this format. Raises `ResultError` naming the file and what is wrong with it."""
     path = Path(path)
     try:
         table = json.loads(path.read_text(encoding="utf-8"))
@@ -216,10 +230,10 @@ def load_result(path: str | Path) -> FitResult:
         raise ResultError(f"{path}: cannot be read: {error.strerror}") from None
     except ValueError as error:
         raise ResultError(f"{path}: is not JSON: {error}") from None
-    if not isinstance(table, dict) or table.get("format") != FORMAT:
-        raise ResultError(f"{path}: is not a fit result of format {FORMAT}; write it with FitResult.save")
+    if not isinstance(table, dict) or table.get("format") != stamp:
+        raise ResultError(f"{path}: is not {what} of format {stamp}; write it with {writer}")
     try:
-        return _from_json(table)
+        return made(table)
     except KeyError as error:
         raise ResultError(f"{path}: has no entry {error}; {choices(str(error.args[0]), table)}") from None
 
@@ -227,17 +241,14 @@ def load_result(path: str | Path) -> FitResult:
 def _from_json(table: dict[str, Any]) -> FitResult:
     spectrum, profile = table["spectrum"], table.get("profile")
 
-    def estimate(p):
-        return Estimate(np.nan if p["value"] is None else p["value"], p["unit"], p["stderr"], p["free"], p["identifiable"])
-
     return FitResult(
         success=table["success"],
         message=table["message"],
         task=task_from_table(table["task_table"]),
         target=Target.from_table(table["target_table"]),
         method=table["method"],
-        parameters={name: estimate(p) for name, p in table["parameters"].items()},
-        derived={name: estimate(p) for name, p in table["derived"].items()},
+        parameters={name: estimate_from_table(p) for name, p in table["parameters"].items()},
+        derived={name: estimate_from_table(p) for name, p in table["derived"].items()},
         correlation=table["correlation"],
         undetermined=tuple(table["undetermined"]),
         singular_values=_array(table["singular_values"]),
