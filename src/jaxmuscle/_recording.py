@@ -316,7 +316,7 @@ def _drift(x: Float[np.ndarray, " times"]) -> tuple[str, ...]:
     if after**2 > DRIFT * before**2:
         return ()
     mean = abs(float(np.mean(x)))
-    return (f"a straight drift makes {1 - (after / before) ** 2:.0%} of the variance: coefficient of variation "
+    return (f"a straight drift makes {100 * (1 - (after / before) ** 2):.0f} % of the variance: coefficient of variation "
             f"{before / mean:.3g} with it, {after / mean:.3g} without; the model knows no drift, so remove it first "
             "(scipy.signal.detrend, and add the mean), or choose a steadier window",)  # fmt: skip
 
