@@ -1,17 +1,21 @@
 """Cohorts: many targets at once are each what a fit alone gives, differences of groups have honest intervals."""
 
 import functools
+import io
+from pathlib import Path
 
 import jax
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 import scipy.stats
+from rich.console import Console
 from test_fit import true_derived
 from test_result import made_result
 from typer.testing import CliRunner
 
 import jaxmuscle as jm
+from jaxmuscle import _cli_cohort
 from jaxmuscle._cli import app
 
 PEOPLE, SEEDS = 6, 20
@@ -167,6 +171,19 @@ def test_one_bad_target_does_not_stop_the_rest(tmp_path):
 def test_bad_arguments(targets, options, message):
     with pytest.raises(ValueError, match=message):
         jm.fit_cohort(targets, **options)
+
+
+def test_the_printed_table_fits_80_columns_and_shortens_no_number(monkeypatch):
+    small = jm.Estimate(1.99e-4, "1", 6e-5, False, True)
+    result = made_result(derived={name: small for name in _cli_cohort.SHOWN})
+    names = {"vastus-lateralis-26mvc": "knee", "fdi-abduction-45mvc": "finger"}
+    cohort = jm.CohortResult(dict.fromkeys(names, result), names, {})
+    console = Console(width=80, file=io.StringIO(), color_system=None)
+    monkeypatch.setattr(_cli_cohort, "out", console)
+    _cli_cohort._show(cohort, Path("out"))
+    printed = console.file.getvalue()
+    assert printed.count("0.000199±6e-05") == 2 * len(_cli_cohort.SHOWN) and "…" not in printed
+    assert max(map(len, printed.splitlines())) <= 80
 
 
 def test_a_figure_needs_a_known_way_and_levels():

@@ -220,6 +220,19 @@ def test_closed_form_is_the_quadrature_of_the_transfer_functions(x64, name):
     np.testing.assert_array_equal(jm.expected_spectrum(task, settings, window).power, moments.power)
 
 
+def test_the_variance_is_that_of_so_many_samples(x64):
+    """A minute after 5 s, as a window or as samples from the begin of a shorter one; more slow noise is in it."""
+    task = jm.Isometric(noise=jm.OrnsteinUhlenbeckNoise(BOTH, 2.0), harmonic=jm.Harmonic(0.003, 0.07, 0.7))
+    whole, begun, short = (
+        expected_moments(as_arrays(task), task.settings, window, samples)[0]
+        for window, samples in (((5.0, 65.0), None), ((5.0, 15.0), 6000), ((5.0, 15.0), None))
+    )
+    np.testing.assert_allclose(begun.variance, whole.variance, rtol=1e-12)
+    np.testing.assert_allclose(whole.variance, by_quadrature(task, task.settings, (5.0, 65.0), 2**16)[3], rtol=ALIASES)
+    assert short.variance < 0.98 * whole.variance
+    np.testing.assert_array_equal(begun.power, short.power)
+
+
 @pytest.mark.parametrize("phase", [0.0, np.pi / 2])
 def test_phase_of_a_slow_harmonic(x64, phase):
     """At 0.5 Hz the leakage from negative frequencies depends on the phase; a segment starts it anew."""

@@ -10,6 +10,7 @@ import numpy as np
 from ._ensemble import ensemble
 from ._likelihood import Likelihood
 from ._linear import settled
+from ._metrics import coefficient_of_variation
 from ._operating import slowest_rate
 from ._parameter import as_arrays, as_numbers
 from ._problem import Setup
@@ -57,7 +58,7 @@ def _runs(task: Any, setup: Setup, segments: int, trial: int, numbers: np.ndarra
         halves = np.array_split(numbers, 2)
         return {n: x for half in halves for n, x in _runs(task, setup, segments, trial, half, failed).items()}
     power, held = np.asarray(runs.spectrum(settings, window).power), runs.filtered(settings, window)
-    variation = held.std(axis=1) / np.abs(held.mean(axis=1))
+    variation = np.asarray(coefficient_of_variation(held))
     return {int(n): (power[i], float(variation[i]), float(held[i].mean())) for i, n in enumerate(numbers)}
 
 

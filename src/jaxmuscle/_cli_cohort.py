@@ -118,14 +118,15 @@ def _show(cohort: "CohortResult", folder: Path) -> None:
     table.add_column("target", overflow="fold")
     grouped = bool(cohort.groups)
     for column in [*["group"] * grouped, *SHOWN.values(), "chi²"]:
-        table.add_column(column, justify="left" if column == "group" else "right")
+        table.add_column(column, justify="left" if column == "group" else "right", no_wrap=column != "group")
     for name, result in cohort.results.items():
         cells = [plain(cohort.groups.get(name, ""))] * grouped + [_cell(result.derived.get(q)) for q in SHOWN]
         chi2 = "" if result.chi2_per_bin is None else f"{result.chi2_per_bin:.2f}"
         table.add_row(plain(name), *cells, chi2 if result.success else "[bold red]failed[/]")
     out.print(table)
     for d in cohort.differences():
-        out.print(f"{plain(d.quantity)}: {plain(d.b)} - {plain(d.a)} = {d.difference:.3g} {'' if d.unit == '1' else d.unit} "
+        unit = "" if d.unit == "1" else f" {d.unit}"
+        out.print(f"{plain(d.quantity)}: {plain(d.b)} - {plain(d.a)} = {d.difference:.3g}{unit} "
                   f"(95 %: {d.low:.3g} to {d.high:.3g})", highlight=False)  # fmt: skip
     for name, why in cohort.failed.items():
         err.print(f"[bold red]not fitted:[/] {plain(name)}: {plain(why)}", highlight=False)

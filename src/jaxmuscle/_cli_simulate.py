@@ -43,7 +43,7 @@ def _simulate(model: "AbstractTask", seeds: int, seed: int, folder: Path) -> Non
 
     from . import plot
     from ._ensemble import ensemble
-    from ._metrics import peaks
+    from ._metrics import coefficient_of_variation, peaks
     from ._store import replacing, write_text
 
     runs = ensemble(model, jax.random.key(seed), seeds=seeds, progress=err.is_terminal)
@@ -60,7 +60,7 @@ def _simulate(model: "AbstractTask", seeds: int, seed: int, folder: Path) -> Non
     save_figure(plot.simulation(runs), folder / "simulate.png")
     held = runs.filtered()
     found = peaks(mean)
-    variation = 100 * np.mean(held.std(axis=1) / np.abs(held.mean(axis=1)))
+    variation = 100 * np.mean(coefficient_of_variation(held))
     out.print(f"{type(model).__name__}, {seeds} seeds of {runs.time[-1]:g} s", highlight=False)
     level = f"{held.mean():.4g} {model.output_unit}"
     out.print(f"{model.output_name}: mean {level}, coefficient of variation {variation:.3g} %", highlight=False)
