@@ -150,10 +150,12 @@ class HillMuscle(jm.AbstractMuscle):
     def shortening(self):
         """x_w [m] at which the belly balances the tendon, at rest with the insertion at 0; by Newton's method."""
         x = self.tendon_strain * self.slack_length * tendon_strain(self.held_force / self.force_max)
-        for _ in range(NEWTON_STEPS):
+
+        def step(_, x):
             surplus, slope = _slope(lambda x: self.tendon_force(x) - self.belly_force(x, jnp.zeros_like(x)), x)
-            x = x - surplus / slope
-        return x
+            return x - surplus / slope
+
+        return jax.lax.fori_loop(0, NEWTON_STEPS, step, x)  # as a loop it is compiled once, not step by step
 
     def base(self):
         """Slopes of both forces in isometric equilibrium at x_z = 0: what small fluctuations see as K_w, K_z, C_w, C_z."""

@@ -207,6 +207,7 @@ def some_slow(names, fast):
 
 
 @pytest.mark.parametrize("name", some_slow(CASES, FAST))
+@pytest.mark.slow
 def test_closed_form_is_the_quadrature_of_the_transfer_functions(x64, name):
     kind, noise, changes = CASES[name]
     settings, window = Settings().replace(**changes), SHIFTED if name == "isometric, OU" else WINDOW
@@ -220,6 +221,7 @@ def test_closed_form_is_the_quadrature_of_the_transfer_functions(x64, name):
     np.testing.assert_array_equal(jm.expected_spectrum(task, settings, window).power, moments.power)
 
 
+@pytest.mark.slow
 def test_the_variance_is_that_of_so_many_samples(x64):
     """A minute after 5 s, as a window or as samples from the begin of a shorter one; more slow noise is in it."""
     task = jm.Isometric(noise=jm.OrnsteinUhlenbeckNoise(BOTH, 2.0), harmonic=jm.Harmonic(0.003, 0.07, 0.7))
@@ -255,6 +257,7 @@ LAG = {"motion": 2e-3}
 
 
 @pytest.mark.parametrize("name", some_slow(ENVELOPES, ["isometric"]))
+@pytest.mark.slow
 def test_line_is_the_spectrum_of_a_noise_free_simulation(x64, name):
     kind, harmonic, changes = ENVELOPES[name]
     task = references.quiet(kind(*INPUTS[kind], harmonic=harmonic, settings=Settings().replace(**changes)))
@@ -368,6 +371,7 @@ def test_every_derivative_forward_reverse_and_by_differences(x64, name):
     assert silent == SILENT_IN[name]
 
 
+@pytest.mark.slow
 def test_gradient_by_a_natural_name_under_jit_and_vmap(x64):
     task = jm.Isometric()
 
@@ -403,7 +407,7 @@ def test_lags_and_the_variance_of_a_mean_are_plain_sums(x64, samples):
     for _ in range(samples - 1):
         r.append(row @ state)
         state = step @ state
-    powers = tuple(jnp.asarray(np.linalg.matrix_power(step, 2**k)) for k in range(11))
+    powers = jnp.stack([np.linalg.matrix_power(step, 2**k) for k in range(11)])
     found = _Autocovariance(jnp.asarray(first), jnp.asarray(row), powers, jnp.asarray(start))
     np.testing.assert_allclose(found.lagged(samples), r, rtol=1e-12, atol=1e-13)
     lag = np.abs(np.subtract.outer(np.arange(samples), np.arange(samples)))
@@ -461,6 +465,7 @@ def test_one_trace_per_structure(x64):
 
 
 @pytest.mark.parametrize("kind", some_slow(INPUTS, [jm.Isometric]))
+@pytest.mark.slow
 def test_a_users_own_muscle_in_closed_form(x64, kind):
     """The same muscle out of jaxmuscle's parts: k (x_ref² + x²) with k x_ref² the stiffness and x_ref = 0.03."""
     inner, outer = jm.QuadraticStiffness(300.0 / 0.03**2, 0.03), jm.QuadraticStiffness(200.0 / 1e8, 1e4)
@@ -541,6 +546,7 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("name", REFUSED)
+@pytest.mark.slow
 def test_what_has_no_linear_response(x64, name):
     task, message = REFUSED[name]
     with pytest.raises(jm.OperatingPointError, match=message):
@@ -572,6 +578,7 @@ def test_nothing_to_see(x64):
         jm.expected_spectrum(unmoved)
 
 
+@pytest.mark.slow
 def test_a_harmonic_beyond_half_the_sampling_rate(x64):
     task = jm.Isometric().replace(harmonic_frequency=50.0)
     with pytest.raises(ValueError, match=r"harmonic_frequency = 50.0 Hz is not below half the sampling rate of 100.0 Hz"):

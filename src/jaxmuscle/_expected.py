@@ -95,7 +95,7 @@ class _Autocovariance(NamedTuple):
 
     zero: Float[Array, ""]
     row: Float[Array, " all"]
-    powers: tuple[Float[Array, "all all"], ...]
+    powers: Float[Array, "doublings all all"]
     next: Float[Array, " all"]
 
     def lagged(self, lags: int) -> Float[Array, " lags"]:
@@ -115,17 +115,20 @@ class _Autocovariance(NamedTuple):
 
         Sums of `Φ^m v` and of `m Φ^m v` double their length from power to power; a block counts if its bit of n - 1 is set.
         """
-        n, count, length = jnp.asarray(samples, self.row.dtype), jnp.asarray(samples) - 1, 1
-        sum_all, rise_all = jnp.zeros_like(self.next), jnp.zeros_like(self.next)
-        sum_here, rise_here = self.next, jnp.zeros_like(self.next)
-        for power in self.powers:
-            counts = (count // length) % 2 == 1  # this block, then what is there already
-            rise_all = jnp.where(counts, rise_here + power @ (rise_all + length * sum_all), rise_all)
-            sum_all = jnp.where(counts, sum_here + power @ sum_all, sum_all)
-            rise_here = rise_here + power @ (rise_here + length * sum_here)
-            sum_here = sum_here + power @ sum_here
-            length *= 2
-        return self.zero / n + 2 / n**2 * self.row @ ((n - 1) * sum_all - rise_all)
+        n, count, zero = jnp.asarray(samples, self.row.dtype), jnp.asarray(samples) - 1, jnp.zeros_like(self.next)
+
+        def double(sums: Array, block: tuple[Array, Array]) -> tuple[Array, None]:
+            power, bit = block
+            sum_all, rise_all, sum_here, rise_here = sums
+            length = (2**bit).astype(n.dtype)
+            moved = jnp.stack([rise_all + length * sum_all, sum_all, rise_here + length * sum_here, sum_here]) @ power.T
+            counts = (count >> bit) % 2 == 1  # this block, then what is there already
+            both = jnp.stack([sum_here + moved[1], rise_here + moved[0]])
+            return jnp.concatenate([jnp.where(counts, both, sums[:2]), sums[2:] + moved[:1:-1]]), None
+
+        bits = jnp.arange(len(self.powers), dtype=count.dtype)
+        sums, _ = jax.lax.scan(double, jnp.stack([zero, zero, self.next, zero]), (self.powers, bits))
+        return self.zero / n + 2 / n**2 * self.row @ ((n - 1) * sums[0] - sums[1])
 
 
 def _autocovariance(system: _Covariances, interval: float, lags: int, sampling: str) -> _Autocovariance:
@@ -142,12 +145,11 @@ def _autocovariance(system: _Covariances, interval: float, lags: int, sampling: 
     else:
         step = jax.scipy.linalg.expm(matrix * interval)
         first, following = row @ start, step @ start
-    powers = [step]
-    while 2 ** (len(powers) - 1) < lags:
-        powers.append(powers[-1] @ powers[-1])
+    count = (lags - 1).bit_length() + 1
+    _, powers = jax.lax.scan(lambda power, _: (power @ power, power), step, length=count)
     # The last power carries an unstable system beyond any bound: no stationary covariance, so none is returned.
     stable = jnp.max(jnp.abs(powers[-1])) < 1e3
-    return _Autocovariance(jnp.where(stable, first, jnp.nan), row, tuple(powers), jnp.where(stable, following, jnp.nan))
+    return _Autocovariance(jnp.where(stable, first, jnp.nan), row, powers, jnp.where(stable, following, jnp.nan))
 
 
 @functools.cache
