@@ -2,15 +2,16 @@
 PYTHON ?= python3
 BIN = .venv/bin
 # Two workers, whatever the machine: each compiles a lot and takes up to 5 GiB.
-PYTEST = $(BIN)/python -m pytest -q -n 2 --dist loadfile
+PYTEST = $(BIN)/python -m pytest -q -n 2 --dist loadfile --no-loadscope-reorder
 PIP = $(BIN)/python -m pip --quiet --disable-pip-version-check install
 
-.PHONY: help fit test test-fast bench docs clean
+.PHONY: help fit test test-fast mutants bench docs clean
 
 help:
 	@echo "make fit        fit a bundled measured target; writes report and figure to out/fit"
 	@echo "make test       ruff, basedpyright and the whole test suite"
 	@echo "make test-fast  the tests that are not marked slow"
+	@echo "make mutants    random faults in the package: which of them a test notices; out/mutants.json"
 	@echo "make bench      measure speed; writes out/bench.json"
 	@echo "make docs       write the documentation; open site/index.html"
 	@echo "make clean      remove outputs and caches, but not .venv"
@@ -27,6 +28,9 @@ test: .venv/.stamp-test
 
 test-fast: .venv/.stamp-test
 	$(PYTEST) -m "not slow"
+
+mutants: .venv/.stamp-test
+	$(BIN)/python tests/mutants.py
 
 bench: .venv/.stamp-bench
 	$(BIN)/python benchmarks/run.py --out out/bench.json

@@ -2,11 +2,16 @@
 
 import gc
 import os
+import subprocess
+import sys
 from pathlib import Path
+from typing import Any
 
 import hypothesis
 import jax
+import jaxlib
 import pytest
+import timing
 from jaxtyping import install_import_hook
 
 install_import_hook("jaxmuscle", "beartype.beartype")  # before the first test module imports the package
@@ -19,21 +24,70 @@ os.environ["MPLBACKEND"] = "Agg"  # the environment reaches commands and noteboo
 hypothesis.settings.register_profile("jaxmuscle", deadline=None, derandomize=True)
 hypothesis.settings.load_profile("jaxmuscle")
 
+OUT = Path(__file__).parents[1] / ".test-out"
+
 
 def _keep_compiled_programs(folder: Path) -> None:
-    """Make repeated runs fast; without a writable folder they are only slower."""
+    """Make repeated runs fast; without a writable folder they are only slower.
+
+    All programs are kept, also the thousands of single operations: the second worker and the next run compile none again.
+    """
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError:
         return
     jax.config.update("jax_compilation_cache_dir", str(folder))
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     os.environ["JAX_COMPILATION_CACHE_DIR"] = str(folder)
+    os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0"
 
 
-MOST_MAPS = 15_000
+QUICK_COMPILER = "--xla_cpu_use_fusion_emitters=false"
 
-_keep_compiled_programs(Path(__file__).parents[1] / ".test-out" / "jax-cache")
+
+def _compile_quickly(known: Path) -> None:
+    """XLA's older emitters compile twice as fast programs that run as fast and give the same numbers to rounding.
+
+    An XLA that no longer has them ends the process at the flag: tried once for every version, in a process of its own.
+    """
+    if os.environ.get("XLA_FLAGS"):
+        return
+    asked = f"{jaxlib.__version__} {QUICK_COMPILER}"
+    answer = known.read_text(encoding="utf-8") if known.exists() else ""
+    if not answer.startswith(asked):
+        tried = subprocess.run([sys.executable, "-c", "import jax; jax.devices()"], capture_output=True,
+                               env=os.environ | {"XLA_FLAGS": QUICK_COMPILER})  # fmt: skip
+        answer = f"{asked} {'understood' if tried.returncode == 0 else 'unknown'}"
+        known.parent.mkdir(parents=True, exist_ok=True)
+        known.write_text(answer, encoding="utf-8")
+    if answer.endswith("understood"):
+        os.environ["XLA_FLAGS"] = QUICK_COMPILER
+
+
+MOST_MAPS = 25_000
+
+_keep_compiled_programs(OUT / "jax-cache")
+_compile_quickly(OUT / "compiler.txt")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    config.pluginmanager.register(timing.Timing(config))
+    _keep_to_own_cores(getattr(config, "workerinput", {}))
+
+
+def _keep_to_own_cores(worker: dict[str, Any]) -> None:
+    """One of several workers keeps off the others' cores: threads of XLA that wait for one another cost a fifth more."""
+    if worker and hasattr(os, "sched_setaffinity"):
+        cores, count = sorted(os.sched_getaffinity(0)), worker["workercount"]
+        own = cores[int(worker["workerid"].removeprefix("gw")) % count :: count]
+        if own:
+            os.sched_setaffinity(0, own)
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """The files that take longest first, so that no worker waits for the last one."""
+    if hasattr(config, "workerinput"):
+        items.sort(key=lambda item: timing.rank(item.path.stem))
 
 
 def pytest_runtest_setup(item: pytest.Item) -> None:
