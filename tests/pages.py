@@ -1,14 +1,21 @@
 """The Python blocks of a page, run as its reader would run them."""
 
+import functools
 import importlib.util
 import re
 import sys
 import textwrap
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+import jax
+import nbformat
+import numpy as np
+
 ROOT = Path(__file__).resolve().parents[1]
+NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
+IN_A_KERNEL = "03-three-tasks"  # the one with sliders, which test_notebooks.py runs as Jupyter does
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
 
 
@@ -37,6 +44,15 @@ def run(name: str, names: Mapping[str, Any] | None = None, smaller: Mapping[str,
     return namespace
 
 
+def run_cells(path: Path) -> dict[str, Any]:
+    """Runs the code cells of a notebook in order in one namespace, and returns that."""
+    namespace: dict[str, Any] = {"__name__": path.stem}
+    cells = [cell.source for cell in nbformat.read(path, as_version=4).cells if cell.cell_type == "code"]
+    for number, code in enumerate(cells, 1):
+        exec(compile(code, f"{path.name}, cell {number}", "exec"), namespace)
+    return namespace
+
+
 def module(path: Path) -> Any:
     """A program of the documentation, as a module."""
     spec = importlib.util.spec_from_file_location(path.stem, path)
@@ -45,3 +61,37 @@ def module(path: Path) -> Any:
     sys.modules[path.stem] = made
     spec.loader.exec_module(made)
     return made
+
+
+def _is_key(x: Any) -> bool:
+    return isinstance(x, jax.Array) and jax.dtypes.issubdtype(x.dtype, jax.dtypes.prng_key)
+
+
+def _content(value: Any) -> Any:
+    """What a value holds, so that equal ones are equal and can be looked up."""
+    leaves, structure = jax.tree.flatten(value)
+    arrays = [jax.random.key_data(x) if _is_key(x) else x for x in leaves]
+    numbers = [(str(x.dtype), x.shape, np.asarray(x).tobytes()) if hasattr(x, "dtype") else repr(x) for x in arrays]
+    return str(structure), tuple(numbers)
+
+
+class Once:
+    """Public functions that pages call with the same arguments again and again, run once each; `last` result by name."""
+
+    def __init__(self) -> None:
+        self.last: dict[str, Any] = {}
+        self.found: dict[Any, Any] = {}
+
+    def of(self, name: str, function: Callable[..., Any], **fewer: Any) -> Callable[..., Any]:
+        """`function` with `fewer` options where a page does not name them; what is written to disk is always run."""
+
+        @functools.wraps(function)
+        def inside(*given: Any, **options: Any) -> Any:
+            options = fewer | options
+            asked = (name, jax.config.jax_enable_x64, _content((given, options)))
+            if asked not in self.found or "store" in options:
+                self.found[asked] = function(*given, **options)
+            self.last[name] = self.found[asked]
+            return self.last[name]
+
+        return inside
