@@ -1,0 +1,232 @@
+"""Does the suite notice a wrong number? Random small faults in the package, and which of them a test finds.
+
+    python tests/mutants.py --count 10 --out out/mutants.json          # 10 mutants of every subject, hours
+    python tests/mutants.py --count 10 --tests ../older/tests ...      # the same mutants seen by other tests
+
+A mutant is a copy of the package with one operator, comparison, number or condition changed. It runs the test files of its
+subject in the order of `SUBJECTS`, the most direct first, and ends at the first failure or after `--seconds`. Other files
+might find it, too: the share that is killed is a lower bound. Mutants that were run stay in the file and are not run again.
+"""
+
+import argparse
+import ast
+import collections
+import concurrent.futures
+import json
+import os
+import queue
+import random
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+ROOT = Path(__file__).resolve().parents[1]
+SUBJECTS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
+    "muscle": (("_muscle", "_law"), ("muscle", "task", "hill", "closed_forms", "simulate", "expected")),
+    "tasks": (("_task", "_signal", "_harmonic"), ("task", "signal", "muscle", "closed_forms", "simulate", "expected")),
+    "noise": (("_noise", "_pink"), ("noise", "pink", "closed_forms", "orders", "expected", "control")),
+    "path": (("_path", "_lanes", "_simulate"), ("simulate", "orders", "closed_forms", "gradients", "control", "ensemble")),
+    "linear response": (
+        ("_operating", "_linear", "_line", "_expected", "_sensitivity", "_static", "_scaling"),
+        ("expected", "sensitivity", "static", "scaling", "control", "fit"),
+    ),
+    "spectra": (("_spectrum", "_metrics", "_estimate"), ("spectrum", "metrics", "uncertainty", "control", "simulate")),
+    "likelihood": (("_likelihood", "_climb", "_marginal", "_profile"), ("likelihood", "identify", "posterior", "goodness")),
+    "objective": (
+        ("_objective", "_problem", "_derived", "_descend", "_starts", "_search", "_uncertainty", "_check", "_harmonic_test"),
+        ("uncertainty", "fit", "identify", "joint", "fitting", "goodness"),
+    ),
+    "targets": (("_target", "_target_file", "_target_check", "_target_csv", "_digitised"), ("target", "digitised", "cli")),
+    "recordings": (
+        ("_recording", "_recording_check", "_recording_csv", "_recording_file", "_recording_formats", "_recording_table"),
+        ("recording", "recording_file", "reproduce"),
+    ),
+    "ensemble store": (
+        ("_ensemble", "_ensemble_plan", "_ensemble_run", "_ensemble_store", "_ensemble_summary", "_tally", "_sweep"),
+        ("ensemble",),
+    ),
+}
+ARITHMETIC = {ast.Add: ast.Sub, ast.Sub: ast.Add, ast.Mult: ast.Div, ast.Div: ast.Mult, ast.Pow: ast.Mult,
+              ast.FloorDiv: ast.Mult, ast.Mod: ast.FloorDiv}  # fmt: skip
+COMPARISONS = {ast.Lt: ast.LtE, ast.LtE: ast.Lt, ast.Gt: ast.GtE, ast.GtE: ast.Gt, ast.Eq: ast.NotEq, ast.NotEq: ast.Eq,
+               ast.Is: ast.IsNot, ast.IsNot: ast.Is, ast.In: ast.NotIn, ast.NotIn: ast.In}  # fmt: skip
+OPPOSITE = {"min": "max", "max": "min", "minimum": "maximum", "maximum": "minimum", "any": "all", "all": "any",
+            "sin": "cos", "cos": "sin", "real": "imag", "argmin": "argmax", "argmax": "argmin"}  # fmt: skip
+WORDS_AND_PICTURES = {"__str__", "__repr__", "plot", "message", "remarks", "notices"}  # what they say is tested, not counted
+
+
+class Mutant(NamedTuple):
+    subject: str
+    file: str
+    line: int
+    column: int
+    before: str
+    after: str
+
+    @property
+    def name(self) -> str:
+        return f"{self.file}:{self.line}:{self.column} {self.before} -> {self.after}"
+
+
+def changed(node: ast.AST) -> Iterator[ast.AST]:
+    """What a node may be exchanged for."""
+    match node:
+        case ast.BinOp() if type(node.op) in ARITHMETIC:
+            yield ast.BinOp(node.left, ARITHMETIC[type(node.op)](), node.right)
+        case ast.Compare(ops=[op]) if type(op) in COMPARISONS:
+            yield ast.Compare(node.left, [COMPARISONS[type(op)]()], node.comparators)
+        case ast.BoolOp():
+            yield ast.BoolOp(ast.Or() if isinstance(node.op, ast.And) else ast.And(), node.values)
+        case ast.UnaryOp(op=ast.USub() | ast.Not()) if not isinstance(node.operand, ast.Constant):
+            yield node.operand
+        case ast.Constant(value=bool() as value):
+            yield ast.Constant(not value)
+        case ast.Constant(value=int() as value):
+            yield ast.Constant(value + 1)
+        case ast.Constant(value=float() as value):
+            yield ast.Constant(2 * value if value else 1.0)
+        case ast.IfExp():
+            yield ast.IfExp(node.test, node.orelse, node.body)
+        case ast.Call(func=ast.Attribute(attr="where"), args=[test, one, other]):
+            yield ast.Call(node.func, [test, other, one], node.keywords)
+        case ast.Call(func=ast.Attribute(attr=name)) if name in OPPOSITE:
+            yield ast.Call(ast.Attribute(node.func.value, OPPOSITE[name], ast.Load()), node.args, node.keywords)
+        case ast.Call(func=ast.Name(id=name)) if name in OPPOSITE:
+            yield ast.Call(ast.Name(OPPOSITE[name], ast.Load()), node.args, node.keywords)
+
+
+def of_numbers(node: ast.AST) -> Iterator[ast.AST]:
+    """The node and all below it that numbers can depend on: no annotations, errors, texts, figures."""
+    skipped = (ast.Raise, ast.JoinedStr, ast.arg, ast.Import, ast.ImportFrom, ast.Assert)
+    if isinstance(node, skipped) or (isinstance(node, ast.FunctionDef) and node.name in WORDS_AND_PICTURES):
+        return
+    if isinstance(node, ast.If) and any(isinstance(inside, ast.Raise) for inside in node.body):
+        yield from of_numbers(node.test)
+        return
+    yield node
+    for field, value in ast.iter_fields(node):
+        if field not in ("annotation", "returns", "decorator_list"):
+            for child in value if isinstance(value, list) else [value]:
+                if isinstance(child, ast.AST):
+                    yield from of_numbers(child)
+
+
+def of_file(subject: str, path: Path) -> list[Mutant]:
+    text = path.read_text(encoding="utf-8")
+    found = []
+    for node in of_numbers(ast.parse(text)):
+        for other in changed(node):
+            before, after = ast.get_source_segment(text, node), ast.unparse(ast.fix_missing_locations(other))
+            if before and "\n" not in before:
+                found.append(Mutant(subject, path.stem, node.lineno, node.col_offset, before, f"({after})"))
+    return found
+
+
+def sampled(count: int, seed: int) -> list[Mutant]:
+    """So many of every subject, each on a line of its own."""
+    chosen = []
+    for subject, (files, _) in SUBJECTS.items():
+        sites = [m for file in files for m in of_file(subject, ROOT / "src" / "jaxmuscle" / f"{file}.py")]
+        random.Random(f"{seed} {subject}").shuffle(sites)
+        one_a_line = {(m.file, m.line): m for m in reversed(sites)}
+        chosen += [m for m in sites if one_a_line[m.file, m.line] is m][:count]
+    return chosen
+
+
+def applied(mutant: Mutant, text: str) -> str:
+    lines = text.split("\n")
+    line = lines[mutant.line - 1].encode()
+    end = mutant.column + len(mutant.before.encode())
+    assert line[mutant.column : end].decode() == mutant.before
+    lines[mutant.line - 1] = (line[: mutant.column] + mutant.after.encode() + line[end:]).decode()
+    return "\n".join(lines)
+
+
+def judged(mutant: Mutant, folder: Path, seconds: float) -> dict[str, Any]:
+    """Runs its tests in a copy of the project for so long; what failed first, or None."""
+    path = folder / "src" / "jaxmuscle" / f"{mutant.file}.py"
+    original = (ROOT / "src" / "jaxmuscle" / f"{mutant.file}.py").read_text(encoding="utf-8")
+    path.write_text(applied(mutant, original), encoding="utf-8")
+    files = [name for test in SUBJECTS[mutant.subject][1] if (folder / (name := f"tests/test_{test}.py")).exists()]
+    command = [sys.executable, "-m", "pytest", "-x", "-q", "--tb=no", "-p", "no:cacheprovider", *files]
+    begun = time.monotonic()
+    try:
+        done = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=seconds, check=False,
+                              env=os.environ | {"PYTHONPATH": str(folder / "src")})  # fmt: skip
+        failed = re.search(r"^(?:FAILED|ERROR) (\S+)", done.stdout, re.MULTILINE)
+        killer = None if done.returncode == 0 else failed.group(1) if failed else f"exit {done.returncode}"
+        ended = True
+    except subprocess.TimeoutExpired:
+        killer, ended = None, False
+    finally:
+        path.write_text(original, encoding="utf-8")
+    return {"killed by": killer, "all run": ended, "seconds": round(time.monotonic() - begun, 1)}
+
+
+def copied(folder: Path, tests: Path) -> Path:
+    """The project in `folder` with those tests; compiled programs are shared with the project itself."""
+    kept = shutil.ignore_patterns(".git", ".venv", "out", "site", ".test-out", "__pycache__", "tests")
+    shutil.copytree(ROOT, folder, ignore=kept, symlinks=True)
+    shutil.copytree(tests, folder / "tests", ignore=shutil.ignore_patterns("__pycache__"))
+    (ROOT / ".test-out").mkdir(exist_ok=True)
+    (folder / ".test-out").symlink_to(ROOT / ".test-out")
+    return folder
+
+
+def table(found: dict[str, Any]) -> str:
+    """Mutants and killed ones of every subject, then the survivors."""
+    count, killed = collections.Counter(), collections.Counter()
+    for row in found.values():
+        count[row["subject"]] += 1
+        killed[row["subject"]] += row["killed by"] is not None
+    rows = [f"{subject:18}{count[subject]:5}{killed[subject]:5}" for subject in count]
+    total = f"{'all':18}{count.total():5}{killed.total():5}   {100 * killed.total() / max(count.total(), 1):.0f} %"
+    alive = [f"  survives: {row['subject']}: {name}" for name, row in found.items() if row["killed by"] is None]
+    return "\n".join([f"{'subject':18}{'mutants':>5}{'killed':>7}", *rows, total, *alive])
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--count", type=int, default=10, help="mutants of every subject")
+    parser.add_argument("--seed", type=int, default=14)
+    parser.add_argument("--tests", type=Path, default=ROOT / "tests")
+    parser.add_argument("--out", type=Path, default=ROOT / "out" / "mutants.json")
+    parser.add_argument("--seconds", type=float, default=180.0, help="for one mutant; then it counts as not noticed")
+    parser.add_argument("--only", default="", help="mutants whose name contains this")
+    parser.add_argument("--list", action="store_true", help="show the mutants, run none")
+    given = parser.parse_args()
+    mutants = [m for m in sampled(given.count, given.seed) if given.only in m.name]
+    if given.list:
+        print("\n".join(f"{m.subject:16} {m.name}" for m in mutants))
+        return
+    found = json.loads(given.out.read_text(encoding="utf-8")) if given.out.exists() else {}
+    given.out.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory() as scratch, concurrent.futures.ThreadPoolExecutor(2) as workers:
+        folders: queue.SimpleQueue[Path] = queue.SimpleQueue()
+        for number in range(2):
+            folders.put(copied(Path(scratch) / str(number), given.tests))
+
+        def one(mutant: Mutant) -> tuple[Mutant, dict[str, Any]]:
+            folder = folders.get()
+            try:
+                return mutant, judged(mutant, folder, given.seconds)
+            finally:
+                folders.put(folder)
+
+        left = [workers.submit(one, m) for m in mutants if m.name not in found]
+        for done in concurrent.futures.as_completed(left):
+            mutant, row = done.result()
+            found[mutant.name] = {"subject": mutant.subject} | row
+            given.out.write_text(json.dumps(found, indent=1), encoding="utf-8")
+            print(f"{row['seconds']:6.0f} s  {mutant.name}  {row['killed by'] or 'SURVIVES'}", flush=True)
+    print(table(found))
+
+
+if __name__ == "__main__":
+    main()
