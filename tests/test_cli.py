@@ -241,6 +241,7 @@ def fitted(tmp_path_factory):
     return result, folder / "out"
 
 
+@pytest.mark.slow
 def test_a_fit_writes_result_table_and_figure(fitted):
     outcome, folder = fitted
     assert outcome.exit_code == 0
@@ -265,6 +266,7 @@ def test_a_fit_prints_what_it_found(fitted):
     assert "m_w" not in outcome.stdout
 
 
+@pytest.mark.slow
 def test_what_was_fitted_can_be_simulated(fitted, tmp_path):
     import xarray
 
@@ -376,14 +378,18 @@ def test_an_interruption_before_the_first_step_writes_nothing(tmp_path, monkeypa
 def test_ctrl_c(tmp_path):
     """A real signal, once the first steps have been taken."""
     code = """
-import contextlib, signal
+import contextlib, signal, time
 from jaxmuscle import _cli, _cli_fit
 
 signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs ignore it
 
 @contextlib.contextmanager
 def loud(title):
-    yield lambda text, share: print(text, flush=True)
+    def told(text, share):
+        print(text, flush=True)
+        if text.startswith("trying starts"):
+            time.sleep(60)  # until the signal: Python would swallow it while it collects garbage
+    yield told
 
 _cli_fit.progress = loud
 _cli.main()

@@ -151,6 +151,7 @@ def test_single_members_are_compared_by_their_standard_errors():
         np.testing.assert_allclose((d.low, d.high), np.array([-1, 1]) * 1.959964 * np.sqrt(2) * error, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_one_bad_target_does_not_stop_the_rest(tmp_path):
     few = jm.Target("few", np.array([0.5, 0.3, 0.2]), bins=np.array([1, 2, 3]), segments=12)
     good = jm.load_target("fdi-abduction-45mvc")

@@ -85,6 +85,7 @@ def test_the_preset_has_the_papers_amplitudes():
     assert task["harmonic_frequency"] == 4.25
 
 
+@pytest.mark.slow
 def test_the_preset_shows_the_papers_two_maxima(paper_force):
     found = jm.peaks(paper_force.mean())
     assert found.maximum.bin == 1
@@ -100,6 +101,7 @@ def test_single_seeds_of_the_preset_show_both_maxima_more_often_than_not(paper_f
     assert 0.5 < both.mean() < 0.9
 
 
+@pytest.mark.slow
 def test_the_presets_displacement_oscillates_about_the_cubics_root():
     task = jm.load_preset("zagrodny-slifkin").as_task(jm.PrescribedForce)
     k, x_ref, force = float(task["k_w"]), float(task["x_ref_w"]), float(task["P_w"])

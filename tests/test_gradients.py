@@ -46,6 +46,7 @@ def test_every_parameter_forward_reverse_and_by_differences(x64, name):
     assert tuple(silent) == WITHOUT_INFLUENCE[name]
 
 
+@pytest.mark.slow
 def test_a_parameter_by_its_natural_name(x64):
     task = jm.Isometric()
 

@@ -152,6 +152,7 @@ def test_at_rest_nothing_pulls_and_shortening_lowers_the_force(muscle):
     assert np.all(np.diff(pull) > 0)  # the belly's shortening stretches the tendon
 
 
+@pytest.mark.slow
 def test_the_base_coefficients_are_those_of_small_motions(muscle):
     task = hill.at_activation(jm.Isometric(muscle=muscle), muscle.activation)
     K_w, K_z, C_w, C_z = np.asarray(muscle.base())
@@ -170,6 +171,7 @@ def test_the_base_coefficients_are_those_of_small_motions(muscle):
 
 
 @pytest.mark.parametrize("x_z", [-0.003, 0.0, 0.005, 0.008])
+@pytest.mark.slow
 def test_held_the_belly_and_the_tendon_balance(muscle, x_z):
     task = hill.at_activation(jm.Isometric(muscle=muscle, x_z=x_z), muscle.activation)
     p = numpy_values(muscle)
@@ -182,6 +184,7 @@ def test_held_the_belly_and_the_tendon_balance(muscle, x_z):
 
 
 @pytest.mark.parametrize("share", [0.75, 0.95])
+@pytest.mark.slow
 def test_under_a_load_the_belly_finds_the_length_that_carries_it(muscle, share):
     p = numpy_values(muscle)
     held = float(muscle.held_force)
@@ -307,6 +310,7 @@ def test_prescribed_motion_is_the_inverse_problem(x64):
         np.testing.assert_allclose(task.output(t, y, u, du), P_w, rtol=1e-6)  # differences: h² and 1e-16 v / h
 
 
+@pytest.mark.slow
 def test_own_muscles_run_at_scale(tmp_path):
     """A reduced, stored sweep over a parameter that only this muscle has."""
     sweep = jm.Sweep.grid(jm.Isometric(muscle=HillMuscle()), velocity_max=[2.0, 4.0])

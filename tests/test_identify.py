@@ -93,6 +93,7 @@ def same_information(found, expected):
 # --- the information of the data
 
 
+@pytest.mark.slow
 def test_the_information_is_that_of_log_contrasts(x64):
     setup, theta = setup_at(fitted())
     same_information(information_of(setup, seen_here(setup, theta)), proportional_information(TRUTH, (SEGMENTS,)))
@@ -225,6 +226,7 @@ def test_a_known_mean_is_known_as_well_as_it_was_measured():
     assert mean.stderr / mean.value == pytest.approx(0.02, rel=1e-3) and "mean" in report.designs[0].gained
 
 
+@pytest.mark.slow
 def test_a_design_at_other_values_knows_the_factors(x64):
     """Information about θ at the design's own values, as if its task had been fitted."""
     stronger = jm.at_level(TRUTH, 0.5)
@@ -255,6 +257,7 @@ def test_separate_parameters_are_eliminated(x64):
     assert np.linalg.eigvalsh(tied - loose)[0] > -1e-9 * np.abs(tied).max()
 
 
+@pytest.mark.slow
 def test_the_load_keeps_the_operating_point(x64):
     result = fitted()
     design = next(d for d in jm.standard_designs(result) if "displacement" in d.name)
@@ -283,6 +286,7 @@ def test_the_load_keeps_the_operating_point(x64):
     ],
     ids=["isometric", "all numbers known", "force", "motion"],
 )  # fmt: skip
+@pytest.mark.slow
 def test_the_usual_designs(result, names):
     designs = jm.standard_designs(result())
     assert [design.name for design in designs] == names
@@ -298,6 +302,7 @@ def report() -> jm.IdentifiabilityReport:
     return jm.identifiability(fitted(coefficient_of_variation=0.016))
 
 
+@pytest.mark.slow
 def test_the_report_agrees_with_itself():
     found = report()
     assert found.present.determined == np.sum(found.present.singular_values >= 3) == 5

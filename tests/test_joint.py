@@ -232,6 +232,7 @@ def test_tasks_at_theta_have_the_shared_values(x64):
     assert float(tasks["shift"]["F_ext"]) == 1.0
 
 
+@pytest.mark.slow
 def test_proportional_parameters_keep_the_ratio_of_their_tasks(x64):
     names = ("k_w", "k_z", "c_w", "c_z", "noise_K_w", "noise_K_z", "noise_C_w", "noise_C_z", "harmonic_amplitude")
     tasks = {f"{100 * level:g}": jm.at_level(TRUTH, level) for level in (0.15, 0.6)}
@@ -289,6 +290,7 @@ def quick():
     return jm.fit_joint(targets, tasks=tasks, free=free, separate=("harmonic_amplitude",), starts=2, seeds=0)
 
 
+@pytest.mark.slow
 def test_a_result_holds_everything(quick):
     assert quick.success, quick.message
     assert quick.free == ("c_w", "noise_K_z", "harmonic_amplitude@low", "harmonic_frequency", "harmonic_amplitude@high",
@@ -349,6 +351,7 @@ def test_the_figure(quick):
         plt.close(figure)
 
 
+@pytest.mark.slow
 def test_a_fit_that_fails_is_a_result(tmp_path):
     """Noise on C does nothing at rest: no spectrum is finite."""
     still = dict.fromkeys(("noise_K_w", "noise_K_z", "harmonic_amplitude"), 0.0) | {"noise_C_w": 0.1}
@@ -361,6 +364,7 @@ def test_a_fit_that_fails_is_a_result(tmp_path):
     plt.close(joint.plot())
 
 
+@pytest.mark.slow
 def test_equal_tasks_of_unequal_levels_are_noticed():
     targets = {"a": expected(TRUTH, mvc_fraction=0.2), "b": expected(TRUTH, mvc_fraction=0.4)}
     joint = jm.fit_joint(targets, free=("c_w", "harmonic_frequency"), starts=1, seeds=0)

@@ -59,6 +59,7 @@ def independent(bins):
     return bins._replace(precision=np.eye(30), logdet=np.zeros(()))
 
 
+@pytest.mark.slow
 def test_without_correlation_the_density_of_proportional_powers_is_a_closed_form():
     """∫ Π gamma(T p; a, E/a) T^(n-1) dT = Γ(Σa) Π a^a p^(a-1) / (Γ(a) E^a) / (Σ a p / E)^Σa."""
     target = jm.load_target("vastus-lateralis-26mvc")
@@ -145,11 +146,13 @@ def bins_information(bins):
     return whole - np.outer(ones, ones) / ones.sum()
 
 
+@functools.cache
 def recording(seconds=20.0):
     runs = jm.ensemble(jm.settled(jm.Isometric()), jax.random.key(3), seeds=1, duration=5 + seconds, control=False)
     return jm.Recording(np.asarray(runs.output[0]), 100, window=(5, 5 + seconds))
 
 
+@pytest.mark.slow
 def test_whittle_is_the_law_of_a_periodogram():
     """With a line: scipy's noncentral chi-squared density of 2 I / N with noncentrality 2 L / N."""
     data = recording()
@@ -166,6 +169,7 @@ def test_whittle_is_the_law_of_a_periodogram():
 
 
 @pytest.mark.parametrize("name", ["vastus-lateralis-26mvc", "recording"])
+@pytest.mark.slow
 def test_likelihoods_are_differentiable(name):
     data = recording() if name == "recording" else jm.load_target(name)
 
@@ -177,6 +181,7 @@ def test_likelihoods_are_differentiable(name):
     assert float(jax.grad(height)(60.0)) == pytest.approx(float(numeric), rel=1e-5)
 
 
+@pytest.mark.slow
 def test_a_recording_prefers_the_muscle_that_made_it():
     data = recording(60.0)
     heights = [float(jm.log_likelihood(jm.Isometric().replace(c_w=c), data)) for c in (30.0, 60.0, 120.0)]

@@ -156,6 +156,7 @@ TASKS = {
 
 
 @pytest.mark.parametrize("name", ["isometric", *(pytest.param(n, marks=pytest.mark.slow) for n in list(TASKS)[1:])])
+@pytest.mark.slow
 def test_its_response_is_the_sum_of_its_states_responses(x64, name):
     """Each is an Ornstein-Uhlenbeck noise of variance w_i and correlation time 1 / 2π f_i, with a known response."""
     task = references.quiet(TASKS[name], harmonic_amplitude=0.0)
@@ -212,6 +213,7 @@ def condition(A, F):
     return np.linalg.cond(np.kron(A, np.eye(len(F))) + np.kron(np.eye(len(A)), F))
 
 
+@pytest.mark.slow
 def test_single_precision():
     normals, noise = np.random.default_rng(0).normal(size=(501, 16)), jm.PinkNoise(1.0)
     task = jm.Isometric(5.0, 0.003, noise=jm.PinkNoise())

@@ -15,6 +15,7 @@ def test_the_papers_tasks():
     assert task2.muscle is task1.muscle and task2.noise is task1.noise and task2.harmonic is task1.harmonic
 
 
+@pytest.mark.slow
 def test_gradients_by_natural_name():
     task1 = jm.load_preset("zagrodny-slifkin")
     power = lambda k: jm.expected_spectrum(task1.replace(k_w=k)).proportional[10]  # noqa: E731
@@ -24,6 +25,7 @@ def test_gradients_by_natural_name():
     assert slope == pytest.approx(difference, rel=0.01)  # 1 % steps in single precision
 
 
+@pytest.mark.slow
 def test_a_users_own_muscle_has_noise_spectra_and_gradients():
     from jaxmuscle import AbstractMuscle
 

@@ -58,6 +58,7 @@ def test_the_steadiest_level_and_the_contrast_are_free():
 
 
 @pytest.mark.parametrize("task", TASKS.values(), ids=TASKS)
+@pytest.mark.slow
 def test_variation_of_the_output_is_smallest_near_30_and_largest_at_95_percent(x64, task):
     seen = np.array([variation(at_level(task, level, resting=0.1)) for level in LEVELS])
     assert LEVELS[seen.argmin()] == pytest.approx(0.3)
@@ -93,6 +94,7 @@ def test_the_reference_is_the_task_itself_and_steps_add_up(x64, task):
 
 
 @pytest.mark.parametrize("task", TASKS.values(), ids=TASKS)
+@pytest.mark.slow
 def test_without_resting_stiffness_forces_follow_the_level_and_nothing_moves(x64, task):
     high = at_level(task, 0.9)
     np.testing.assert_allclose(jm.equilibrium(high), jm.equilibrium(task), rtol=1e-9, atol=1e-12)
@@ -136,6 +138,7 @@ def test_variation_falls_with_strength(x64, task):
 
 
 @pytest.mark.parametrize("exponent", [1.0, 0.0])
+@pytest.mark.slow
 def test_similar_muscles_have_similar_equilibria_and_rates(x64, exponent):
     task = jm.PrescribedForce(F_ext=1.0)
     large = scaled(task, 2.0, time_exponent=exponent)
@@ -149,6 +152,7 @@ def test_similar_muscles_have_similar_equilibria_and_rates(x64, exponent):
         np.testing.assert_allclose(slower, rates / 2, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_dynamic_similarity_is_exact_far_from_linear(x64):
     """Twice the size, times stretched by two: x ∝ s, force ∝ s², along the whole nonlinear run."""
     size = 2.0
@@ -174,6 +178,7 @@ def test_sizes_multiply(x64, task):
 # --- both
 
 
+@pytest.mark.slow
 def test_derivatives_and_batches_go_through(x64):
     def change(level, size):
         task = scaled(at_level(jm.Isometric(), level), size)
@@ -256,6 +261,7 @@ def test_the_only_maximum_of_the_expected_force_is_bin_1(x64, hamilton):
     assert not found.local_maxima
 
 
+@pytest.mark.slow
 def test_the_only_maximum_of_100_simulated_seeds_is_bin_1(hamilton, capsys):
     runs = jm.ensemble(hamilton, jax.random.key(12), seeds=100)
     found = jm.peaks(runs.spectrum().mean())
@@ -270,6 +276,7 @@ def test_the_only_maximum_of_100_simulated_seeds_is_bin_1(hamilton, capsys):
     assert seen[0] == pytest.approx(expected[0], abs=0.05)
 
 
+@pytest.mark.slow
 def test_the_preset_is_smoother_and_its_amplitude_falls(x64, hamilton):
     beside = jm.load_preset("zagrodny-slifkin")
     smooth, rough = (np.asarray(jm.expected_spectrum(t).proportional) for t in (hamilton, beside))

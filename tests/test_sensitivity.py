@@ -8,6 +8,7 @@ import jaxmuscle as jm
 TASK = jm.Isometric()
 
 
+@pytest.mark.slow
 def test_every_entry_is_a_difference_quotient(x64):
     names = ("k_w", "c_z", "noise_K_w", "harmonic_frequency", "x_z")
     found = jm.sensitivity(TASK, names)
@@ -24,6 +25,7 @@ def test_every_entry_is_a_difference_quotient(x64):
     assert list(found.relative) == [True, True, True, True, False]
 
 
+@pytest.mark.slow
 def test_the_scale_of_all_perturbations_moves_power_alone():
     """Power goes with the square of noise and harmonic together; its proportions do not change."""
     found = jm.sensitivity(TASK, ("noise_K_w", "noise_K_z", "noise_C_w", "noise_C_z", "harmonic_amplitude"))
@@ -31,6 +33,7 @@ def test_the_scale_of_all_perturbations_moves_power_alone():
     np.testing.assert_allclose(found.proportional.sum(axis=0), 0.0, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_the_table_has_its_labels():
     table = jm.sensitivity(TASK).to_xarray()
     assert table["proportional"].dims == ("parameter", "frequency")

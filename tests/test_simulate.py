@@ -73,6 +73,7 @@ DETERMINISTIC = [
 
 
 @pytest.mark.parametrize("task, reference", DETERMINISTIC)
+@pytest.mark.slow
 def test_without_noise_the_result_is_scipys_to_second_order(x64, task, reference):
     task = references.quiet(task.with_parts(harmonic=HARMONIC), k_w=4e5, c_w=50.0)
     errors = []
@@ -131,6 +132,7 @@ class Integral(jm.AbstractTask):
         (150, 3, 49, "float64"),
     ],
 )
+@pytest.mark.slow
 def test_every_step_gets_its_own_noise(steps, every, substeps, precision):
     """diffrax rounds the times of steps: none may find its neighbour's noise."""
     with jax.enable_x64(precision == "float64"):
@@ -146,6 +148,7 @@ def test_every_step_gets_its_own_noise(steps, every, substeps, precision):
 
 
 @pytest.mark.parametrize("task", ["motion", "force", "isometric"])
+@pytest.mark.slow
 def test_tables_of_inputs_and_harmonic_change_nothing(x64, task):
     """A traced call, which may be differentiated in reverse, evaluates them in the loop; a plain one looks them up."""
     rhythm = jm.Harmonic(0.02, 3.0, 0.4, jm.Decay(1.0, 0.2, 0.3, 0.2))
@@ -208,6 +211,7 @@ def test_seed_i_folds_i_into_the_key():
         np.testing.assert_array_equal(normals, noise.draw(jax.random.fold_in(KEY, i), 10))
 
 
+@pytest.mark.slow
 def test_what_does_not_stay_finite_is_named(x64):
     task = jm.Isometric(noise=jm.OrnsteinUhlenbeckNoise({"C_w": 30.0}))
     with pytest.raises(jm.SimulationError) as error:
@@ -244,6 +248,7 @@ def test_impossible_ensembles_are_refused():
         jm.ensemble(jm.Isometric(), KEY, seeds=1, chunk=0)
 
 
+@pytest.mark.slow
 def test_averages_are_those_of_a_fine_run(x64):
     task = jm.Isometric(noise=jm.BandLimitedNoise(0.1))
     fine = np.asarray(jm.simulate(task, KEY, duration=1.0, rate=1000.0).output)
@@ -275,6 +280,7 @@ def test_sampling_and_window():
         run.spectrum(jm.SpectrumSettings(rate=150.0), window=(0.0, 3.0))
 
 
+@pytest.mark.slow
 def test_ensembles_under_vmap_and_jit(x64):
     task = jm.Isometric()
     stiffness = jnp.array([4e5, 6e5])
@@ -289,6 +295,7 @@ def test_ensembles_under_vmap_and_jit(x64):
     assert np.abs(both[0] - both[1]).max() > 1e-2
 
 
+@pytest.mark.slow
 def test_other_values_do_not_compile_again():
     traces = []
 
@@ -313,6 +320,7 @@ def test_other_values_do_not_compile_again():
     assert compilations(task.replace(k_w=jnp.asarray(3e5)), 2, 3) == 0
 
 
+@pytest.mark.slow
 def test_xarray_says_what_it_holds(tmp_path):
     import xarray
 

@@ -64,6 +64,7 @@ def user_view():
 
 
 @pytest.mark.parametrize("settings", GRID, ids=lambda s: f"{s.window}-{s.overlap}-{s.detrend}-{s.length}")
+@pytest.mark.slow
 def test_welch_is_scipy(x64, settings):
     frequency, power = scipy_welch(FORCE, settings)
     np.testing.assert_allclose(settings.frequency, frequency, rtol=1e-14)
@@ -131,6 +132,7 @@ records = hnp.arrays(np.float64, lengths, elements=st.floats(-100, 100, width=32
 
 @settings(max_examples=40)
 @given(records, st.sampled_from([16, 17]))
+@pytest.mark.slow
 def test_power_adds_up_to_the_variance(record, length):
     with jax.enable_x64(True):
         chosen = SpectrumSettings(length=length, first_bin=0, last_bin=8, window="boxcar", overlap=0.0, filter_cutoff=None)

@@ -62,6 +62,7 @@ def test_force_at_the_insertion_solves_the_statics():
 
 
 @pytest.mark.parametrize("kind", [jm.Isometric, jm.PrescribedForce, jm.PrescribedMotion])
+@pytest.mark.slow
 def test_the_operating_point_is_the_tasks(kind):
     task = kind()
     seen = static_characteristics(task)

@@ -116,6 +116,7 @@ STATIC = [
 
 
 @pytest.mark.parametrize("task, static", STATIC)
+@pytest.mark.slow
 def test_without_noise_everything_settles_at_the_roots_of_the_statics(x64, task, static):
     task = references.quiet(task, harmonic_amplitude=0.0, k_w=4e5, k_z=6e5, x_ref_z=0.015)
     states, output = static({name: float(value) for name, value in task.parameters.items()})

@@ -134,6 +134,7 @@ def test_statistics_from_sigma_and_from_nothing():
     np.testing.assert_array_equal(unknown.sd, 1.0)
 
 
+@pytest.mark.slow
 def test_the_true_spectrum_gives_the_stated_chi2():
     """Design 6: 0.97 ± 0.31 for a recording of twelve segments."""
     target = jm.Target("white", FLAT, segments=12)
