@@ -4,7 +4,8 @@
     python tests/mutants.py --count 10 --tests ../older/tests ...      # the same mutants seen by other tests
 
 A mutant is a copy of the package with one operator, comparison, number or condition changed. It runs the test files of its
-subject in the order of `SUBJECTS`, the most direct first, and ends at the first failure or after `--seconds`. Other files
+subject in the order of `SUBJECTS`, the most direct first, first what is not slow, and ends at the first failure or after
+`--seconds`. Other files
 might find it, too: the share that is killed is a lower bound. Mutants that were run stay in the file and are not run again.
 """
 
@@ -59,6 +60,9 @@ COMPARISONS = {ast.Lt: ast.LtE, ast.LtE: ast.Lt, ast.Gt: ast.GtE, ast.GtE: ast.G
 OPPOSITE = {"min": "max", "max": "min", "minimum": "maximum", "maximum": "minimum", "any": "all", "all": "any",
             "sin": "cos", "cos": "sin", "real": "imag", "argmin": "argmax", "argmax": "argmin"}  # fmt: skip
 WORDS_AND_PICTURES = {"__str__", "__repr__", "plot", "message", "remarks", "notices"}  # what they say is tested, not counted
+
+
+NO_TESTS = 5  # pytest's exit code where none has the mark
 
 
 class Mutant(NamedTuple):
@@ -154,16 +158,19 @@ def judged(mutant: Mutant, folder: Path, seconds: float) -> dict[str, Any]:
     original = (ROOT / "src" / "jaxmuscle" / f"{mutant.file}.py").read_text(encoding="utf-8")
     path.write_text(applied(mutant, original), encoding="utf-8")
     files = [name for test in SUBJECTS[mutant.subject][1] if (folder / (name := f"tests/test_{test}.py")).exists()]
-    command = [sys.executable, "-m", "pytest", "-x", "-q", "--tb=no", "-p", "no:cacheprovider", *files]
-    begun = time.monotonic()
+    begun, killer, ended = time.monotonic(), None, True
     try:
-        done = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=seconds, check=False,
-                              env=os.environ | {"PYTHONPATH": str(folder / "src")})  # fmt: skip
-        failed = re.search(r"^(?:FAILED|ERROR) (\S+)", done.stdout, re.MULTILINE)
-        killer = None if done.returncode == 0 else failed.group(1) if failed else f"exit {done.returncode}"
-        ended = True
+        for mark in ("not slow", "slow"):
+            command = [sys.executable, "-m", "pytest", "-x", "-q", "--tb=no", "-p", "no:cacheprovider", "-m", mark, *files]
+            done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False,
+                                  timeout=max(1.0, seconds - (time.monotonic() - begun)),
+                                  env=os.environ | {"PYTHONPATH": str(folder / "src")})  # fmt: skip
+            failed = re.search(r"^(?:FAILED|ERROR) (\S+)", done.stdout, re.MULTILINE)
+            if done.returncode not in (0, NO_TESTS):
+                killer = failed.group(1) if failed else f"exit {done.returncode}"
+                break
     except subprocess.TimeoutExpired:
-        killer, ended = None, False
+        ended = False
     finally:
         path.write_text(original, encoding="utf-8")
     return {"killed by": killer, "all run": ended, "seconds": round(time.monotonic() - begun, 1)}
@@ -198,10 +205,14 @@ def main() -> None:
     parser.add_argument("--tests", type=Path, default=ROOT / "tests")
     parser.add_argument("--out", type=Path, default=ROOT / "out" / "mutants.json")
     parser.add_argument("--seconds", type=float, default=180.0, help="for one mutant; then it counts as not noticed")
+    parser.add_argument("--names", type=Path, help="a file with the names of mutants, one a line: run these")
     parser.add_argument("--only", default="", help="mutants whose name contains this")
     parser.add_argument("--list", action="store_true", help="show the mutants, run none")
     given = parser.parse_args()
     mutants = [m for m in sampled(given.count, given.seed) if given.only in m.name]
+    if given.names is not None:
+        asked = given.names.read_text(encoding="utf-8").splitlines()
+        mutants = [m for m in mutants if m.name in asked]
     if given.list:
         print("\n".join(f"{m.subject:16} {m.name}" for m in mutants))
         return

@@ -286,6 +286,7 @@ def test_what_was_fitted_can_be_simulated(fitted, tmp_path):
     assert np.all(columns["quantile_05"] < columns["quantile_95"])
 
 
+@pytest.mark.slow
 def test_several_targets_have_a_folder_each(tmp_path, monkeypatch):
     seen = []
 
@@ -413,6 +414,7 @@ _cli.main()
 # --- compilation cache
 
 
+@pytest.mark.slow
 def test_a_cache_that_cannot_be_written_is_done_without(tmp_path, monkeypatch):
     (tmp_path / "file").write_text("")
     monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(tmp_path / "file" / "cache"))

@@ -259,6 +259,7 @@ def test_single_precision_estimates_the_same():
 
 
 @pytest.mark.parametrize("kind", INPUTS)
+@pytest.mark.slow
 def test_the_linear_task_is_the_tangent(x64, kind):
     """What is left of vector field and output falls with the square of the distance."""
     task, rng = as_arrays(kind(*INPUTS[kind])), np.random.default_rng(0)

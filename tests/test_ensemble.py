@@ -130,6 +130,7 @@ def test_a_stored_summary_is_the_one_in_memory(tmp_path):
     assert str(stored) == str(found)
 
 
+@pytest.mark.slow
 def test_a_run_too_short_for_a_spectrum_has_none():
     found = jm.ensemble(TASK, KEY, seeds=3, reduce=True, **SHORT)
     assert found.spectra == () and found.mean.shape == (101,)
@@ -258,6 +259,7 @@ def test_a_store_holds_what_memory_would(tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == ["runs.zarr"]
 
 
+@pytest.mark.slow
 def test_a_store_of_a_sweep_has_points(tmp_path):
     sweep = jm.Sweep.grid(TASK, k_w=[4e5, 5e5, 6e5])
     for name, seeds in (("few", 2), ("many", 20)):
@@ -642,6 +644,7 @@ def test_memory_does_not_grow_with_the_seeds():
 RUNNER = CliRunner()
 
 
+@pytest.mark.slow
 def test_the_command_writes_resumes_and_refuses(tmp_path):
     path = tmp_path / "runs.zarr"
     arguments = ["ensemble", "zagrodny-slifkin", "--seeds", "10", "--duration", "1", "--out", str(path)]

@@ -415,6 +415,7 @@ def test_lags_and_the_variance_of_a_mean_are_plain_sums(x64, samples):
 
 
 @pytest.mark.parametrize("name", ["zagrodny-slifkin", "zagrodny-hamilton"])
+@pytest.mark.slow
 def test_heavy_forces_on_soft_tissue_have_an_equilibrium_in_single_precision(name):
     """Accelerations of 1e3 m/s² are rounded by more than displacements of 1e-2 m are large."""
     task = jm.load_preset(name).as_task(jm.PrescribedForce)
@@ -452,6 +453,7 @@ class Crossbridge(jm.AbstractMuscle):
         return v_z - (force - (200.0 + u[1]) * (x_z - x_w)) / (5.0 + u[3])
 
 
+@pytest.mark.slow
 def test_one_trace_per_structure(x64):
     looks, settings = Crossbridge.looks, Settings(last_bin=29)
     task, before = jm.Isometric(5.0, 0.002, muscle=Crossbridge(m_w=0.3)), len(Crossbridge.looks)

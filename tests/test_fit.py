@@ -378,6 +378,7 @@ def test_the_measured_variation_fixes_the_scale(x64):
     assert PERTURBATION not in fixed and MECHANICS in fixed
 
 
+@pytest.mark.slow
 def test_stiff_points_get_substeps(x64):
     """c_w / m_w = 4000/s: λ dt = 10 on the grid of the fit, which Heun's method does not survive."""
     setup = setup_of(jm.Isometric().replace(c_w=2000.0), simple_target(), ("c_w", "k_w"))

@@ -216,6 +216,7 @@ def test_a_task_with_an_own_muscle_is_saved_and_read(tmp_path):
         jm.load_preset(tmp_path / "other.toml")
 
 
+@pytest.mark.slow
 def test_activation_and_drive_go_together():
     task = hill.at_activation(jm.Isometric(muscle=HillMuscle(pennation=0.0)), 0.4)
     assert task["activation"] == 0.4 and task["P_w"] == pytest.approx(0.4 * 33.75)

@@ -413,6 +413,7 @@ def test_bad_arguments(targets, options, message):
         jm.fit_joint(targets, **options)
 
 
+@pytest.mark.slow
 def test_priors_and_bounds_by_joint_or_plain_name(x64):
     plan = planned_jointly({"a": A, "b": B}, separate=("c_w",), priors={"c_w": 0.5, "c_w@b": 0.25, "k_w": None},
                            bounds={"c_w@a": (10.0, 200.0)})  # fmt: skip

@@ -34,6 +34,7 @@ def white_powers(count=20_000):
     return scipy.signal.welch(rng.normal(size=(count, samples)), 100.0, nperseg=256)[1][:, 1:31]
 
 
+@pytest.mark.slow
 def test_law_of_welch_bins_is_that_of_scipys_spectra_of_white_noise():
     settings = jm.SpectrumSettings()
     law = welch_law(settings, np.arange(1, 31), (SEGMENTS,))

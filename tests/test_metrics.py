@@ -1,6 +1,5 @@
 """Metrics against their definitions, written a second time and slowly, and against analytic values."""
 
-import antropy
 import jax
 import jax.numpy as jnp
 import jaxtyping
@@ -68,6 +67,8 @@ def test_entropies_are_their_definitions(name, m, tolerance):
 
 @pytest.mark.parametrize("name", RECORDS)
 def test_entropies_are_those_of_antropy(name):
+    import antropy  # takes 7 s: not in every worker
+
     x = RECORDS[name]
     assert approximate_entropy(x) == pytest.approx(antropy.app_entropy(x), abs=1e-10)
     assert sample_entropy(x) == pytest.approx(antropy.sample_entropy(x), abs=1e-10)
@@ -230,6 +231,7 @@ def test_interpolation_finds_a_sine(x64, hertz):
     assert peak.interpolated == pytest.approx(hertz, abs=0.02 * settings.resolution)
 
 
+@pytest.mark.slow
 def test_peaks_need_one_spectrum(user_view):
     for power, message in (
         (np.ones((2, 5)), "mean()"),

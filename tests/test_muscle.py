@@ -78,6 +78,7 @@ def test_contraction_velocity_inverts_passive_force(x64, argument, c_z, v_ref_z)
         np.testing.assert_allclose(muscle.passive_force(x_w, v_w, x_z, v_z, u), force, rtol=1e-9, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_custom_law_is_a_parameter_in_replace_and_simulate(x64):
     muscle = jm.Muscle(stiffness_z=Tendon())
     task = jm.PrescribedForce(2.0, 1.0, muscle=muscle)
@@ -106,6 +107,7 @@ def test_a_custom_law_may_reuse_a_table_name():
     np.testing.assert_allclose(task.muscle.base()[1], 400.0, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_whole_own_muscle_runs_in_every_task():
     class Linear(jm.AbstractMuscle):
         m_w: Scalar = 0.5

@@ -124,6 +124,7 @@ def test_band_limited_transition_is_the_matrix_exponential(x64):
     np.testing.assert_allclose(end, scipy.linalg.expm(drift * dt) @ start, rtol=1e-10)
 
 
+@pytest.mark.slow
 def test_slopes_are_the_derivative_of_values(x64):
     omega = 2 * np.pi * BAND.cutoff
     for dt in (2e-3, 5e-4):
@@ -165,6 +166,7 @@ def test_channels_are_independent_unless_shared(x64, kind):
     assert path(kind(1.0, shared=True)).shape[-1] == 1
 
 
+@pytest.mark.slow
 def test_a_shared_noise_moves_all_coefficients_together(x64):
     def force(shared, channel):
         noise = jm.BandLimitedNoise({channel: 0.1}, shared=shared)
@@ -197,6 +199,7 @@ def test_amplitude_as_number_tuple_and_mapping(x64):
             np.testing.assert_allclose(absolute.noise_scale(), amplitude, rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_relative_noise_is_absolute_noise_of_that_size(x64):
     def force(noise):
         return jm.simulate(jm.Isometric(noise=noise), KEY, duration=1.0).output

@@ -107,8 +107,10 @@ print(json.dumps([sys.prefix, jm.__file__, version, jm.__version__, jm.list_targ
 def test_the_installed_command_fits_a_bundled_target(installed):
     command = installed / "clean" / "bin" / "jaxmuscle"
     assert run(command, "--version", cwd=installed).split() == ["jaxmuscle", jm.__version__]
-    users = {"XDG_CACHE_HOME": str(installed / "cache"), "XLA_FLAGS": ""}  # not the tests' quick compiler
-    printed = run(command, "fit", TARGET, "--starts", "20", "--out", "out", cwd=installed, **users)
+    users = {"XLA_FLAGS": ""}  # not the tests' quick compiler
+    assert "simulate.png" in run(command, "simulate", "zagrodny-slifkin", "--seeds", "2", cwd=installed, **users)
+    assert (installed / "out" / "simulate.png").read_bytes().startswith(b"\x89PNG")
+    printed = run(command, "fit", TARGET, "--starts", "20", "--out", "out", cwd=installed)
     assert max(map(len, printed.splitlines())) <= 80
     assert TARGET in printed and "Written: out/fit.json" in printed
     result = jm.load_result(installed / "out" / "fit.json")

@@ -157,6 +157,7 @@ def test_coming_from_elsewhere():
     assert names["many"].shape == (8, 101) and np.all(np.isfinite(names["solution"].ys))
 
 
+@pytest.mark.slow
 def test_figures_in_given_axes():
     figure = pages.run("docs/reference/figures.md")["figure"]
     assert len(figure.axes) == 5 and len(figure.subfigs) == 1

@@ -96,6 +96,7 @@ def test_the_transition_is_the_exact_one(x64, dt):
 
 
 @pytest.mark.parametrize("dt", [8e-3, 4e-3])
+@pytest.mark.slow
 def test_drawn_paths_have_the_autocovariance(x64, dt):
     """Variance and autocovariance of the drawn paths at dt and dt / 2, from the start."""
     x = unit_paths(PINK, dt, round(4.0 / dt), seeds=512)
@@ -110,6 +111,7 @@ def test_drawn_paths_have_the_autocovariance(x64, dt):
     assert abs(np.mean(x[:, 0] ** 2) - 1) < 3.3 * np.sqrt(2 / x[:, 0].size)
 
 
+@pytest.mark.slow
 def test_paths_have_the_density(x64):
     """Periodograms of drawn paths; a tapered segment's expected power is a quadratic form of the autocovariance."""
     dt, steps, chunk, seeds = 4e-3, 2048, 256, 256
@@ -128,6 +130,7 @@ def test_paths_have_the_density(x64):
     assert np.ptp(seen) < 2 * PINK.deviation() + 3.3 * np.sqrt(2) * np.max(error / expected) + 0.05
 
 
+@pytest.mark.slow
 def test_channels_are_independent_unless_shared(x64):
     x = unit_paths(PINK, 2e-3, 400, seeds=128)
     products = np.stack([(x[..., i] * x[..., j]).mean(axis=1) for i in range(4) for j in range(i)])
@@ -179,6 +182,7 @@ def test_simulations_have_the_expected_spectrum(x64):
     references.assert_standard_normal(z, every=3)
 
 
+@pytest.mark.slow
 def test_linear_trajectories_have_the_expected_spectrum_on_the_grid_of_a_fit(x64):
     runs = jm.ensemble(jm.Isometric(noise=jm.PinkNoise()), KEY, seeds=128, dt=2.5e-3)
     power = np.asarray(runs.beside().spectrum().power)

@@ -293,6 +293,7 @@ def benchmark():
     return module
 
 
+@pytest.mark.slow
 def test_the_calibration_draws_its_muscles_from_the_prior_of_the_fit():
     """The study itself takes hours: `benchmarks/calibration.py`, table in docs/uncertainty.md."""
     study = benchmark()

@@ -7,6 +7,7 @@ import pytest
 import jaxmuscle as jm
 
 
+@pytest.mark.slow
 def test_the_papers_tasks():
     task1 = jm.load_preset("zagrodny-slifkin")
     ax = jm.simulate(task1, jax.random.key(1)).plot()

@@ -1,6 +1,5 @@
 """Recordings: resampling and spectra against scipy, the plateau, what a target gets, what is refused."""
 
-import antropy
 import jax
 import matplotlib.pyplot as plt
 import numpy as np
@@ -132,6 +131,8 @@ def test_no_plateau_is_said(case):
 
 
 def test_summary_against_its_sources():
+    import antropy  # takes 7 s: not in every worker
+
     x, window = noisy(seed=4), (2.0, 18.0)
     part = Recording(x, 2048).steady(window)
     cut, summary = np.ascontiguousarray(by_scipy(x, window)[2]), part.summary()
@@ -254,6 +255,7 @@ def test_refused(case):
     assert message in str(caught.value)
 
 
+@pytest.mark.slow
 def test_figure():
     x, _ = ramp_and_hold()
     figure = Recording(x, 500, name="trial", source="$a_b$").steady().plot()

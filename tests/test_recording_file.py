@@ -387,6 +387,7 @@ def trial(folder):
     return write(folder, text(t, force.round(5), header="time,force (N)"))
 
 
+@pytest.mark.slow
 def test_command(tmp_path):
     path, out = trial(tmp_path), tmp_path / "out"
     done = run(path, "--column", "force", "--window", "4:16", "--out", out, "--save-target", tmp_path / "held.toml")

@@ -67,6 +67,7 @@ def test_variation_of_the_output_is_smallest_near_30_and_largest_at_95_percent(x
     np.testing.assert_allclose(seen / seen.min(), law, rtol=1e-8)
 
 
+@pytest.mark.slow
 def test_simulated_variation_follows_the_law(x64):
     steady, weak, strong = (jm.settled(at_level(jm.Isometric(), level)) for level in (0.3, 0.05, 0.95))
     seen = []
@@ -255,6 +256,7 @@ def test_the_preset_has_the_papers_noise_and_a_smaller_changing_harmonic(hamilto
     assert float(envelope(15.0)) < 0.5 * float(envelope(5.0))
 
 
+@pytest.mark.slow
 def test_the_only_maximum_of_the_expected_force_is_bin_1(x64, hamilton):
     found = jm.peaks(jm.expected_spectrum(hamilton), min_prominence=0.0)
     assert found.maximum.bin == 1 and found.maximum.frequency == 0.390625

@@ -89,6 +89,7 @@ def test_without_noise_the_result_is_scipys_to_second_order(x64, task, reference
         assert 1.85 < references.observed_order([2e-3, 1e-3], column) < 2.2, errors
 
 
+@pytest.mark.slow
 def test_a_stiff_task_gets_sub_steps_and_the_right_answer(x64):
     task = references.quiet(jm.Isometric(5.0, 0.003, harmonic=HARMONIC), c_w=2000.0)  # C_w0 / m_w = 4000/s
     run = jm.simulate(task, KEY, duration=3.0)
@@ -190,6 +191,7 @@ def test_a_seed_is_the_same_whatever_the_batch(task, precision):
                                        atol=1e-6 * np.abs(reference.states).max())  # fmt: skip
 
 
+@pytest.mark.slow
 def test_single_precision_follows_double():
     task = references.quiet(jm.PrescribedForce(5.0, 1.0))
     single = jm.simulate(task, KEY, duration=3.0)
@@ -198,6 +200,7 @@ def test_single_precision_follows_double():
     np.testing.assert_allclose(single.output, double.output, atol=1e-4 * np.abs(double.output).max())
 
 
+@pytest.mark.slow
 def test_other_keys_and_seeds_are_other_noise():
     task = TASKS[2]
     a, b = (jm.simulate(task, jax.random.key(k), duration=2.0).output for k in (0, 1))
@@ -205,6 +208,7 @@ def test_other_keys_and_seeds_are_other_noise():
     assert np.abs(a - b).max() > 1e-3 and np.abs(a - c).max() > 1e-3
 
 
+@pytest.mark.slow
 def test_seed_i_folds_i_into_the_key():
     noise = jm.BandLimitedNoise()
     for i, normals in zip((3, 70), draw(noise, KEY, jnp.array([3, 70]), 10), strict=True):
@@ -263,6 +267,7 @@ def test_averages_are_those_of_a_fine_run(x64):
     np.testing.assert_array_equal(jm.simulate(asked, KEY, duration=1.0).output, mean.output)
 
 
+@pytest.mark.slow
 def test_sampling_and_window():
     run = jm.simulate(jm.Isometric(), KEY, duration=3.0, rate=200.0)
     assert run.output.shape == (601,) and run.states.shape == (601, 2)
@@ -345,6 +350,7 @@ def test_xarray_says_what_it_holds(tmp_path):
     assert single["x_z"].dims == ("time",) and single["x_z"].attrs["units"] == "m" and int(single["seed"]) == 4
 
 
+@pytest.mark.slow
 def test_a_trajectory_is_a_tree():
     run = jm.simulate(jm.Isometric(), KEY, duration=0.5)
     doubled = eqx.tree_at(lambda r: r.output, run, 2 * run.output)

@@ -35,6 +35,7 @@ class Tendon(jm.AbstractMuscle):
 
 
 @pytest.mark.parametrize("argument", ["literal", "elongation"])
+@pytest.mark.slow
 def test_the_papers_laws_are_found(argument):
     task = jm.Isometric(muscle=jm.Muscle(argument=argument)).replace(k_z=3e5, c_w=50.0, x_ref_w=0.01)
     seen = static_characteristics(task, span=0.03, speed=2.0)
@@ -49,6 +50,7 @@ def test_the_papers_laws_are_found(argument):
     np.testing.assert_allclose(seen.F_z, seen.K_z * x, **EXACT)
 
 
+@pytest.mark.slow
 def test_force_at_the_insertion_solves_the_statics():
     seen = static_characteristics(jm.Isometric(), points=41)
     for x, force, P in [*zip(seen.displacement, seen.F_ext, [0.0] * 41, strict=True),
@@ -73,6 +75,7 @@ def test_the_operating_point_is_the_tasks(kind):
     assert middle == pytest.approx(load, abs=2e-3)
 
 
+@pytest.mark.slow
 def test_a_users_muscle_is_seen_through_its_methods():
     seen = static_characteristics(jm.Isometric(muscle=Tendon()), span=0.02)
     x = seen.displacement

@@ -443,6 +443,7 @@ POINTS = st.lists(POINT, max_size=40).map(lambda points: [(5.05, 2.0), *points, 
 
 
 @given(points=POINTS, data=st.data())
+@pytest.mark.slow
 def test_valid_csv_loads_whatever_the_order(points, data, tmp_path_factory):
     path = tmp_path_factory.mktemp("csv") / "points.csv"
     path.write_text(csv_text(*zip(*points, strict=True), header=""))

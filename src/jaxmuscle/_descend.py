@@ -10,7 +10,10 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
-from ._objective import Linear
+from ._expected import Moments
+from ._objective import Coordinates, Linear, at
+from ._parameter import USUALLY_FREE
+from ._task import AbstractTask
 
 SMALL = 1e-3
 STILL = 1e-4
@@ -45,6 +48,17 @@ class Seen(NamedTuple):
         return jax.tree.map(lambda value, slope: value + slope @ (theta - self.theta), self.moments, self.slopes)
 
 
+class _Response(eqx.Module):
+    """What the moments of a linear response depend on, and nothing else, so that a program is used again."""
+
+    model: Linear
+    task: AbstractTask
+    coordinates: Coordinates
+
+    def moments(self, theta: Float[Array, " free"]) -> Moments:
+        return self.model.moments(at(self.task, self.coordinates, theta))
+
+
 @eqx.filter_jit
 def _moments_and_slopes(problem: Any, theta: Float[Array | np.ndarray, "points free"]) -> tuple[Any, Any]:
     def one(theta):
@@ -62,15 +76,31 @@ def _moments_and_slopes(problem: Any, theta: Float[Array | np.ndarray, "points f
 def seen_at(problem: Any, theta: Float[np.ndarray, "points free"]) -> Seen:
     """The problem's moments and their slopes at every θ, as numbers.
 
-    A linear response is computed for `BATCH` points at a time, so that one compiled program serves any number of them; a
-    Monte Carlo simulation for all points together.
+    A linear response is computed for `BATCH` points at a time and with slopes also for what a fit usually leaves free, so
+    that one compiled program serves any number of points and nearly any choice of free parameters; a Monte Carlo
+    simulation for all points together, with the slopes that are asked for.
     """
-    count = len(theta)
-    size = BATCH if isinstance(problem.model, Linear) else count
-    padded = np.concatenate([theta, np.broadcast_to(theta[-1], (-count % size, theta.shape[1]))])
-    batches = np.split(padded, len(padded) // size)
-    parts = [_moments_and_slopes(problem, batch) for batch in batches]
-    return Seen(theta, *jax.tree.map(lambda *x: np.concatenate(x)[:count], *parts))
+    if not isinstance(problem.model, Linear):
+        return Seen(theta, *jax.tree.map(np.asarray, _moments_and_slopes(problem, theta)))
+    count, wide = len(theta), _with_the_usual(problem.coordinates, problem.task)
+    own = np.array([wide.names.index(name) for name in problem.coordinates.names])
+    padded = np.zeros((-(-count // BATCH) * BATCH, len(wide.names)))
+    padded[:, own] = np.concatenate([theta, np.broadcast_to(theta[-1], (len(padded) - count, len(own)))])
+    response = _Response(problem.model, problem.task, wide)
+    parts = [_moments_and_slopes(response, batch) for batch in np.split(padded, len(padded) // BATCH)]
+    moments, slopes = jax.tree.map(lambda *x: np.concatenate(x)[:count], *parts)
+    return Seen(theta, moments, jax.tree.map(lambda slope: slope[..., own], slopes))
+
+
+def _with_the_usual(coordinates: Coordinates, task: AbstractTask) -> Coordinates:
+    """The coordinates and those of what is usually free, in one order whatever is asked for: θ = 0 is the task's value."""
+    known = task.parameter_names
+    names = tuple(dict.fromkeys([*(name for name in USUALLY_FREE if name in known), *coordinates.names]))
+    given = {name: i for i, name in enumerate(coordinates.names)}
+    rows = [(coordinates.centre[given[n]], coordinates.sd[given[n]], coordinates.positive[given[n]]) if n in given
+            else (float(task[n]), 1.0, False) for n in names]  # fmt: skip
+    centre, sd, positive = (np.array(column) for column in zip(*rows, strict=True))
+    return Coordinates(names, centre, sd, positive, np.full(len(names), -np.inf), np.full(len(names), np.inf))
 
 
 def _residuals(s: Float[Array, " free"], given: tuple[Any, Any, Seen]) -> tuple[Float[Array, " residuals"], None]:

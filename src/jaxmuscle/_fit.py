@@ -13,7 +13,7 @@ from ._expected import check_line
 from ._linear import has_response
 from ._noise import AbstractNoise, BandLimitedNoise, OrnsteinUhlenbeckNoise, WhiteNoise
 from ._objective import Coordinates
-from ._parameter import CHANNELS, DEFAULT_FREE, PARAMETERS, as_numbers
+from ._parameter import CHANNELS, PARAMETERS, USUALLY_FREE, as_numbers
 from ._pink import PinkNoise
 from ._problem import Setup
 from ._result import FitResult
@@ -172,8 +172,7 @@ def free_names(task: AbstractTask, free: Iterable[str] | None, fix: Mapping[str,
     """The parameters to fit, checked against the task, the fixed ones and the number of bins."""
     known = task.parameter_names
     if free is None:
-        wanted = [*DEFAULT_FREE, "noise_correlation_time"]
-        names = [n for n in wanted if n in known and n not in fix and float(task[n]) > 0]
+        names = [n for n in USUALLY_FREE if n in known and n not in fix and float(task[n]) > 0]
     else:
         names = list(dict.fromkeys(free))
         _check_names("free", names, known)
