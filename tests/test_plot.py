@@ -141,7 +141,7 @@ def test_the_band_covers_the_true_spectrum_as_often_as_one_standard_deviation_do
     aim = load_target("vastus-lateralis-26mvc")
     nu, draws = aim.degrees_of_freedom, 4000
     factor = np.random.default_rng(2).chisquare(nu, draws) / nu
-    low, high = (edge[0] / aim.proportional_power[0] for edge in plot.sampling_band(aim))
+    low, high = (edge[0] / aim.proportional_power[0] for edge in aim.sampling_band())
     covered = np.mean((factor * low < 1) & (factor * high > 1))
     # A normal law has 0.683 in this range, log χ² with 23 degrees of freedom within 0.01 of it.
     assert covered == pytest.approx(0.683, abs=0.01 + 4 * np.sqrt(0.22 / draws))
@@ -163,7 +163,7 @@ def test_target_with_sigma_has_its_band_and_says_that_it_is_assumed():
 def test_target_of_unknown_spread_has_no_band():
     aim = Target("a" * 60, np.ones(30))
     ax = plot.target(aim)
-    assert plot.sampling_band(aim) is None and not ax.collections
+    assert aim.sampling_band() is None and not ax.collections
     assert len(ax.lines[0].get_label()) < 60
 
 

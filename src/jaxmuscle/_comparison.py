@@ -3,7 +3,7 @@
 import json
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, TypeVar
 
 import equinox as eqx
 import numpy as np
@@ -50,6 +50,8 @@ class ComparedModel(eqx.Module):
     chi2_per_bin: float
     success: bool
     scores: Float[np.ndarray, " bins"] | None
+
+    needed: ClassVar[float] = NEEDED
 
     @property
     def evidence(self) -> "Evidence":

@@ -82,8 +82,9 @@ def progress(title: str) -> Iterator[Any]:
     """A progress bar on a terminal, nothing elsewhere."""
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
+    screen = Console(stderr=True)
     columns = (TextColumn("{task.fields[title]}"), BarColumn(), TextColumn("{task.description}"), TimeElapsedColumn())
-    with Progress(*columns, console=err, transient=True, disable=not err.is_terminal) as bar:
+    with Progress(*columns, console=screen, transient=True, disable=not screen.is_terminal) as bar:
         row = bar.add_task("starting", total=1.0, title=title)
         yield lambda text, share: bar.update(row, description=text, completed=share)
 

@@ -2,7 +2,7 @@
 
 import textwrap
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import equinox as eqx
 import numpy as np
@@ -107,6 +107,19 @@ class IdentifiabilityReport(eqx.Module):
         """Pairs that determine more quantities than each of their two designs does, or any other, best first."""
         most = max((len(design.gained) for design in self.designs), default=0)
         return tuple(pair for pair in self.pairs if len(pair.gained) > most)
+
+    together: ClassVar[str] = TOGETHER
+    threshold: ClassVar[float] = DETERMINED
+
+    @staticmethod
+    def letter(number: int) -> str:
+        """What tables and figures call the design of that number: A, B, …"""
+        return letter(number)
+
+    @property
+    def told(self) -> list[str]:
+        """Names of the quantities that tables and figures show."""
+        return told(self.present.quantities)
 
     def to_dict(self) -> dict[str, Any]:
         """As nested tables of numbers and strings."""

@@ -7,7 +7,6 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure, SubFigure
 
-from ._comparison import NEEDED
 from ._style import BLACK, GREY, PALETTE, canvas, styled
 from .plot import target
 
@@ -54,7 +53,7 @@ def _spectra(ax: Axes, comparison: Any, colours: dict[str, str]) -> None:
 
 def _criterion(ax: Axes, rows: list[Any], colours: dict[str, str]) -> None:
     """AIC above the lowest; filled with a harmonic, open without."""
-    ax.axvspan(0, NEEDED, color="0.92", lw=0, zorder=0)
+    ax.axvspan(0, rows[0].needed, color="0.92", lw=0, zorder=0)
     for i, row in enumerate(rows):
         ax.plot(row.delta_aic, i, "o", color=colours[row.noise], mfc=_face(row, colours), **MARK)
     if len({row.harmonic for row in rows}) > 1:
@@ -68,7 +67,7 @@ def _criterion(ax: Axes, rows: list[Any], colours: dict[str, str]) -> None:
 
 
 def _span(rows: list[Any]) -> float:
-    return max(1.6 * NEEDED, 1.1 * max((row.delta_aic for row in rows if np.isfinite(row.delta_aic)), default=0.0))
+    return max(1.6 * rows[0].needed, 1.1 * max((row.delta_aic for row in rows if np.isfinite(row.delta_aic)), default=0.0))
 
 
 def _scores(ax: Axes, rows: list[Any], colours: dict[str, str]) -> None:

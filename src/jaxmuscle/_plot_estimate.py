@@ -1,14 +1,15 @@
 """The figure of a mean spectrum with its standard error."""
 
+from typing import Any
+
 import numpy as np
 from matplotlib.axes import Axes
 
-from ._estimate import SpectrumEstimate
 from ._style import BLUE, GREY, PROPORTIONAL, axes_or_new, frequency_axis, legend, styled
 
 
 @styled
-def draw(estimate: SpectrumEstimate, ax: Axes | None, log: bool) -> Axes:
+def draw(estimate: Any, ax: Axes | None, log: bool) -> Axes:
     """Mean with control variate over the mean without, each ± 2 SE."""
     ax = axes_or_new(ax)
     frequency, whole = np.asarray(estimate.frequency), float(np.sum(estimate.power))

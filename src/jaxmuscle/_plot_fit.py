@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure, SubFigure
 
 from ._style import BLACK, BLUE, GREY, ORANGE, VERMILLION, canvas, legend, output_label, styled
-from .plot import sampling_band, target
+from .plot import target
 
 WIDTH, LINE, FONT = 7.5, 0.165, 7.5  # inches, inches, points
 TABLE = (0.55, 0.565, 0.83)  # where values end, errors begin, units begin
@@ -136,7 +136,7 @@ def _spectra(ax: Axes, result: Any, *, log: bool) -> None:
 
 
 def _log_limits(ax: Axes, result: Any, fitted: Any) -> None:
-    band = sampling_band(result.target)
+    band = result.target.sampling_band()
     seen = np.concatenate([result.target.proportional_power, fitted, *(band or ())])
     seen = seen[np.isfinite(seen) & (seen > 0)]
     ax.set_ylim(seen.min() / 1.4, seen.max() * 1.4)

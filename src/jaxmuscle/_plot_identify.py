@@ -8,9 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure, SubFigure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
-from ._identify_report import TOGETHER, Outlook, letter, told
 from ._style import BLACK, BLUE, GREY, VERMILLION, canvas, styled
-from ._uncertainty import DETERMINED
 
 WIDTH, ROW = 7.5, 0.21  # inches
 LEAST, EDGE = 1e-2, 5e-3
@@ -21,17 +19,17 @@ PAIRS = 3
 @styled
 def figure(report: Any, ax: Axes | None = None) -> Figure | SubFigure:
     """Above, singular values of the present data and with each design; below, the error of every quantity."""
-    letters = {d.name: letter(i) for i, d in enumerate(report.designs)}
+    letters = {d.name: report.letter(i) for i, d in enumerate(report.designs)}
     shown = [report.present, *(d for d in report.designs if d.failed is None), *report.telling_pairs[:PAIRS]]
-    marks = ["now", *(" + ".join(letters[name] for name in o.name.split(TOGETHER)) for o in shown[1:])]
-    names = told(report.present.quantities)
+    marks = ["now", *(" + ".join(letters[name] for name in o.name.split(report.together)) for o in shown[1:])]
+    names = report.told
     rows = [_label(mark, o.name) for mark, o in zip(marks, shown, strict=True)]
     lines = sum(row.count("\n") + 1.35 for row in rows)
     heights = [0.15 * lines + 0.2, ROW * len(names) + 0.1]
     fig = canvas(ax, (WIDTH, sum(heights) + 1.6), h_pad=0.08)
     upper, lower = fig.subplots(2, 1, height_ratios=heights)
     fig.suptitle(f"{report.target}: what the data determine, and what more would", x=0.01, ha="left", weight="bold", size=10)
-    _singular_values(upper, shown, rows)
+    _singular_values(upper, shown, rows, report.threshold)
     _matrix(lower, shown, marks, names)
     return fig
 
@@ -42,14 +40,14 @@ def _label(mark: str, name: str) -> str:
     return "\n".join(textwrap.wrap(f"{mark}: {name}", WRAP, break_long_words=False))
 
 
-def _singular_values(ax: Axes, shown: list[Outlook], labels: list[str]) -> None:
+def _singular_values(ax: Axes, shown: list[Any], labels: list[str], threshold: float) -> None:
     """One row for each design: filled where determined; what is smaller than the axis is counted at its edge."""
     largest = max(float(o.singular_values.max()) for o in shown)
-    ax.axvspan(EDGE, DETERMINED, color="0.94", lw=0, zorder=0)
-    ax.axvline(DETERMINED, color=GREY, lw=0.8, zorder=1)
+    ax.axvspan(EDGE, threshold, color="0.94", lw=0, zorder=0)
+    ax.axvline(threshold, color=GREY, lw=0.8, zorder=1)
     for row, outlook in enumerate(shown):
         size = outlook.singular_values
-        known, tiny = size >= DETERMINED, size < LEAST
+        known, tiny = size >= threshold, size < LEAST
         ax.axhline(row, color="0.85", lw=0.5, zorder=0)
         ax.scatter(size[known], np.full(known.sum(), row), s=26, color=BLUE, zorder=3)
         some = ~known & ~tiny
@@ -59,18 +57,18 @@ def _singular_values(ax: Axes, shown: list[Outlook], labels: list[str]) -> None:
             ax.text(EDGE * 1.1, row, f"◂ {tiny.sum()}", color=VERMILLION, **style)
         ax.text(1.01, row, f"{known.sum()} of {len(size)}", transform=ax.get_yaxis_transform(), va="center", size=7.5)
     ax.set_xscale("log")
-    ax.set(xlim=(EDGE, max(largest, DETERMINED) * 1.6), ylim=(len(shown) - 0.4, -0.6))
+    ax.set(xlim=(EDGE, max(largest, threshold) * 1.6), ylim=(len(shown) - 0.4, -0.6))
     ax.set_yticks(range(len(shown)), labels)
     ax.tick_params(axis="y", length=0)
     ax.xaxis.set_major_locator(LogLocator())
     ax.xaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:g}"))
     ax.xaxis.set_minor_formatter(NullFormatter())
     ax.set_xlabel("Singular value (per prior standard deviation)")
-    ax.set_title(f"Directions of the parameters: determined from {DETERMINED:g} on")
+    ax.set_title(f"Directions of the parameters: determined from {threshold:g} on")
     ax.spines["left"].set_visible(False)
 
 
-def _matrix(ax: Axes, shown: list[Outlook], marks: list[str], names: list[str]) -> None:
+def _matrix(ax: Axes, shown: list[Any], marks: list[str], names: list[str]) -> None:
     """Colour: share of the prior's standard deviation that is left. Number: standard error; bold: determined."""
     left = np.array([[o.quantities[name].left for o in shown] for name in names])
     mesh = ax.imshow(np.minimum(left, 1.0), cmap="Blues_r", vmin=-0.35, vmax=1.0, aspect="auto")

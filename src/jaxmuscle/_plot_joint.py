@@ -9,7 +9,7 @@ from matplotlib.figure import Figure, SubFigure
 
 from ._plot_fit import quantity
 from ._style import BLACK, BLUE, GREY, ORANGE, VERMILLION, canvas, legend, styled
-from .plot import sampling_band, target
+from .plot import target
 
 WIDTH, PANEL, LINE, FONT = 8.5, 2.1, 0.165, 7.5  # inches, inches, inches, points
 WRAP = 126
@@ -84,7 +84,7 @@ def _spectrum(ax: Axes, name: str, part: Any) -> None:
         near = held | np.roll(held, 1) | np.roll(held, -1)
         ax.fill_between(frequency, fitted - np.minimum(line, 0.999 * fitted), fitted, where=near, color=ORANGE, alpha=0.6,
                         lw=0, label="harmonic", zorder=2)  # fmt: skip
-    edges = np.concatenate([part.target.proportional_power, fitted, *(sampling_band(part.target) or ())])
+    edges = np.concatenate([part.target.proportional_power, fitted, *(part.target.sampling_band() or ())])
     edges = edges[np.isfinite(edges) & (edges > 0)]
     ax.set(ylim=(edges.min() / 1.4, edges.max() * 1.4), xlim=(frequency[frequency > 0][0] / 1.15, frequency[-1] * 1.15))
     ax.set_title(f"{name}: {type(part.task).__name__}", parse_math=False)

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 
-from ._posterior import NotMixedError, Posterior
+from ._posterior import NotMixedError
 from ._style import BLUE, ORANGE, PALETTE, PROPORTIONAL, SKY, VERMILLION, axes_or_new, canvas, styled
 
 ORDER = ("corner_frequency", "harmonic_frequency", "harmonic_share", "high_frequency_floor", "coefficient_of_variation")
@@ -15,7 +15,7 @@ BANDS = ((0.025, 0.975, 0.18), (0.25, 0.75, 0.35))
 MASS = (0.95, 0.8, 0.5)
 
 
-def chosen(found: Posterior) -> list[str]:
+def chosen(found: Any) -> list[str]:
     """What a corner figure shows: the quantities that the data determine, and the harmonic's frequency."""
     names = [n for n in ORDER if n in found.quantities and (n in found.determined or n == "harmonic_frequency")]
     more = [n for n in found.quantities if n in found.determined and n not in names]
@@ -23,7 +23,7 @@ def chosen(found: Posterior) -> list[str]:
 
 
 @styled
-def corner(found: Posterior, ax: Axes | None = None) -> Any:
+def corner(found: Any, ax: Axes | None = None) -> Any:
     """Densities of the determined quantities and of each pair (50, 80 and 95 % regions)."""
     if not found.success:
         raise NotMixedError(f"{found.target.name}: {found.message}")
@@ -60,7 +60,7 @@ def corner(found: Posterior, ax: Axes | None = None) -> Any:
     return fig
 
 
-def _label(found: Posterior, name: str) -> str:
+def _label(found: Any, name: str) -> str:
     words = name.replace("_", " ")
     words = words if len(words) < 15 else words.replace(" ", "\n", 1)
     return words + ("" if found.unit(name) == "1" else f" ({found.unit(name)})")
@@ -91,7 +91,7 @@ def _pair(ax: Axes, x: np.ndarray, y: np.ndarray, wide: np.ndarray, high: np.nda
 
 
 @styled
-def predictive(found: Posterior, ax: Axes | None = None) -> Axes:
+def predictive(found: Any, ax: Axes | None = None) -> Axes:
     """The target among spectra that the posterior predicts: 50 and 95 % of them, and of the model itself."""
     if not found.success:
         raise NotMixedError(f"{found.target.name}: {found.message}")
@@ -112,7 +112,7 @@ def predictive(found: Posterior, ax: Axes | None = None) -> Axes:
 
 
 @styled
-def traces(found: Posterior, ax: Axes | None = None) -> Any:
+def traces(found: Any, ax: Axes | None = None) -> Any:
     """Every chain's draws of what the data determine; also of chains that did not mix."""
     names = chosen(found) or list(found.samples)[:MOST]
     fig = canvas(ax, (6.5, 1.1 * len(names) + 0.5))

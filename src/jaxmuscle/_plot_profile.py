@@ -1,16 +1,17 @@
 """The figure of a profile likelihood."""
 
+from typing import Any
+
 import numpy as np
 from matplotlib.axes import Axes
 
-from ._profile import Profile
 from ._style import BLUE, GREY, ORANGE, axes_or_new, log_axis, styled
 
 SHOWN = 3.0  # times the threshold
 
 
 @styled
-def draw(found: Profile, ax: Axes | None = None) -> Axes:
+def draw(found: Any, ax: Axes | None = None) -> Axes:
     """Rise of -2 ln L, the bound of the interval, the interval, and the parabola by the curvature."""
     ax = axes_or_new(ax)
     ax.plot(found.values, found.rise, color=BLUE, marker="o", ms=2.5, lw=1.2, label="profile")

@@ -7,13 +7,11 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure, SubFigure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
-from ._spectrum import Spectrum, SpectrumSettings
 from ._style import BLACK, BLUE, GREY, ORANGE, SKY, canvas, legend, styled
-from .plot import sampling_band
 
 
 @styled
-def figure(recording: Any, settings: SpectrumSettings | None = None, ax: Axes | None = None) -> Figure | SubFigure:
+def figure(recording: Any, settings: Any = None, ax: Axes | None = None) -> Figure | SubFigure:
     """Trace with the window, the window enlarged, and power (Welch with its error, FFT), linear and logarithmic."""
     fig = canvas(ax, (9.0, 5.6))
     axes = fig.subplots(2, 2)
@@ -21,7 +19,7 @@ def figure(recording: Any, settings: SpectrumSettings | None = None, ax: Axes | 
     _window(axes[0, 1], recording, settings)
     welch, fft = recording.spectrum(settings), recording.fft_spectrum(settings)
     target = recording.target("welch", quantity="force", settings=settings)
-    band = [edge * np.sum(welch.power) for edge in sampling_band(target) or ()]
+    band = [edge * np.sum(welch.power) for edge in target.sampling_band() or ()]
     for panel, log in ((axes[1, 0], False), (axes[1, 1], True)):
         _spectra(panel, welch, fft, band, log)
     words = f"{recording.segments(settings)} Welch segments"
@@ -40,7 +38,7 @@ def _trace(ax: Axes, recording: Any) -> None:
     ax.set_title("Whole recording")
 
 
-def _window(ax: Axes, recording: Any, settings: SpectrumSettings | None) -> None:
+def _window(ax: Axes, recording: Any, settings: Any) -> None:
     x, time = recording.filtered(settings), recording.time
     ax.plot(time, recording.samples, color=SKY, lw=0.5, label="as recorded")
     ax.plot(time[0] + np.arange(x.size) / (x.size / recording.duration), x, color=BLUE, lw=0.9, label="filtered")
@@ -51,7 +49,7 @@ def _window(ax: Axes, recording: Any, settings: SpectrumSettings | None) -> None
     legend(ax, "above")
 
 
-def _spectra(ax: Axes, welch: Spectrum, fft: Spectrum, band: list[Any], log: bool) -> None:
+def _spectra(ax: Axes, welch: Any, fft: Any, band: list[Any], log: bool) -> None:
     f, power = np.asarray(welch.frequency), np.asarray(welch.power)
     shown = slice(None) if not log else f > 0
     ax.plot(fft.frequency, fft.power, color=GREY, lw=0.6, alpha=0.8, label="FFT of the window", zorder=2)

@@ -1,16 +1,17 @@
 """The figure of a sensitivity."""
 
+from typing import Any
+
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import SymLogNorm
 
-from ._sensitivity import Sensitivity
 from ._style import styled
 
 
 @styled
-def draw(sensitivity: Sensitivity, ax: Axes | None = None) -> Axes:
+def draw(sensitivity: Any, ax: Axes | None = None) -> Axes:
     """A heat map of the parameters that do something."""
     table = np.asarray(sensitivity.proportional)
     shown = np.flatnonzero(np.max(np.abs(table), axis=1) > 1e-6)

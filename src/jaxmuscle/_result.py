@@ -13,7 +13,7 @@ from ._bundled import choices
 from ._preset import task_from_table, task_to_table
 from ._store import write_json
 from ._target import Target
-from ._task import AbstractTask
+from ._task import TASKS, AbstractTask
 from ._words import folded
 
 if TYPE_CHECKING:
@@ -211,8 +211,6 @@ def _to_json(result: FitResult) -> dict[str, Any]:
 
 
 def _task_name(task: AbstractTask) -> str:
-    from ._task import TASKS
-
     return next((name for name, kind in TASKS.items() if isinstance(task, kind)), type(task).__name__)
 
 

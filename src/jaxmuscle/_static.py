@@ -135,7 +135,7 @@ def _held_force(muscle: AbstractMuscle, x_z: Array, P_w: Array) -> Array:
     return held.output(jnp.zeros(()), equilibrium(held), jnp.zeros(4), jnp.zeros(4))
 
 
-def _draw(curves: StaticCharacteristics, ax: "Sequence[Axes] | None") -> "tuple[Axes, Axes, Axes]":
+def _draw(curves: Any, ax: "Sequence[Axes] | None") -> "tuple[Axes, Axes, Axes]":
     import matplotlib.pyplot as plt
 
     from ._style import styled
@@ -151,7 +151,7 @@ def _draw(curves: StaticCharacteristics, ax: "Sequence[Axes] | None") -> "tuple[
     return styled(panels)()
 
 
-def _coefficients(curves: StaticCharacteristics, stiffness: "Axes", damping: "Axes") -> None:
+def _coefficients(curves: Any, stiffness: "Axes", damping: "Axes") -> None:
     from ._style import BLUE, VERMILLION
 
     x = 1e3 * curves.displacement
@@ -169,7 +169,7 @@ def _coefficients(curves: StaticCharacteristics, stiffness: "Axes", damping: "Ax
     _finish(damping, "Velocity (m/s)", "Damping (N s/m)", room=0.35)
 
 
-def _forces(curves: StaticCharacteristics, ax: "Axes") -> None:
+def _forces(curves: Any, ax: "Axes") -> None:
     from ._style import BLUE, GREEN, GREY, VERMILLION
 
     x = 1e3 * curves.displacement

@@ -118,6 +118,19 @@ class Target(eqx.Module):
                 temporary.unlink()
             raise TargetError(f"{path}: cannot be written: {error.strerror}") from None
 
+    def sampling_band(self) -> tuple[Float[np.ndarray, " bins"], Float[np.ndarray, " bins"]] | None:
+        """Lower and upper edge of p_k exp(-bias ± sd), where the expected spectrum lies within one standard deviation.
+
+        `None` if nothing is known about the sampling error.
+        """
+        from ._uncertainty import bin_statistics
+
+        statistics = bin_statistics(self)
+        if not statistics.known:
+            return None
+        centre = self.proportional_power * np.exp(-statistics.bias)
+        return centre * np.exp(-statistics.sd), centre * np.exp(statistics.sd)
+
     def to_table(self) -> dict[str, Any]:
         """The target as the table that a TOML file holds."""
         sigma = None if self.sigma is None else self.sigma.tolist()

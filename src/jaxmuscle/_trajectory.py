@@ -4,7 +4,7 @@ import functools
 import json
 from collections.abc import Iterable
 from importlib.metadata import version
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -39,6 +39,8 @@ class Trajectory(eqx.Module):
     substeps: int = eqx.field(static=True)
     sampling: str = eqx.field(static=True)
     linear: Float[Array | np.ndarray, "*seeds samples"] | None = None
+
+    analysed: ClassVar[tuple[float, float]] = WINDOW
 
     @property
     def time(self) -> Float[np.ndarray, " samples"]:

@@ -59,7 +59,7 @@ def bin_correlation(
     return (total / total[0])[distance]
 
 
-def bin_statistics(target: Target, line_share: Float[np.ndarray, " bins"] | None = None) -> BinStatistics:
+def bin_statistics(target: Any, line_share: Float[np.ndarray, " bins"] | None = None) -> BinStatistics:
     """Statistics of a target's log powers: from its segments, else from its sigma, else unknown (sd 1).
 
     A harmonic line that holds the share ρ of a bin does not scatter: bias and variance fall by 1 - ρ².
@@ -83,7 +83,7 @@ def samples_of(segments: int, settings: SpectrumSettings) -> int:
     return min(settings.length - settings.step // 2 + segments * settings.step, LONGEST)
 
 
-def trial_samples(target: Target) -> int:
+def trial_samples(target: Any) -> int:
     """Samples of a trial of a target, the average of several; of 10 s where it states no segments."""
     if target.segments is None:
         return samples_in(WINDOW, target.settings)

@@ -4,16 +4,13 @@ What has one pair of axes draws into `ax` or a new figure and returns the axes. 
 grid that they take) returns the figure, or the part of yours.
 """
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Real
+from jaxtyping import Real
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure, SubFigure
 
-from ._estimate import SpectrumEstimate
-from ._sensitivity import Sensitivity
-from ._spectrum import Spectrum, SpectrumSettings
 from ._style import (
     BLACK,
     PROPORTIONAL,
@@ -33,21 +30,6 @@ from ._style import PURPLE as PURPLE
 from ._style import SKY as SKY
 from ._style import STYLE as STYLE
 from ._style import VERMILLION as VERMILLION
-from ._target import Target
-from ._trajectory import WINDOW, Trajectory
-from ._uncertainty import bin_statistics
-
-if TYPE_CHECKING:
-    from ._bootstrap import Bootstrap
-    from ._cohort import CohortResult
-    from ._comparison import Comparison
-    from ._goodness import Goodness
-    from ._identify_report import IdentifiabilityReport
-    from ._joint_result import JointResult
-    from ._posterior import Posterior
-    from ._profile import Profile
-    from ._recording import Recording
-    from ._static import StaticCharacteristics
 
 QUANTILES = (0.05, 0.95)
 _MODEL = "jaxmuscle-model"
@@ -55,7 +37,7 @@ _MODEL = "jaxmuscle-model"
 
 @styled
 def spectrum(
-    spectrum: Spectrum, ax: Axes | None = None, *, log: bool = False, proportional: bool = True, label: str | None = None
+    spectrum: Any, ax: Axes | None = None, *, log: bool = False, proportional: bool = True, label: str | None = None
 ) -> Axes:
     """Draws power over frequency; of several seeds the mean and the band that holds 90 % of them.
 
@@ -81,7 +63,7 @@ def spectrum(
     return ax
 
 
-def estimate(estimate: SpectrumEstimate, ax: Axes | None = None, *, log: bool = False) -> Axes:
+def estimate(estimate: Any, ax: Axes | None = None, *, log: bool = False) -> Axes:
     """Draws the proportional power of a `SpectrumEstimate`, with two standard errors either way, and without control.
 
     **Arguments:** `estimate`; `ax`, or a new figure; `log`, both axes logarithmic. **Returns:** the axes.
@@ -92,7 +74,7 @@ def estimate(estimate: SpectrumEstimate, ax: Axes | None = None, *, log: bool = 
 
 
 @styled
-def target(target: Target, ax: Axes | None = None, *, log: bool = False) -> Axes:
+def target(target: Any, ax: Axes | None = None, *, log: bool = False) -> Axes:
     """Draws a target's proportional power with the band of its sampling error.
 
     The band is where an expected spectrum lies at most one standard deviation from the target in log power:
@@ -104,7 +86,7 @@ def target(target: Target, ax: Axes | None = None, *, log: bool = False) -> Axes
     **Returns:** the axes.
     """
     ax = axes_or_new(ax)
-    frequency, power, band = target.frequency, target.proportional_power, sampling_band(target)
+    frequency, power, band = target.frequency, target.proportional_power, target.sampling_band()
     shown = slice(None) if not log else frequency > 0
     if band is not None:
         low, high = band
@@ -123,7 +105,7 @@ def target(target: Target, ax: Axes | None = None, *, log: bool = False) -> Axes
 
 @styled
 def trajectory(
-    trajectory: Trajectory, ax: Axes | None = None, *, window: tuple[float, float] | None = None, lines: int = 3
+    trajectory: Any, ax: Axes | None = None, *, window: tuple[float, float] | None = None, lines: int = 3
 ) -> Axes:
     """Draws the output over time; of an ensemble the mean, the band that holds 90 % of the seeds and a few of them.
 
@@ -175,7 +157,7 @@ def fit(result: Any, ax: Axes | None = None) -> Figure | SubFigure:
 
 
 @styled
-def simulation(runs: Trajectory, ax: Axes | None = None) -> Figure | SubFigure:
+def simulation(runs: Any, ax: Axes | None = None) -> Figure | SubFigure:
     """Draws a simulation: the whole output over time, its analysed window, and the spectrum, linear and logarithmic.
 
     **Arguments:** `runs`, one seed or an ensemble; `ax`, its place. **Returns:** the figure.
@@ -184,7 +166,7 @@ def simulation(runs: Trajectory, ax: Axes | None = None) -> Figure | SubFigure:
     axes = figure.subplots(2, 2)
     task = runs.task
     trajectory(runs, axes[0, 0])
-    trajectory(runs, axes[0, 1], window=WINDOW)
+    trajectory(runs, axes[0, 1], window=runs.analysed)
     spectra = runs.spectrum()
     spectrum(spectra, axes[1, 0])
     spectrum(spectra, axes[1, 1], log=True)
@@ -199,15 +181,6 @@ def simulation(runs: Trajectory, ax: Axes | None = None) -> Figure | SubFigure:
         f"{type(task).__name__}, {type(task.noise).__name__}, {count} seed{'s' * (count > 1)}", x=0.01, ha="left"
     )
     return figure
-
-
-def sampling_band(target: Target) -> tuple[Float[np.ndarray, " bins"], Float[np.ndarray, " bins"]] | None:
-    """Lower and upper edge of the band of `target`; `None` if nothing is known about the sampling error."""
-    statistics = bin_statistics(target)
-    if not statistics.known:
-        return None
-    centre = target.proportional_power * np.exp(-statistics.bias)
-    return centre * np.exp(-statistics.sd), centre * np.exp(statistics.sd)
 
 
 def _finite(rows: Real[np.ndarray, "seeds values"]) -> tuple[Real[np.ndarray, "finite values"], str]:
@@ -235,7 +208,7 @@ def _mean_and_band(
     return colour
 
 
-def sensitivity(sensitivity: Sensitivity, ax: Axes | None = None) -> Axes:
+def sensitivity(sensitivity: Any, ax: Axes | None = None) -> Axes:
     """Draws how proportional power answers to the parameters as a heat map, parameters that do nothing left out.
 
     **Arguments:** `sensitivity`; `ax`, or a new figure high enough for the parameters. **Returns:** the axes.
@@ -245,14 +218,14 @@ def sensitivity(sensitivity: Sensitivity, ax: Axes | None = None) -> Axes:
     return draw(sensitivity, ax)
 
 
-def profile(profile: "Profile", ax: Axes | None = None) -> Axes:
+def profile(profile: Any, ax: Axes | None = None) -> Axes:
     """Draws a profile likelihood with its interval and the parabola of the curvature. Returns the axes (`ax` or new)."""
     from ._plot_profile import draw
 
     return draw(profile, ax)
 
 
-def posterior(found: "Posterior", ax: Axes | None = None) -> Figure | SubFigure:
+def posterior(found: Any, ax: Axes | None = None) -> Figure | SubFigure:
     """Draws the posterior `found` of what the data determine: densities, and 50, 80 and 95 % regions of pairs.
 
     **Raises:** `NotMixedError` if the chains did not mix; `ValueError` if the data determine nothing.
@@ -262,42 +235,42 @@ def posterior(found: "Posterior", ax: Axes | None = None) -> Figure | SubFigure:
     return corner(found, ax)
 
 
-def chains(found: "Posterior", ax: Axes | None = None) -> Figure | SubFigure:
+def chains(found: Any, ax: Axes | None = None) -> Figure | SubFigure:
     """Draws every chain of the posterior `found` over its draws, also of chains that did not mix."""
     from ._plot_posterior import traces
 
     return traces(found, ax)
 
 
-def predictive(found: "Posterior", ax: Axes | None = None) -> Axes:
+def predictive(found: Any, ax: Axes | None = None) -> Axes:
     """Draws the target among spectra that the posterior `found` predicts. **Raises:** `NotMixedError`."""
     from ._plot_posterior import predictive
 
     return predictive(found, ax)
 
 
-def comparison(comparison: "Comparison", ax: Axes | None = None) -> Figure | SubFigure:
+def comparison(comparison: Any, ax: Axes | None = None) -> Figure | SubFigure:
     """Draws the best fit of each noise, AIC and held-out score of every model, and says whether they can be told apart."""
     from ._plot_compare import figure
 
     return figure(comparison, ax)
 
 
-def identifiability(report: "IdentifiabilityReport", ax: Axes | None = None) -> Figure | SubFigure:
+def identifiability(report: Any, ax: Axes | None = None) -> Figure | SubFigure:
     """Draws singular values and standard errors, now and with each further measurement."""
     from ._plot_identify import figure
 
     return figure(report, ax)
 
 
-def goodness(found: "Goodness", ax: Axes | None = None) -> Figure | SubFigure:
+def goodness(found: Any, ax: Axes | None = None) -> Figure | SubFigure:
     """Draws residuals with what is usual in each bin, and the three checks with their reference distributions."""
     from ._plot_bootstrap import goodness_figure
 
     return goodness_figure(found, ax)
 
 
-def bootstrap(found: "Bootstrap", ax: Axes | None = None) -> Figure | SubFigure:
+def bootstrap(found: Any, ax: Axes | None = None) -> Figure | SubFigure:
     """Draws the refits of every quantity, the value they were made from and the interval that the fit states.
 
     **Raises:** `ValueError` if fewer than two refits succeeded.
@@ -307,14 +280,14 @@ def bootstrap(found: "Bootstrap", ax: Axes | None = None) -> Figure | SubFigure:
     return bootstrap_figure(found, ax)
 
 
-def joint(result: "JointResult", ax: Axes | None = None) -> Figure | SubFigure:
+def joint(result: Any, ax: Axes | None = None) -> Figure | SubFigure:
     """Draws a joint fit: spectrum, fit and residuals of each target, and what they determine together."""
     from ._plot_joint import figure
 
     return figure(result, ax)
 
 
-def cohort(cohort: "CohortResult", by: str = "person", ax: Axes | None = None) -> Figure | SubFigure:
+def cohort(cohort: Any, by: str = "person", ax: Axes | None = None) -> Figure | SubFigure:
     """Draws what at least half of the targets determine, `by` "person", "group" or "level" (fraction of MVC).
 
     **Raises:** `ValueError` for another `by`, and if there is nothing to draw.
@@ -324,16 +297,14 @@ def cohort(cohort: "CohortResult", by: str = "person", ax: Axes | None = None) -
     return figure(cohort, by, ax)
 
 
-def recording(
-    recording: "Recording", settings: SpectrumSettings | None = None, ax: Axes | None = None
-) -> Figure | SubFigure:
+def recording(recording: Any, settings: Any = None, ax: Axes | None = None) -> Figure | SubFigure:
     """Draws a recording: the trace with its window, and its spectra (Welch, FFT), linear and logarithmic."""
     from ._plot_recording import figure
 
     return figure(recording, settings, ax)
 
 
-def static(curves: "StaticCharacteristics", ax: Any = None) -> tuple[Axes, Axes, Axes]:
+def static(curves: Any, ax: Any = None) -> tuple[Axes, Axes, Axes]:
     """Draws K(x), C(v) and force against displacement, in three axes (`ax`: three of yours). Returns the axes.
 
     **Raises:** `ValueError` unless `ax` has three.
