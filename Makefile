@@ -24,6 +24,7 @@ test: .venv/.stamp-test
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
 	$(BIN)/basedpyright
+	$(BIN)/lint-imports
 	$(PYTEST)
 
 test-fast: .venv/.stamp-test

@@ -19,12 +19,15 @@ from jaxtyping import Float
 from measure import Row, Unequal, require_equal, seconds
 
 import jaxmuscle as jm
-from jaxmuscle._expected import WINDOW, expected_moments
-from jaxmuscle._lanes import respond
-from jaxmuscle._noise import Realisation
-from jaxmuscle._parameter import DEFAULT_FREE, as_arrays
-from jaxmuscle._path import Grid
-from jaxmuscle._uncertainty import bin_statistics, standardised, target_variation
+from jaxmuscle._common.arrays import as_arrays
+from jaxmuscle.model._noise import Realisation
+from jaxmuscle.model._parameters import DEFAULT_FREE
+from jaxmuscle.objective._problem import target_variation
+from jaxmuscle.response._expected import expected_moments
+from jaxmuscle.simulation._batch import respond
+from jaxmuscle.simulation._integrator import Grid
+from jaxmuscle.spectra._bin_law import bin_statistics, standardised
+from jaxmuscle.spectra._settings import WINDOW
 
 SEEDS, RATE, ROUNDS, DOUBT = 48, 100.0, 3, 0.01
 FTOL = 1e-4  # the default 1e-8 creeps along the ripples that fixed seeds leave in the cost, to the last evaluation allowed

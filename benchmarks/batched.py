@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from handwritten import filter_matrices
 
 import jaxmuscle as jm
-from jaxmuscle._lanes import draw
+from jaxmuscle.simulation._batch import draw
 
 SEEDS, DT, EVERY, STEPS = 1024, 1e-3, 10, 2000
 BAND = (float(jm.BandLimitedNoise().rate), float(jm.BandLimitedNoise().cutoff))

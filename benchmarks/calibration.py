@@ -18,14 +18,13 @@ import numpy as np
 import scipy.stats
 
 import jaxmuscle as jm
-from jaxmuscle._again import theta_of
-from jaxmuscle._cache import keep_compiled_programs
-from jaxmuscle._climb import quantities
-from jaxmuscle._descend import seen_at
-from jaxmuscle._fit import planned
-from jaxmuscle._parameter import DEFAULT_FREE, PARAMETERS
-from jaxmuscle._search import search_together
-from jaxmuscle._store import write_json
+from jaxmuscle._common.environment import keep_compiled_programs
+from jaxmuscle._common.files import write_json
+from jaxmuscle.fits._search import search_together
+from jaxmuscle.model._parameters import DEFAULT_FREE, PARAMETERS
+from jaxmuscle.objective._arguments import planned
+from jaxmuscle.objective._consequences import quantities, seen_at
+from jaxmuscle.objective._problem import theta_of
 
 PERTURBED = ("noise_K_w", "noise_K_z", "harmonic_amplitude")
 SOFTER = 3.0

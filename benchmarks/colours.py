@@ -13,13 +13,13 @@ import numpy as np
 from run import machine, write
 
 import jaxmuscle as jm
-from jaxmuscle._again import theta_of
-from jaxmuscle._cache import keep_compiled_programs
-from jaxmuscle._colours import Folds, Model, held_out, masked_bins, maxima, stacked
-from jaxmuscle._comparison import NEEDED, Evidence, decided, lowest
-from jaxmuscle._fit import planned, with_noise
-from jaxmuscle._parameter import DEFAULT_FREE
-from jaxmuscle._problem import Setup
+from jaxmuscle._common.environment import keep_compiled_programs
+from jaxmuscle.comparison._comparison import NEEDED, Evidence, decided, lowest
+from jaxmuscle.comparison._evidence import Folds, Model, held_out, masked_bins, maxima, stacked
+from jaxmuscle.model._parameters import DEFAULT_FREE
+from jaxmuscle.model._tasks import with_noise
+from jaxmuscle.objective._arguments import planned
+from jaxmuscle.objective._problem import Setup, theta_of
 
 COLOURS = ("band-limited", "ornstein-uhlenbeck", "pink")
 VARIED = (*DEFAULT_FREE, "noise_correlation_time")

@@ -11,13 +11,13 @@ import numpy as np
 from measure import Row, seconds
 
 import jaxmuscle as jm
-from jaxmuscle._descend import descend
-from jaxmuscle._fit import DT, free_names
-from jaxmuscle._objective import Coordinates
-from jaxmuscle._parameter import PARAMETERS, as_numbers
-from jaxmuscle._problem import Setup
-from jaxmuscle._starts import starting_points
-from jaxmuscle._uncertainty import target_variation
+from jaxmuscle._common.arrays import as_numbers
+from jaxmuscle.model._parameters import PARAMETERS
+from jaxmuscle.objective._arguments import DT, free_names
+from jaxmuscle.objective._coordinates import Coordinates
+from jaxmuscle.objective._least_squares import descend
+from jaxmuscle.objective._problem import Setup, target_variation
+from jaxmuscle.objective._starts import starting_points
 
 TARGETS = ("vastus-lateralis-26mvc", "fdi-abduction-45mvc")
 NOISES = ("band-limited", "ornstein-uhlenbeck")
@@ -120,7 +120,7 @@ def cold() -> list[Row]:
     found: list[Row] = []
     with tempfile.TemporaryDirectory() as folder:
         environment = os.environ | {"JAX_COMPILATION_CACHE_DIR": os.path.join(folder, "cache")}
-        command = [sys.executable, "-m", "jaxmuscle._cli", "fit", TARGETS[0], "--out", os.path.join(folder, "fit")]
+        command = [sys.executable, "-m", "jaxmuscle", "fit", TARGETS[0], "--out", os.path.join(folder, "fit")]
         for state, limit in (("an empty", COLD), ("a warm", WARM)):
             group = f"jaxmuscle fit, new process, {state} compilation cache"
             start, before = time.perf_counter(), os.times()

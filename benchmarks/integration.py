@@ -12,9 +12,9 @@ from handwritten import band_scan, filter_matrices, stock_diffrax, white_scan
 from measure import DTYPES, Program, Row, Unequal, require_equal, seconds, speed_ratio, speeds
 
 import jaxmuscle as jm
-from jaxmuscle._lanes import draw
-from jaxmuscle._parameter import as_arrays
-from jaxmuscle._path import Grid, solve
+from jaxmuscle._common.arrays import as_arrays
+from jaxmuscle.simulation._batch import draw
+from jaxmuscle.simulation._integrator import Grid, solve
 
 SEEDS, DT, EVERY, STEPS = 64, 1e-3, 10, 15_000
 GRID = Grid(DT, STEPS, EVERY, reverse=False)

@@ -9,7 +9,8 @@ from integration import SEEDS
 from measure import Program, Row, Taken, require_equal, seconds
 
 import jaxmuscle as jm
-from jaxmuscle._parameter import DEFAULT_FREE, as_arrays
+from jaxmuscle._common.arrays import as_arrays
+from jaxmuscle.model._parameters import DEFAULT_FREE
 
 BLOCK = 25  # calls in a row, for what takes less than a millisecond
 TEN = (*DEFAULT_FREE, "m_w", "noise_cutoff")

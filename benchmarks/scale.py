@@ -22,7 +22,7 @@ from batched import DT, SEEDS, STEPS, band_by_hand, grid_inputs, numbers, white_
 from measure import Row, Unequal, require_equal, seconds, speed_ratio, speeds
 
 import jaxmuscle as jm
-from jaxmuscle._parameter import as_arrays
+from jaxmuscle._common.arrays import as_arrays
 
 OURS, BEST = "jaxmuscle.ensemble", "hand-written batched lax.scan"
 EPSILONS = 200
@@ -202,7 +202,7 @@ def _command(count: int, seeds: int) -> float:
     with socket.socket() as listener:
         listener.bind(("127.0.0.1", 0))
         port = listener.getsockname()[1]
-    command = [sys.executable, "-m", "jaxmuscle._cli", "ensemble", "zagrodny-slifkin", "--seeds", str(seeds), "--reduce",
+    command = [sys.executable, "-m", "jaxmuscle", "ensemble", "zagrodny-slifkin", "--seeds", str(seeds), "--reduce",
                "--duration", "1", "--devices", "1", "--out", f"{folder}/a.zarr"]  # fmt: skip
     each = [["--coordinator", f"127.0.0.1:{port}", "--processes", str(count), "--process-id", str(i)]
             for i in range(count)] if count > 1 else [[]]  # fmt: skip
@@ -217,7 +217,7 @@ def _command(count: int, seeds: int) -> float:
 
 MEMORY = """
 import sys, threading, time, jax, jaxmuscle as jm
-from jaxmuscle._speed import peak_memory
+from jaxmuscle.ensembles._speed import peak_memory
 jax.config.update("jax_num_cpu_devices", 2)
 jm.ensemble, jm.WhiteNoise
 before = peak_memory()

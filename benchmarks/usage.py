@@ -10,9 +10,10 @@ from integration import DT, SEEDS, STEPS
 from measure import DTYPES, Row, require_equal, seconds
 
 import jaxmuscle as jm
-from jaxmuscle._lanes import draw, respond
-from jaxmuscle._parameter import DEFAULT_FREE, as_arrays
-from jaxmuscle._path import Grid
+from jaxmuscle._common.arrays import as_arrays
+from jaxmuscle.model._parameters import DEFAULT_FREE
+from jaxmuscle.simulation._batch import draw, respond
+from jaxmuscle.simulation._integrator import Grid
 
 GRADIENT_SEEDS = 8
 

@@ -3,7 +3,7 @@
 import math
 from pathlib import Path
 
-from jaxmuscle._parameter import DEFAULT_FREE, PARAMETERS, Parameter
+from jaxmuscle.model._parameters import DEFAULT_FREE, PARAMETERS, Parameter
 
 PAGE = Path(__file__).parent / "reference" / "parameters.md"
 HEAD = """# Parameters and units

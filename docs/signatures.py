@@ -7,7 +7,7 @@ from pathlib import Path
 import griffe
 
 POSITIONAL, KEYWORD = griffe.ParameterKind.positional_or_keyword, griffe.ParameterKind.keyword_only
-TABLE = ast.parse((Path(__file__).parents[1] / "src/jaxmuscle/_parameter.py").read_text(encoding="utf-8"))
+TABLE = ast.parse((Path(__file__).parents[1] / "src/jaxmuscle/model/_parameters.py").read_text(encoding="utf-8"))
 ROWS = [n.args for n in ast.walk(TABLE) if isinstance(n, ast.Call) and ast.unparse(n.func) in ("_row", "_free_sign")]
 DEFAULTS = {ast.unparse(row[0]).strip("'"): ast.unparse(row[3]) for row in ROWS if isinstance(row[3], ast.Constant)}
 
@@ -16,7 +16,7 @@ class Signatures(griffe.Extension):
     """`eqx.Module` and `NamedTuple` make constructors at run time, which griffe, reading the sources, does not see."""
 
     def on_package(self, *, pkg: griffe.Module, **kwargs: object) -> None:
-        for module in pkg.modules.values():
+        for module in [part for wing in pkg.modules.values() for part in (wing, *wing.modules.values())]:
             classes = [cls for cls in module.classes.values() if not cls.is_alias]
             for cls in filter(makes_constructor, classes):
                 cls.set_member("__init__", constructor(cls))

@@ -45,7 +45,7 @@ def expected(name: str) -> dict:
 
 
 if __name__ == "__main__":
-    from jaxmuscle._cache import keep_compiled_programs
+    from jaxmuscle._common.environment import keep_compiled_programs
 
     keep_compiled_programs()
     folder = Path(__file__).parent / "expected"

@@ -17,9 +17,9 @@ from test_result import assert_equal, failed_result, made_result
 from typer.testing import CliRunner
 
 import jaxmuscle as jm
-from jaxmuscle import _cohort, _fit
-from jaxmuscle._cache import keep_compiled_programs
-from jaxmuscle._cli import app
+from jaxmuscle._common.environment import keep_compiled_programs
+from jaxmuscle.commands.main import app
+from jaxmuscle.fits import _cohort, _fit
 
 GRID = 0.390625 * np.arange(1, 31)
 POWER = 1 / (1 + (GRID / 1.2) ** 2) + 0.01
@@ -181,7 +181,7 @@ def test_listings_and_help_do_not_wait_for_jax():
     code = """
 import sys
 from typer.testing import CliRunner
-from jaxmuscle._cli import app
+from jaxmuscle.commands.main import app
 for arguments in (["targets"], ["presets"], ["--help"], ["fit", "--help"], ["simulate", "--help"]):
     result = CliRunner().invoke(app, arguments)
     assert result.exit_code == 0, (arguments, result.output)
@@ -339,7 +339,7 @@ def test_options_reach_the_fit(tmp_path, monkeypatch):
 
 
 def test_a_failing_simulation_is_not_a_users_mistake(tmp_path, monkeypatch):
-    from jaxmuscle import _ensemble
+    from jaxmuscle.ensembles import _ensemble as _ensemble
 
     def explode(*_, **__):
         raise jm.SimulationError("3 seed(s) did not stay finite [0, 1, 2]")
@@ -380,7 +380,8 @@ def test_ctrl_c(tmp_path):
     """A real signal, once the first steps have been taken."""
     code = """
 import contextlib, signal, time
-from jaxmuscle import _cli, _cli_fit
+from jaxmuscle.commands import main as _cli
+from jaxmuscle.commands import fit as _cli_fit
 
 signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs ignore it
 

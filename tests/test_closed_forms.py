@@ -10,8 +10,8 @@ import references
 import scipy.integrate
 
 import jaxmuscle as jm
-from jaxmuscle._noise import Realisation
-from jaxmuscle._path import Grid, observe, solve
+from jaxmuscle.model._noise import Realisation
+from jaxmuscle.simulation._integrator import Grid, observe, solve
 
 KEY = jax.random.key(23)
 MASS, K, C_W, C_Z, FORCE = 0.5, 200.0, 3.0, 1.0, 5.0

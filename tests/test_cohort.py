@@ -15,8 +15,8 @@ from test_result import made_result
 from typer.testing import CliRunner
 
 import jaxmuscle as jm
-from jaxmuscle import _cli_cohort
-from jaxmuscle._cli import app
+from jaxmuscle.commands import cohort as _cli_cohort
+from jaxmuscle.commands.main import app
 
 PEOPLE, SEEDS = 6, 20
 

@@ -17,12 +17,13 @@ import scipy.stats
 from typer.testing import CliRunner
 
 import jaxmuscle as jm
-from jaxmuscle import _compare
-from jaxmuscle._cli import app
-from jaxmuscle._colours import Folds, Model, effective_parameters, without_harmonic
-from jaxmuscle._comparison import COLUMNS, Evidence, decided
-from jaxmuscle._fit import planned, with_noise
-from jaxmuscle._likelihood import log_density, log_likelihood, measured_bins
+from jaxmuscle.commands.main import app
+from jaxmuscle.comparison import _compare
+from jaxmuscle.comparison._comparison import COLUMNS, Evidence, decided
+from jaxmuscle.comparison._evidence import Folds, Model, effective_parameters, without_harmonic
+from jaxmuscle.model._tasks import with_noise
+from jaxmuscle.objective._arguments import planned
+from jaxmuscle.objective._likelihood import log_density, log_likelihood, measured_bins
 
 FREE = ("c_w", "noise_K_z", "harmonic_amplitude", "harmonic_frequency", "noise_correlation_time")
 COLOURS = ("band-limited", "ornstein-uhlenbeck", "pink")

@@ -8,11 +8,11 @@ import pytest
 import references
 
 import jaxmuscle as jm
-from jaxmuscle._lanes import respond
-from jaxmuscle._linear import LinearTask, linearised
-from jaxmuscle._noise import Realisation
-from jaxmuscle._parameter import as_arrays
-from jaxmuscle._path import Grid
+from jaxmuscle._common.arrays import as_arrays
+from jaxmuscle.model._noise import Realisation
+from jaxmuscle.response._linearised import LinearTask, linearised
+from jaxmuscle.simulation._batch import respond
+from jaxmuscle.simulation._integrator import Grid
 
 KEY = jax.random.key(41)
 WINDOW = (5.0, 15.0)

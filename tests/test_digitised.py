@@ -12,11 +12,11 @@ import pages
 import pytest
 from typer.testing import CliRunner
 
-from jaxmuscle import _cli_fit
-from jaxmuscle._bundled import TargetError
-from jaxmuscle._cli import app
-from jaxmuscle._digitised import read_project
-from jaxmuscle._target import load_target
+from jaxmuscle._common.errors import TargetError
+from jaxmuscle.commands import fit as _cli_fit
+from jaxmuscle.commands.main import app
+from jaxmuscle.data._digitised import read_project
+from jaxmuscle.data._target import load_target
 
 GRID = 0.390625 * np.arange(1, 31)
 DOCS = Path(__file__).parents[1] / "docs" / "digitise.md"

@@ -33,9 +33,7 @@ def test_reference_describes_every_public_name_once():
 
 # Values and the module of figures stand on their pages of the reference.
 NAMES = sorted(set(PUBLIC) - {"__version__", "PARAMETERS", "plot"})
-FIGURES = [
-    name for name, value in vars(jm.plot).items() if getattr(value, "__module__", "") == jm.plot.__name__ and name[0] != "_"
-]
+FIGURES = [name for name in jm.plot.__all__ if callable(getattr(jm.plot, name)) and name != "styled"]
 # Of results, which the types of these fields explain.
 EVERYWHERE = {"ax", "seed", "settings", "target", "task", "versions"}
 

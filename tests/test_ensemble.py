@@ -23,17 +23,17 @@ from test_simulate import Integral
 from typer.testing import CliRunner
 
 import jaxmuscle as jm
-from jaxmuscle import _ensemble_run
-from jaxmuscle._cli import app
-from jaxmuscle._ensemble_store import differences
-from jaxmuscle._processes import join
-from jaxmuscle._tally import CELLS, add, count_cells, empty, merged, quantiles, set_cells
+from jaxmuscle.commands.main import app
+from jaxmuscle.ensembles import _run as _ensemble_run
+from jaxmuscle.ensembles._processes import join
+from jaxmuscle.ensembles._running_moments import CELLS, add, count_cells, empty, merged, quantiles, set_cells
+from jaxmuscle.ensembles._store import differences
 
 KEY = jax.random.key(5)
 TASK = jm.Isometric()
 SHORT = {"duration": 1.0, "chunk": 8}  # the force begins to rise at 0.5 s
 PYTHON = [sys.executable, "-c"]
-COMMAND = [sys.executable, "-m", "jaxmuscle._cli"]
+COMMAND = [sys.executable, "-m", "jaxmuscle"]
 
 
 class Brittle(Integral):
@@ -499,7 +499,7 @@ def test_several_processes_give_the_numbers_of_one(tmp_path):
 
 ALONE = """
 import sys, jax, jaxmuscle as jm
-from jaxmuscle._processes import join
+from jaxmuscle.ensembles._processes import join
 rank, port = int(sys.argv[1]), sys.argv[2]
 join(f"127.0.0.1:{port}", 2, rank)
 jax.devices()  # JAX itself waits for all here
@@ -558,7 +558,7 @@ def test_processes_fail_together(tmp_path):
 
 RUNS = """
 import os, sys, jax
-import jaxmuscle as jm, jaxmuscle._ensemble_run as run
+import jaxmuscle as jm, jaxmuscle.ensembles._run as run
 run.KEEP_EVERY = run.KEEP_SHARE = 0
 Task, ensemble = jm.Isometric, jm.ensemble  # imported once; without a device so far, so that each run can be a fork
 for _ in sys.stdin:
@@ -623,7 +623,7 @@ def amount(path):
 
 MEMORY = """
 import sys, jax, jaxmuscle as jm
-from jaxmuscle._speed import peak_memory
+from jaxmuscle.ensembles._speed import peak_memory
 run = lambda seeds: jm.ensemble(jm.Isometric(), jax.random.key(5), seeds=seeds, duration=0.2, chunk=512, reduce=True)
 run(4096)
 before = peak_memory()

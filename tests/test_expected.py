@@ -13,10 +13,10 @@ import scipy.optimize
 import scipy.signal
 
 import jaxmuscle as jm
-from jaxmuscle._expected import _Autocovariance, covariance_operator, expected_moments
-from jaxmuscle._linear import has_response
-from jaxmuscle._parameter import as_arrays
-from jaxmuscle._uncertainty import target_variation
+from jaxmuscle._common.arrays import as_arrays
+from jaxmuscle.objective._problem import target_variation
+from jaxmuscle.response._expected import _Autocovariance, covariance_operator, expected_moments
+from jaxmuscle.response._linearised import has_response
 
 KEY = jax.random.key(31)
 WINDOW, SHIFTED = (5.0, 15.0), (2.7, 12.7)

@@ -14,19 +14,24 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import jaxmuscle as jm
-from jaxmuscle import _fit, _search
-from jaxmuscle._check import AMBIGUOUS, rival_frequencies
-from jaxmuscle._derived import consequences, derived
-from jaxmuscle._descend import BATCH, Descent, _moments_and_slopes, _residuals, descend, seen_at
-from jaxmuscle._expected import Moments
-from jaxmuscle._lanes import draw
-from jaxmuscle._objective import Coordinates, MonteCarlo, welch_operator
-from jaxmuscle._parameter import DEFAULT_FREE, PARAMETERS, as_arrays
-from jaxmuscle._path import Grid
-from jaxmuscle._problem import Setup, residual_sigma
-from jaxmuscle._starts import contenders
-from jaxmuscle._trajectory import WINDOW
-from jaxmuscle._uncertainty import bin_statistics, identifiability, target_variation, undetermined_directions
+from jaxmuscle._common.arrays import as_arrays
+from jaxmuscle.fits import _search
+from jaxmuscle.fits._checks import AMBIGUOUS, rival_frequencies
+from jaxmuscle.model._parameters import DEFAULT_FREE, PARAMETERS
+from jaxmuscle.model._tasks import with_noise
+from jaxmuscle.objective._arguments import DT, RESIDUALS, free_names
+from jaxmuscle.objective._consequences import BATCH, _moments_and_slopes, consequences, derived, seen_at
+from jaxmuscle.objective._coordinates import Coordinates
+from jaxmuscle.objective._covariance import identifiability, undetermined_directions
+from jaxmuscle.objective._least_squares import Descent, _residuals, descend
+from jaxmuscle.objective._moment_models import MonteCarlo, welch_operator
+from jaxmuscle.objective._problem import Setup, residual_sigma, target_variation
+from jaxmuscle.objective._starts import contenders
+from jaxmuscle.response._expected import Moments
+from jaxmuscle.simulation._batch import draw
+from jaxmuscle.simulation._integrator import Grid
+from jaxmuscle.spectra._bin_law import bin_statistics
+from jaxmuscle.spectra._settings import WINDOW
 
 PERTURBATION = "all noise amplitudes and the harmonic's can be scaled together"
 MECHANICS = "stiffness and damping can be scaled together"
@@ -46,7 +51,7 @@ def setup_of(task, target, free, *, residual="log", extra=(None, None), seeds=8,
     """What `fit` makes of its arguments, for one problem without a search. Needs float64."""
     values = {name: float(task[name]) for name in free}
     coordinates = Coordinates.of(values, {}, {name: PARAMETERS[name].prior_sd for name in free})
-    return Setup(task, target, coordinates, np.ones(len(free)), extra, residual, "montecarlo", _fit.DT, jax.random.key(key),
+    return Setup(task, target, coordinates, np.ones(len(free)), extra, residual, "montecarlo", DT, jax.random.key(key),
                  seeds, control, lambda text, share: None)  # fmt: skip
 
 
@@ -301,7 +306,7 @@ def _problem(residual, extra=(None, None)):
         return setup_of(jm.Isometric(), simple_target(), FREE, residual=residual, extra=extra).montecarlo(8)
 
 
-@pytest.mark.parametrize("residual", _fit.RESIDUALS)
+@pytest.mark.parametrize("residual", RESIDUALS)
 @pytest.mark.slow
 def test_gradients_of_the_residuals_are_differences(x64, residual):
     problem = _problem(residual, ((np.log(0.02), 0.1), (2.0, 0.1)))
@@ -330,7 +335,7 @@ def test_the_extra_residuals_are_log_variation_and_mean(x64):
 
 @pytest.mark.slow
 def test_the_residuals_vanish_for_a_target_that_the_model_makes(x64):
-    for residual in _fit.RESIDUALS:
+    for residual in RESIDUALS:
         problem = _problem(residual)
         moments = eqx.filter_jit(problem.moments)(jnp.zeros(3))
         bias = np.exp(problem.statistics.bias) if residual == "log" else 1.0
@@ -406,21 +411,21 @@ def test_the_task_follows_from_the_quantity():
 
 def test_white_noise_works_where_the_output_does_not_contain_it():
     with pytest.raises(ValueError, match=r"WhiteNoise on K_z cannot be used in Isometric.*BandLimitedNoise.*noise_K_z"):
-        _fit.with_noise(jm.Isometric(), "white")
+        with_noise(jm.Isometric(), "white")
     with pytest.raises(ValueError, match="WhiteNoise on C_z"):
-        _fit.with_noise(jm.Isometric(), "white", {"noise_K_z": 0.0})
-    task = _fit.with_noise(jm.Isometric(), "white", {"noise_K_z": 0.0, "noise_C_z": 0.0, "noise_K_w": 0.2})
+        with_noise(jm.Isometric(), "white", {"noise_K_z": 0.0})
+    task = with_noise(jm.Isometric(), "white", {"noise_K_z": 0.0, "noise_C_z": 0.0, "noise_K_w": 0.2})
     assert isinstance(task.noise, jm.WhiteNoise)
     np.testing.assert_array_equal(task.noise.amplitude, [0.2, 0.0, PARAMETERS["noise_C_w"].default, 0.0])
-    assert "noise_K_z" not in _fit.free_names(task, None, {"noise_K_z": 0.0}, 30)
+    assert "noise_K_z" not in free_names(task, None, {"noise_K_z": 0.0}, 30)
 
 
 def test_free_by_default():
-    assert _fit.free_names(jm.Isometric(), None, {}, 30) == DEFAULT_FREE
+    assert free_names(jm.Isometric(), None, {}, 30) == DEFAULT_FREE
     ornstein = jm.Isometric(noise=jm.OrnsteinUhlenbeckNoise())
-    assert _fit.free_names(ornstein, None, {"k_w": 1.0}, 30) == (*DEFAULT_FREE[1:], "noise_correlation_time")
+    assert free_names(ornstein, None, {"k_w": 1.0}, 30) == (*DEFAULT_FREE[1:], "noise_correlation_time")
     # What is zero cannot be fitted in log space and stays.
-    assert "harmonic_amplitude" not in _fit.free_names(jm.Isometric().replace(harmonic_amplitude=0.0), None, {}, 30)
+    assert "harmonic_amplitude" not in free_names(jm.Isometric().replace(harmonic_amplitude=0.0), None, {}, 30)
 
 
 @pytest.mark.parametrize(

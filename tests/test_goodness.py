@@ -12,18 +12,19 @@ import scipy.special
 import scipy.stats
 
 import jaxmuscle as jm
-from jaxmuscle import _bootstrap, _bootstrap_data
-from jaxmuscle._again import taken_up, theta_of
-from jaxmuscle._bootstrap import Recovery
-from jaxmuscle._derived import consequences
-from jaxmuscle._descend import seen_at
-from jaxmuscle._fit import planned
-from jaxmuscle._goodness import Drawn, numbers_of, p_values, refitted, residuals_of
-from jaxmuscle._likelihood import Likelihood, welch_law
-from jaxmuscle._replicate import drawn_spectra, repeated
-from jaxmuscle._search import search_together
-from jaxmuscle._simulate import SimulationError
-from jaxmuscle._target import Target
+from jaxmuscle._common.errors import SimulationError
+from jaxmuscle.checks import _bootstrap
+from jaxmuscle.checks import _replicates as _bootstrap_data
+from jaxmuscle.checks._goodness import Drawn, numbers_of, p_values, refitted, residuals_of
+from jaxmuscle.checks._recovery import Recovery
+from jaxmuscle.data._target import Target
+from jaxmuscle.fits._reopened import taken_up
+from jaxmuscle.fits._search import search_together
+from jaxmuscle.objective._arguments import planned
+from jaxmuscle.objective._consequences import consequences, seen_at
+from jaxmuscle.objective._likelihood import Likelihood, drawn_spectra, repeated
+from jaxmuscle.objective._problem import theta_of
+from jaxmuscle.spectra._bin_law import welch_law
 
 FREE = ("c_w", "noise_K_z")
 SURE = 1e-3  # two-sided probability outside the bounds of every statistical test

@@ -17,17 +17,20 @@ from scipy.special import gammaincinv, ndtr
 from test_result import made_result
 
 import jaxmuscle as jm
-from jaxmuscle._again import taken_up, theta_of
-from jaxmuscle._climb import climb, quantities
-from jaxmuscle._descend import descend, seen_at
-from jaxmuscle._expected import expected_moments
-from jaxmuscle._identify_designs import design_information, information_of, seen_here, without_offset
-from jaxmuscle._joint import planned_jointly
-from jaxmuscle._likelihood import Likelihood, welch_law
-from jaxmuscle._operating import equilibrium
-from jaxmuscle._parameter import DEFAULT_FREE, PARAMETERS, as_arrays
-from jaxmuscle._trajectory import WINDOW
-from jaxmuscle._uncertainty import samples_of, target_variation
+from jaxmuscle._common.arrays import as_arrays
+from jaxmuscle.fits._joint import planned_jointly
+from jaxmuscle.fits._reopened import taken_up
+from jaxmuscle.model._parameters import DEFAULT_FREE, PARAMETERS
+from jaxmuscle.objective._consequences import quantities, seen_at
+from jaxmuscle.objective._least_squares import descend
+from jaxmuscle.objective._likelihood import Likelihood
+from jaxmuscle.objective._problem import target_variation, theta_of
+from jaxmuscle.objective._scoring import climb
+from jaxmuscle.response._equilibrium import equilibrium
+from jaxmuscle.response._expected import expected_moments
+from jaxmuscle.spectra._bin_law import samples_of, welch_law
+from jaxmuscle.spectra._settings import WINDOW
+from jaxmuscle.uncertainty._designs import design_information, information_of, seen_here, without_offset
 
 TRUTH = jm.Isometric().replace(harmonic_amplitude=0.012, harmonic_frequency=5.0)
 LOADED = TRUTH.as_task(jm.PrescribedForce, P_w=0.0)

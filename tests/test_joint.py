@@ -12,15 +12,15 @@ from test_fit import true_derived
 from test_result import assert_equal
 
 import jaxmuscle as jm
-from jaxmuscle._derived import derived
-from jaxmuscle._descend import seen_at
-from jaxmuscle._joint import planned_jointly
-from jaxmuscle._joint_problem import joint_names
-from jaxmuscle._joint_search import joint_starts
-from jaxmuscle._objective import at
-from jaxmuscle._parameter import DEFAULT_FREE, as_arrays
-from jaxmuscle._result import ResultError
-from jaxmuscle._uncertainty import identifiability, undetermined_directions
+from jaxmuscle._common.arrays import as_arrays
+from jaxmuscle._common.errors import ResultError
+from jaxmuscle.fits._joint import planned_jointly
+from jaxmuscle.fits._joint_search import joint_starts
+from jaxmuscle.model._parameters import DEFAULT_FREE
+from jaxmuscle.objective._arguments import joint_names
+from jaxmuscle.objective._consequences import derived, seen_at
+from jaxmuscle.objective._coordinates import at
+from jaxmuscle.objective._covariance import identifiability, undetermined_directions
 
 TRUTH = jm.Isometric().replace(k_w=3.5e5, k_z=7e5, c_w=80.0, harmonic_frequency=5.0, harmonic_amplitude=0.012)
 SEEDS = 24

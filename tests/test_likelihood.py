@@ -11,10 +11,10 @@ import scipy.stats
 from scipy.special import gammaln
 
 import jaxmuscle as jm
-from jaxmuscle._expected import expected_moments
-from jaxmuscle._likelihood import _log_gamma, likeliest_offset, log_density, log_marginal, measured_bins, welch_law
-from jaxmuscle._line import bin_rows
-from jaxmuscle._parameter import as_arrays
+from jaxmuscle._common.arrays import as_arrays
+from jaxmuscle.objective._likelihood import _log_gamma, likeliest_offset, log_density, log_marginal, measured_bins
+from jaxmuscle.response._expected import expected_moments
+from jaxmuscle.spectra._bin_law import bin_rows, welch_law
 
 SEGMENTS = 6
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.special import erf
 
-from jaxmuscle._metrics import (
+from jaxmuscle.spectra._measures import (
     approximate_entropy,
     coefficient_of_variation,
     normalised,
@@ -16,7 +16,8 @@ from jaxmuscle._metrics import (
     signal_to_noise,
     spearman,
 )
-from jaxmuscle._spectrum import Spectrum, SpectrumSettings, spectrum_of
+from jaxmuscle.spectra._settings import SpectrumSettings
+from jaxmuscle.spectra._welch import Spectrum, spectrum_of
 
 RNG = np.random.default_rng(0)
 RECORDS = {

@@ -9,8 +9,8 @@ import references
 from jaxtyping import Array, Float
 
 import jaxmuscle as jm
-from jaxmuscle._law import Scalar
-from jaxmuscle._parameter import DEFAULT_FREE, PARAMETERS, default
+from jaxmuscle._common.types import Scalar
+from jaxmuscle.model._parameters import DEFAULT_FREE, PARAMETERS, default
 
 MUSCLE = {name: PARAMETERS[name].default for name in list(PARAMETERS)[:10]}
 TASKS = (jm.PrescribedMotion, jm.PrescribedForce, jm.Isometric)

@@ -9,7 +9,7 @@ import scipy.integrate
 import scipy.linalg
 
 import jaxmuscle as jm
-from jaxmuscle._noise import Realisation
+from jaxmuscle.model._noise import Realisation
 
 KEY = jax.random.key(7)
 CHANNELS = ("K_w", "K_z", "C_w", "C_z")

@@ -8,8 +8,8 @@ import pytest
 import references
 
 import jaxmuscle as jm
-from jaxmuscle._noise import Realisation
-from jaxmuscle._path import Grid, observe, solve
+from jaxmuscle.model._noise import Realisation
+from jaxmuscle.simulation._integrator import Grid, observe, solve
 
 KEY = jax.random.key(5)
 FINE, SECONDS, SEEDS = 2**14, 0.25, 400

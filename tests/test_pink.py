@@ -11,11 +11,11 @@ import scipy.signal
 import scipy.stats
 
 import jaxmuscle as jm
-from jaxmuscle import _pink
-from jaxmuscle._cli_fit import NoiseName
-from jaxmuscle._fit import NOISES
-from jaxmuscle._linear import linearise
-from jaxmuscle._parameter import as_arrays
+from jaxmuscle._common.arrays import as_arrays
+from jaxmuscle.commands.options import NoiseName
+from jaxmuscle.model import _pink_noise as _pink
+from jaxmuscle.model._tasks import NOISES
+from jaxmuscle.response._linearised import linearise
 
 KEY = jax.random.key(23)
 PINK = jm.PinkNoise(1.0)

@@ -11,11 +11,13 @@ import pytest
 import scipy.special
 from matplotlib.colors import to_rgba
 
-from jaxmuscle import _plot_fit, plot
-from jaxmuscle._spectrum import Spectrum, SpectrumSettings
-from jaxmuscle._target import Target, load_target
-from jaxmuscle._task import Isometric, PrescribedForce
-from jaxmuscle._trajectory import Trajectory
+from jaxmuscle import plot
+from jaxmuscle.data._target import Target, load_target
+from jaxmuscle.model._tasks import Isometric, PrescribedForce
+from jaxmuscle.plot import _fit as _plot_fit
+from jaxmuscle.simulation._trajectory import Trajectory
+from jaxmuscle.spectra._settings import SpectrumSettings
+from jaxmuscle.spectra._welch import Spectrum
 
 SETTINGS = SpectrumSettings()
 F = SETTINGS.frequency

@@ -17,13 +17,14 @@ import xarray
 from typer.testing import CliRunner
 
 import jaxmuscle as jm
-from jaxmuscle._again import taken_up, theta_of
-from jaxmuscle._chains import Chains, sample
-from jaxmuscle._cli import app
-from jaxmuscle._likelihood import Likelihood
-from jaxmuscle._marginal import marginal_of
-from jaxmuscle._mixing import diagnosed, modes_of, verdict
-from jaxmuscle._parameter import PARAMETERS
+from jaxmuscle.commands.main import app
+from jaxmuscle.fits._reopened import taken_up
+from jaxmuscle.model._parameters import PARAMETERS
+from jaxmuscle.objective._likelihood import Likelihood
+from jaxmuscle.objective._problem import theta_of
+from jaxmuscle.uncertainty._chains import Chains, sample
+from jaxmuscle.uncertainty._posterior_checks import diagnosed, modes_of, verdict
+from jaxmuscle.uncertainty._posterior_density import marginal_of
 
 FREE = ("c_w", "noise_K_z", "harmonic_amplitude", "harmonic_frequency")
 

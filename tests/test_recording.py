@@ -7,9 +7,9 @@ import pytest
 import scipy.signal
 from matplotlib.figure import Figure
 
-from jaxmuscle._metrics import peaks
-from jaxmuscle._recording import LOWEST_RATE, UNITS, Recording, known_unit
-from jaxmuscle._spectrum import SpectrumSettings
+from jaxmuscle.data._recording import LOWEST_RATE, UNITS, Recording, known_unit
+from jaxmuscle.spectra._measures import peaks
+from jaxmuscle.spectra._settings import SpectrumSettings
 
 # Float64 through a filter of order 18 and a transform: a few thousand times the rounding of one operation.
 EXACT = 1e-10

@@ -14,10 +14,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from typer.testing import CliRunner
 
-from jaxmuscle._cli_analyse import analyse
-from jaxmuscle._recording import Recording
-from jaxmuscle._recording_file import load_recording
-from jaxmuscle._target import load_target
+from jaxmuscle.commands.analyse import analyse
+from jaxmuscle.data._recording import Recording
+from jaxmuscle.data._recording_files import load_recording
+from jaxmuscle.data._target import load_target
 
 X = np.round(10 + np.random.default_rng(0).normal(size=40), 3)
 TIME = np.arange(X.size) / 1000

@@ -11,12 +11,13 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from jaxmuscle._cli_reproduce import reproduce as command
-from jaxmuscle._plot_reproduce import FIGURES
-from jaxmuscle._recording import Recording
-from jaxmuscle._reproduce import experiment, given_recordings, reproduce
-from jaxmuscle._reproduce_claims import AGREES, CLAIMS, DIFFERS, GRID, UNCHECKED, check
-from jaxmuscle._reproduce_readings import conclusion, fast_share
+from jaxmuscle.commands.reproduce import reproduce as command
+from jaxmuscle.data._recording import Recording
+from jaxmuscle.paper._claims import AGREES, CLAIMS, DIFFERS, GRID, UNCHECKED, check
+from jaxmuscle.paper._figures import FIGURES
+from jaxmuscle.paper._numbers import experiment, given_recordings
+from jaxmuscle.paper._readings import conclusion, fast_share
+from jaxmuscle.paper._reproduce import reproduce
 
 EXACT = 1e-9  # arithmetic, bins and what is put in
 LINEAR = 2e-3  # closed forms; the presets hold four digits

@@ -12,9 +12,10 @@ import pytest
 import tomli_w
 
 import jaxmuscle as jm
-from jaxmuscle._preset import PresetError, task_from_table, task_to_table
-from jaxmuscle._result import FORMAT, ResultError, Start
-from jaxmuscle._store import replacing, write_json, write_text
+from jaxmuscle._common.errors import PresetError, ResultError
+from jaxmuscle._common.files import replacing, write_json, write_text
+from jaxmuscle.fits._result import FORMAT, Start
+from jaxmuscle.model._presets import task_from_table, task_to_table
 
 POWER = 1 / (1 + np.arange(1, 31) ** 2)
 TARGET = jm.Target("made", POWER, segments=[6, 7], coefficient_of_variation=0.02, notices=["a notice"])
@@ -411,7 +412,7 @@ def test_a_table_that_is_no_table(tmp_path):
 
 
 def test_an_unknown_preset_names_the_nearest(monkeypatch):
-    from jaxmuscle import _preset
+    from jaxmuscle.model import _presets as _preset
 
     monkeypatch.setattr(_preset, "list_presets", lambda: ("zagrodny-hamilton", "zagrodny-slifkin"))
     with pytest.raises(PresetError, match=r"'zagrodny-slifki': did you mean 'zagrodny-slifkin'.*or give a path"):

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 import jaxmuscle as jm
-from jaxmuscle._expected import WINDOW, expected_moments
-from jaxmuscle._parameter import as_arrays
-from jaxmuscle._scaling import at_level, relative_variation, scaled
+from jaxmuscle._common.arrays import as_arrays
+from jaxmuscle.response._expected import expected_moments
+from jaxmuscle.response._scaling import at_level, relative_variation, scaled
+from jaxmuscle.spectra._settings import WINDOW
 
 LEVELS = np.array([5, 10, 20, 25, 30, 35, 40, 60, 80, 90, 95]) / 100  # the range of [30]
 SIZES = (0.5, 0.8, 1.0, 1.25, 2.0)
@@ -147,7 +148,7 @@ def test_similar_muscles_have_similar_equilibria_and_rates(x64, exponent):
     base = np.asarray(large.muscle.base() / task.muscle.base())
     np.testing.assert_allclose(base, [2.0, 2.0, 2.0 ** (1 + exponent), 2.0 ** (1 + exponent)])
     if exponent == 1.0:
-        from jaxmuscle._operating import operating_point
+        from jaxmuscle.response._equilibrium import operating_point
 
         rates, slower = (np.sort_complex(operating_point(t)[1]) for t in (task, large))
         np.testing.assert_allclose(slower, rates / 2, rtol=1e-6)

@@ -9,7 +9,7 @@ import references
 import scipy.interpolate
 
 import jaxmuscle as jm
-from jaxmuscle._signal import Tabulated, derivatives
+from jaxmuscle.model._signals import Tabulated, derivatives
 
 TIMES = np.linspace(0.0, 6.0, 25)
 CASES = {

@@ -10,11 +10,11 @@ import pytest
 import references
 
 import jaxmuscle as jm
-from jaxmuscle._lanes import draw
-from jaxmuscle._law import Scalar
-from jaxmuscle._noise import Realisation
-from jaxmuscle._parameter import is_concrete
-from jaxmuscle._path import Grid, solve
+from jaxmuscle._common.arrays import is_concrete
+from jaxmuscle._common.types import Scalar
+from jaxmuscle.model._noise import Realisation
+from jaxmuscle.simulation._batch import draw
+from jaxmuscle.simulation._integrator import Grid, solve
 
 KEY = jax.random.key(11)
 HARMONIC = jm.Harmonic(0.1, 4.25, 0.3)

@@ -15,7 +15,8 @@ import scipy.signal
 import scipy.stats
 from hypothesis import given, settings
 
-from jaxmuscle._spectrum import Spectrum, SpectrumSettings, lowpass, periodogram, spectrum_of, welch
+from jaxmuscle.spectra._settings import SpectrumSettings
+from jaxmuscle.spectra._welch import Spectrum, lowpass, periodogram, spectrum_of, welch
 
 ROUNDING = 1e-10  # float64: what the design promises; the transforms themselves are within 1e-13
 SINGLE = 1e-4  # float32, relative to the range of the fluctuations

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import jaxmuscle as jm
-from jaxmuscle._static import static_characteristics
+from jaxmuscle.response._characteristics import static_characteristics
 
 EXACT = {"rtol": 1e-12, "atol": 1e-12}
 

@@ -9,10 +9,11 @@ import scipy.signal
 from hypothesis import given
 from hypothesis import strategies as st
 
-from jaxmuscle import _bundled
-from jaxmuscle._bundled import TargetError, describe_targets, list_targets
-from jaxmuscle._spectrum import SpectrumSettings
-from jaxmuscle._target import Target, load_target
+from jaxmuscle._common import bundled as _bundled
+from jaxmuscle._common.bundled import describe_targets, list_targets
+from jaxmuscle._common.errors import TargetError
+from jaxmuscle.data._target import Target, load_target
+from jaxmuscle.spectra._settings import SpectrumSettings
 
 GRID = 0.390625 * np.arange(1, 31)
 MEASURED = ("fdi-abduction-45mvc", "vastus-lateralis-26mvc")

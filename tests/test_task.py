@@ -7,7 +7,8 @@ import pytest
 import references
 
 import jaxmuscle as jm
-from jaxmuscle._operating import OperatingPointError, operating_point
+from jaxmuscle._common.errors import OperatingPointError
+from jaxmuscle.response._equilibrium import operating_point
 
 KEY = jax.random.key(3)
 TASKS = (jm.PrescribedMotion, jm.PrescribedForce, jm.Isometric)

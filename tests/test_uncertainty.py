@@ -7,16 +7,8 @@ import scipy.signal
 import scipy.stats
 
 import jaxmuscle as jm
-from jaxmuscle._uncertainty import (
-    bin_correlation,
-    bin_statistics,
-    identifiability,
-    log_power_moments,
-    parameter_covariance,
-    shares_map,
-    standardised,
-    undetermined_directions,
-)
+from jaxmuscle.objective._covariance import identifiability, parameter_covariance, undetermined_directions
+from jaxmuscle.spectra._bin_law import bin_correlation, bin_statistics, log_power_moments, shares_map, standardised
 
 BINS = np.arange(1, 31)
 FLAT = np.full(30, 1 / 30)

@@ -1,0 +1,11 @@
+"""Types that many modules share."""
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from jaxtyping import Array, Float
+
+if TYPE_CHECKING:
+    Scalar = Any  # a union of numbers and arrays supports no arithmetic in the eyes of a type checker
+else:
+    Scalar = Float[Array, "..."] | Float[np.ndarray, "..."] | float | int

@@ -1,0 +1,210 @@
+"""What a bootstrap found: how far refits scatter about the truth, against the errors that were stated."""
+
+import json
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import equinox as eqx
+import numpy as np
+import scipy.stats
+from jaxtyping import Float
+
+from jaxmuscle._common.environment import versions
+from jaxmuscle._common.files import write_text
+from jaxmuscle._common.text import folded
+from jaxmuscle.data._target import Target
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure, SubFigure
+
+
+FORMAT = 1
+REACH = float(scipy.stats.norm.ppf(0.975))
+DOUBT = 0.01
+
+
+class Recovery(eqx.Module):
+    """One quantity: the value `true` simulated from, the standard error `stated` by the fit, `values` that refits found with
+    the errors `stderrs` they state (NaN where a refit states none)."""
+
+    name: str
+    unit: str
+    true: float
+    stated: float
+    values: Float[np.ndarray, " refits"]
+    stderrs: Float[np.ndarray, " refits"]
+
+    @property
+    def spread(self) -> float:
+        """Standard deviation of the refits."""
+        return float(np.std(self.values, ddof=1))
+
+    @property
+    def ratio(self) -> float:
+        """Spread over stated error; 1 where that holds."""
+        return self.spread / self.stated
+
+    @property
+    def ratio_stderr(self) -> float:
+        """`ratio / √(2 (n - 1))`, for refits that scatter normally."""
+        return self.ratio / math.sqrt(2 * (len(self.values) - 1))
+
+    @property
+    def core(self) -> float:
+        """Half the width of the middle 68.3 % of the refits over the stated error: the ratio without its tails."""
+        low, high = np.quantile(self.values, scipy.stats.norm.cdf([-1.0, 1.0]))
+        return float(high - low) / 2 / self.stated
+
+    @property
+    def bias(self) -> float:
+        """Mean of the refits less the true value."""
+        return float(np.mean(self.values) - self.true)
+
+    @property
+    def bias_stderr(self) -> float:
+        """Standard error of the bias."""
+        return self.spread / math.sqrt(len(self.values))
+
+    @property
+    def inside(self) -> tuple[int, int]:
+        """Refits whose 95 % interval holds the true value, and those that state one."""
+        known = np.isfinite(self.stderrs)
+        near = np.abs(self.values[known] - self.true) <= REACH * self.stderrs[known]
+        return int(np.sum(near)), int(np.sum(known))
+
+    @property
+    def coverage(self) -> float:
+        """Their share; NaN where no refit states an interval."""
+        near, known = self.inside
+        return near / known if known else math.nan
+
+    @property
+    def verdict(self) -> str:
+        """Whether the error holds, judged at 1 % by the χ² law of the spread and the binomial one of the coverage."""
+        squares = (len(self.values) - 1) * self.ratio**2
+        above = scipy.stats.chi2.sf(squares, len(self.values) - 1)
+        near, known = self.inside
+        rare = scipy.stats.binom.cdf(near, known, 0.95) if known else 1.0
+        if above < DOUBT / 2:
+            return "error too small"
+        if 1 - above < DOUBT / 2:
+            return "error too large"
+        if rare < DOUBT:
+            return "intervals miss"
+        return "holds"
+
+
+class Bootstrap(eqx.Module):
+    """What refits of data made from a fit found.
+
+    `quantities` {name: `Recovery`}, those that the fit determines; `replicates` asked for; `failed` {replicate: why it
+    was not simulated or fitted}; `source`, how the data were made; `task`, made from; `target`, whose fit it is; `seed`;
+    `versions`.
+    """
+
+    target: Target
+    task: Any
+    quantities: dict[str, Recovery]
+    replicates: int
+    failed: dict[int, str]
+    source: str
+    seed: int | None
+    versions: dict[str, str] = eqx.field(default_factory=versions)
+
+    @property
+    def success(self) -> bool:
+        """Whether every replicate was fitted and every stated error holds."""
+        return not self.failed and bool(self.quantities) and all(q.verdict == "holds" for q in self.quantities.values())
+
+    def table(self) -> list[dict[str, Any]]:
+        """Tidy rows, one per quantity."""
+        return [
+            {"quantity": q.name, "unit": q.unit, "true": q.true, "stated": q.stated, "spread": q.spread, "ratio": q.ratio,
+             "ratio_stderr": q.ratio_stderr, "core": q.core, "bias": q.bias, "bias_stderr": q.bias_stderr,
+             "coverage": q.coverage, "intervals": q.inside[1], "refits": len(q.values), "verdict": q.verdict}
+            for q in self.quantities.values()
+        ]  # fmt: skip
+
+    @property
+    def sentences(self) -> tuple[str, ...]:
+        """Whether the stated errors hold, and what is off, in words."""
+        done = self.replicates - len(self.failed)
+        said = []
+        off = {verdict: [q.name for q in self.quantities.values() if q.verdict == verdict]
+               for verdict in ("error too small", "error too large", "intervals miss")}  # fmt: skip
+        holding = len(self.quantities) - sum(map(len, off.values()))
+        if self.quantities and holding == len(self.quantities):
+            said.append(f"the stated errors hold, as far as {done} refits can tell")
+        elif self.quantities:
+            said.append(f"the stated errors hold for {holding} of {len(self.quantities)} quantities")
+        words = {"error too small": "refits scatter more than the fit states",
+                 "error too large": "refits scatter less than the fit states",
+                 "intervals miss": "the 95 % intervals of the refits hold the true value too seldom"}  # fmt: skip
+        said += [f"{words[verdict]}: {', '.join(names)}" for verdict, names in off.items() if names]
+        tails = [f"{q.name} ({q.core:.2f})" for q in self.quantities.values()
+                 if q.verdict == "error too small" and q.core < 1 + (q.ratio - 1) / 2]  # fmt: skip
+        if tails:
+            said.append(f"mostly by a few far refits; the middle 68 % over the stated error: {', '.join(tails)}")
+        biased = [q.name for q in self.quantities.values() if abs(q.bias) > max(0.5 * q.stated, 3 * q.bias_stderr)]
+        if biased:
+            said.append(f"off by more than half a standard error on average: {', '.join(biased)}")
+        silent = [f"{q.name} ({len(q.values) - q.inside[1]})" for q in self.quantities.values()
+                  if q.inside[1] < len(q.values)]  # fmt: skip
+        if silent:
+            said.append(f"refits whose own data do not determine the quantity state no interval: {', '.join(silent)}")
+        if self.failed:
+            first = next(iter(self.failed.items()))
+            said.append(f"{len(self.failed)} of {self.replicates} failed and are not in the table; replicate {first[0]}: "
+                        f"{first[1]}")  # fmt: skip
+        return (*said, self.source)
+
+    def __str__(self) -> str:
+        done = self.replicates - len(self.failed)
+        lines = [f"{self.target.name}: {done} refits of data made from the fit"]
+        head = f"  {'':<24}{'true':>9} {'stated':>8} {'spread/stated':>14} {'bias':>9} {'in 95 %':>7}"
+        lines.append(head)
+        for q in self.quantities.values():
+            share = "-" if math.isnan(q.coverage) else f"{100 * q.coverage:.0f} %"
+            mark = "" if q.verdict == "holds" else " *"
+            lines.append(f"  {q.name:<24}{q.true:>9.4g} {q.stated:>8.2g} {q.ratio:>7.2f} ± {q.ratio_stderr:<4.2f} "
+                         f"{q.bias:>9.1g} {share:>7}{mark}")  # fmt: skip
+        for sentence in self.sentences:
+            lines.append(f"- {sentence}")
+        return folded(lines)
+
+    def to_json(self) -> str:
+        """Everything but the task as JSON."""
+        rows = {q.name: {"values": _numbers(q.values), "stderrs": _numbers(q.stderrs)} for q in self.quantities.values()}
+        table = {
+            "format": FORMAT,
+            "target": self.target.name,
+            "source": self.source,
+            "replicates": self.replicates,
+            "failed": {str(number): why for number, why in self.failed.items()},
+            "sentences": list(self.sentences),
+            "table": [{name: _number(value) for name, value in row.items()} for row in self.table()],
+            "refits": rows,
+            "seed": self.seed,
+            "versions": self.versions,
+        }
+        return json.dumps(table, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
+
+    def save(self, path: str | Path) -> None:
+        """Write `to_json` atomically."""
+        write_text(path, self.to_json())
+
+    def plot(self, ax: "Axes | None" = None) -> "Figure | SubFigure":
+        """The refits of every quantity, with the true value and the interval that the fit states."""
+        from jaxmuscle.plot._checks import bootstrap_figure
+
+        return bootstrap_figure(self, ax)
+
+
+def _number(value: Any) -> Any:
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _numbers(values: np.ndarray) -> list[float | None]:
+    return [_number(float(v)) for v in values]

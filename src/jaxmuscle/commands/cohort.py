@@ -1,0 +1,130 @@
+"""`jaxmuscle fit` with several targets."""
+
+import csv
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from rich.box import SIMPLE_HEAD
+from rich.table import Table
+
+from jaxmuscle._common.progress import progress
+
+from .console import BAD_INPUT, CONVERGED, NOT_CONVERGED, csv_text, err, out, plain, save_figure, writable, write_fit
+from .options import TaskName
+
+if TYPE_CHECKING:
+    from jaxmuscle.fits._cohort import CohortResult
+
+
+SHOWN = {
+    "harmonic_frequency": "harmonic (Hz)",
+    "corner_frequency": "corner (Hz)",
+    "harmonic_share": "share",
+    "high_frequency_floor": "floor",
+}
+
+
+def fit_together(
+    names: list[str],
+    read: dict[str, Any],
+    task: TaskName | None,
+    groups: Path | None,
+    folder: Path,
+    options: dict[str, Any],
+) -> int:
+    """Fit and write all targets that can be read; the exit code says whether some could not be, or did not converge."""
+    from jaxmuscle.data._target import load_target
+    from jaxmuscle.fits._cohort import CohortResult, fit_cohort
+    from jaxmuscle.model._tasks import TASKS
+
+    grouped = {} if groups is None else _groups(groups)
+    writable(folder)
+    targets, failed = [], {}
+    for name in names:
+        try:
+            targets.append(load_target(name, **read))
+        except (ValueError, OSError) as error:
+            failed[name] = str(error)
+    starts = {} if options["starts"] is None else {"starts": options["starts"]}
+    options = {name: value for name, value in options.items() if name != "starts"} | starts
+    if not targets:
+        raise ValueError(f"none of the targets can be read: {_reasons(failed)}")
+    with progress(f"fitting {len(targets)} targets") as tell:
+        found = fit_cohort(targets, groups=grouped, task=None if task is None else TASKS[task], progress=tell, **options)
+    failed |= found.failed
+    if not found.results:
+        raise ValueError(f"none of the targets can be fitted: {_reasons(failed)}")
+    cohort = CohortResult(found.results, found.groups, failed)
+    _write(cohort, folder)
+    _show(cohort, folder)
+    return BAD_INPUT if failed else CONVERGED if cohort.success else NOT_CONVERGED
+
+
+def _reasons(failed: dict[str, str]) -> str:
+    return "; ".join(f"{name}: {why}" for name, why in failed.items())
+
+
+def _groups(path: Path) -> dict[str, str]:
+    """The groups that a CSV with the columns target and group names."""
+    with open(path, encoding="utf-8-sig", newline="") as file:
+        rows = list(csv.DictReader(file))
+    if not rows or not {"target", "group"} <= set(rows[0]):
+        raise ValueError(f"{path}: needs a header with the columns target and group, and a line per target")
+    found: dict[str, str] = {}
+    for number, row in enumerate(rows, start=2):
+        name, group = (row["target"] or "").strip(), (row["group"] or "").strip()
+        if not name or not group:
+            raise ValueError(f"{path}: line {number}: give a target and its group")
+        if found.get(name, group) != group:
+            raise ValueError(f"{path}: line {number}: {name} is in group {found[name]} already")
+        found[name] = group
+    return found
+
+
+def _write(cohort: "CohortResult", folder: Path) -> None:
+    from jaxmuscle._common.files import write_text
+
+    for name, result in cohort.results.items():
+        write_fit(result, folder / name)
+    write_text(folder / "cohort.csv", csv_text(_columns(cohort.table())))
+    differences = [_row(d) for d in cohort.differences()]
+    if differences:
+        write_text(folder / "differences.csv", csv_text(_columns(differences)))
+    if any(row["stderr"] is not None for row in cohort.table()):
+        save_figure(cohort.plot("group" if len(set(cohort.groups.values())) > 1 else "person"), folder / "cohort.png")
+
+
+def _row(difference: Any) -> dict[str, Any]:
+    row = {name: getattr(difference, name) for name in ("quantity", "a", "b", "difference", "low", "high", "unit", "basis")}
+    return row | {"members_a": difference.members[0], "members_b": difference.members[1]}
+
+
+def _columns(rows: list[dict[str, Any]]) -> dict[str, list[Any]]:
+    return {name: [row[name] for row in rows] for name in rows[0]}
+
+
+def _show(cohort: "CohortResult", folder: Path) -> None:
+    title = f"{len(cohort.results)} targets, in linear response; in brackets: not determined"
+    table = Table(title=title, title_justify="left", box=SIMPLE_HEAD, padding=0)
+    table.add_column("target", overflow="fold")
+    grouped = bool(cohort.groups)
+    for column in [*["group"] * grouped, *SHOWN.values(), "chi²"]:
+        table.add_column(column, justify="left" if column == "group" else "right", no_wrap=column != "group")
+    for name, result in cohort.results.items():
+        cells = [plain(cohort.groups.get(name, ""))] * grouped + [_cell(result.derived.get(q)) for q in SHOWN]
+        chi2 = "" if result.chi2_per_bin is None else f"{result.chi2_per_bin:.2f}"
+        table.add_row(plain(name), *cells, chi2 if result.success else "[bold red]failed[/]")
+    out.print(table)
+    for d in cohort.differences():
+        unit = "" if d.unit == "1" else f" {d.unit}"
+        out.print(f"{plain(d.quantity)}: {plain(d.b)} - {plain(d.a)} = {d.difference:.3g}{unit} "
+                  f"(95 %: {d.low:.3g} to {d.high:.3g})", highlight=False)  # fmt: skip
+    for name, why in cohort.failed.items():
+        err.print(f"[bold red]not fitted:[/] {plain(name)}: {plain(why)}", highlight=False)
+    out.print(f"Written: {folder}/cohort.csv and a folder for each target", highlight=False)
+
+
+def _cell(estimate: Any) -> str:
+    if estimate is None:
+        return ""
+    return f"({estimate.value:.3g})" if estimate.stderr is None else f"{estimate.value:.3g}±{estimate.stderr:.1g}"

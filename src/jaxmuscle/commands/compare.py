@@ -1,0 +1,81 @@
+"""`jaxmuscle compare`."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from jaxmuscle._common.progress import progress
+
+from .console import CONVERGED, NOT_CONVERGED, csv_text, err, out, plain, reporting, save_figure, writable
+from .options import Output, Seed, TaskName, fixed_values
+
+if TYPE_CHECKING:
+    from jaxmuscle.comparison._comparison import Comparison
+
+
+def compare(
+    target: Annotated[
+        str, typer.Argument(help="Bundled target (see `jaxmuscle targets`) or path of a .toml, .csv, .json, .tar.")
+    ],
+    task: Annotated[TaskName | None, typer.Option(help="Default: follows from what the target measured.")] = None,
+    free: Annotated[str | None, typer.Option(metavar="NAMES", help="Comma-separated; replaces the default set.")] = None,
+    fix: Annotated[
+        list[str] | None, typer.Option(metavar="NAME=VALUE", help="Set a parameter and keep it; repeatable.")
+    ] = None,
+    seed: Seed = 0,
+    segments: Annotated[int | None, typer.Option(min=1, help="Welch segments behind the target.")] = None,
+    quantity: Annotated[str | None, typer.Option(help="force, torque or displacement.")] = None,
+    output: Output = Path("out"),
+) -> None:
+    """Compare the colours of noise, each with and without a harmonic, on one target.
+
+    Writes DIR/compare.csv, DIR/compare.json and DIR/compare.png, prints the table and which of them can be told apart. A
+    noise that the task cannot carry is left out, and why is said.
+
+    Examples:
+
+        jaxmuscle compare vastus-lateralis-26mvc --out out/compare
+
+        jaxmuscle compare my-spectrum.csv --segments 45 --fix k_w=450000 --fix c_w=55
+
+        jaxmuscle compare my-displacement.csv --quantity displacement --segments 12
+    """
+    with reporting():
+        from jaxmuscle._common.environment import keep_compiled_programs
+        from jaxmuscle.comparison._compare import compare_noise
+        from jaxmuscle.data._target import load_target
+        from jaxmuscle.model._tasks import TASKS
+        from jaxmuscle.objective._arguments import task_for
+
+        keep_compiled_programs()
+        fixed = fixed_values(fix or [])
+        names = None if free is None else [name.strip() for name in free.split(",") if name.strip()]
+        aim = load_target(target, quantity=quantity, segments=segments)
+        model = task_for(aim) if task is None else TASKS[task](settings=aim.settings)
+        writable(output)
+        for notice in aim.notices:
+            err.print(f"[yellow]notice:[/] {plain(notice)}", highlight=False)
+        with progress(f"comparing noises on {aim.name}") as tell:
+            found = compare_noise(model, aim, free=names, fix=fixed, key=seed, progress=tell)
+        _write(found, output)
+        _show(found, output)
+    raise typer.Exit(CONVERGED if found.success else NOT_CONVERGED)
+
+
+def _write(found: "Comparison", folder: Path) -> None:
+    from jaxmuscle._common.files import write_text
+
+    rows = found.table()
+    write_text(folder / "compare.csv", csv_text({name: [row[name] for row in rows] for name in rows[0]}))
+    found.save(folder / "compare.json")
+    save_figure(found.plot(), folder / "compare.png")
+
+
+def _show(found: "Comparison", folder: Path) -> None:
+    out.print(plain(found), highlight=False, soft_wrap=True)
+    if not found.success:
+        out.print(
+            "[bold red]failed:[/] not every model came to its maximum: fix a parameter, or free fewer", highlight=False
+        )
+    out.print(f"Written: {folder}/compare.csv, compare.json, compare.png", highlight=False)

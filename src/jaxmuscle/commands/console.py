@@ -1,0 +1,106 @@
+"""What commands share: the terminal, exit codes, errors in one line, files that are written."""
+
+import contextlib
+import csv
+import io
+import os
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import typer
+from rich.console import Console
+
+from .options import TaskName
+
+if TYPE_CHECKING:
+    from jaxmuscle.fits._result import FitResult
+
+
+def write_fit(result: "FitResult", folder: Path) -> None:
+    """fit.json, spectrum.csv and fit.png, each whole or not there."""
+    from jaxmuscle._common.files import write_text
+
+    result.save(folder / "fit.json")
+    columns = {"frequency_hz": result.frequency_hz, "target": result.target.proportional_power, "fitted": result.fitted,
+               "harmonic_share": result.harmonic_share, "residual_sd": result.residual}  # fmt: skip
+    write_text(folder / "spectrum.csv", csv_text(columns))
+    save_figure(result.plot(), folder / "fit.png")
+
+
+CONVERGED, NOT_CONVERGED, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
+
+out = Console(soft_wrap=False)
+err = Console(stderr=True, soft_wrap=not sys.stderr.isatty())  # a message is one line of a log
+
+
+def task_of(preset: str, task: TaskName | None) -> Any:
+    """The task of a preset, its muscle put into another task if one is named."""
+    from jaxmuscle.model._presets import load_preset
+    from jaxmuscle.model._tasks import TASKS
+
+    model = load_preset(preset)
+    return model if task is None or type(model) is TASKS[task] else model.as_task(TASKS[task])
+
+
+@contextlib.contextmanager
+def reporting() -> Iterator[None]:
+    """Turn a user's mistake into one line and exit code 2, a numerical failure into 1, an interruption into 130."""
+    from jaxmuscle._common.errors import SimulationError
+
+    try:
+        yield
+    except (ValueError, OSError) as error:
+        err.print(f"[bold red]error:[/] {plain(_words(error))}", highlight=False)
+        raise typer.Exit(BAD_INPUT) from None
+    except SimulationError as error:
+        err.print(f"[bold red]failed:[/] {plain(error)}", highlight=False)
+        raise typer.Exit(NOT_CONVERGED) from None
+    except KeyboardInterrupt:
+        err.print("interrupted")
+        raise typer.Exit(INTERRUPTED) from None
+
+
+def _words(error: Exception) -> str:
+    if isinstance(error, OSError) and error.filename is not None:
+        return f"{error.filename}: {error.strerror}"
+    return str(error)
+
+
+def plain(text: object) -> str:
+    return str(text).replace("[", r"\[")
+
+
+def writable(folder: Path) -> None:
+    """Fail before the long work, not after it."""
+    if folder.exists() and not folder.is_dir():
+        raise ValueError(f"--out {folder}: is a file, give a folder")
+    folder.mkdir(parents=True, exist_ok=True)
+    if not os.access(folder, os.W_OK | os.X_OK):
+        raise ValueError(f"--out {folder}: cannot be written to")
+
+
+def csv_text(columns: dict[str, Any]) -> str:
+    """Columns as CSV; numbers with eight digits, None as an empty field."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(columns)
+    writer.writerows([_field(value) for value in row] for row in zip(*columns.values(), strict=True))
+    return text.getvalue()
+
+
+def _field(value: Any) -> str:
+    if value is None or isinstance(value, str | bool):
+        return "" if value is None else str(value)
+    return f"{value:.8g}"
+
+
+def save_figure(figure: Any, path: Path) -> None:
+    import matplotlib.pyplot as plt
+
+    from jaxmuscle._common.files import replacing
+
+    with replacing(path) as temporary:
+        figure.savefig(temporary, dpi=150)
+    plt.close(figure)

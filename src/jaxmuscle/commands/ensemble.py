@@ -1,0 +1,195 @@
+"""`jaxmuscle ensemble`."""
+
+import json
+import os
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from jaxmuscle._common.progress import progress
+
+from .console import NOT_CONVERGED, err, out, reporting, task_of
+from .options import Preset, Seed, TaskName
+
+if TYPE_CHECKING:
+    from jaxmuscle.ensembles._layout import Pace
+    from jaxmuscle.model._tasks import AbstractTask
+
+
+Devices = Annotated[int | None, typer.Option(min=1, help="Cores of a CPU to use, each as a device; all by default.")]
+Json = Annotated[bool, typer.Option("--json", help="One JSON object per line instead of text.")]
+
+
+class Precision(StrEnum):
+    single = "float32"
+    double = "float64"
+
+
+def ensemble(
+    preset: Preset,
+    seeds: Annotated[int, typer.Option(help="Noise paths.")],
+    output: Annotated[Path, typer.Option("--out", metavar="FILE.zarr", help="The store.")],
+    task: Annotated[TaskName | None, typer.Option(help="Put the same muscle into another task.")] = None,
+    seed: Seed = 0,
+    vary: Annotated[
+        list[str] | None, typer.Option(metavar="NAME=VALUES", help="Sweep: k_w=4e5,5e5; several make a grid.")
+    ] = None,
+    duration: Annotated[float, typer.Option(help="Simulated time [s].")] = 15.0,
+    dt: Annotated[float, typer.Option(help="Step of the noise [s].")] = 1e-3,
+    reduce: Annotated[bool, typer.Option("--reduce", help="Keep moments, quantiles and the mean spectrum only.")] = False,
+    states: Annotated[bool, typer.Option("--states", help="Keep the states too.")] = False,
+    resume: Annotated[bool, typer.Option("--resume", help="Continue an interrupted store.")] = False,
+    precision: Annotated[Precision, typer.Option(help="Of the simulation.")] = Precision.single,
+    chunk: Annotated[int | None, typer.Option(min=1, help="Seeds (times points) simulated at once.")] = None,
+    devices: Devices = None,
+    coordinator: Annotated[str | None, typer.Option(metavar="HOST:PORT", help="Process 0 of several.")] = None,
+    processes: Annotated[int | None, typer.Option(min=1, help="How many processes.")] = None,
+    process_id: Annotated[int | None, typer.Option(help="Which of them this is, from 0.")] = None,
+    as_json: Json = False,
+) -> None:
+    """Simulate any number of seeds into a zarr store, in chunks, on all cores, resumable.
+
+    The store has the dimensions seed, time and frequency (and point with --vary); its attribute `complete` is set last.
+    Under SLURM or Open MPI, or with --coordinator, several processes share the work.
+
+    Examples:
+
+        jaxmuscle ensemble zagrodny-slifkin --seeds 10000 --out out/runs.zarr
+
+        jaxmuscle ensemble out/fit/fit.json --seeds 1000000 --reduce --resume --out out/moments.zarr
+    """
+    with alone_or_together(coordinator, processes):
+        from jaxmuscle._common.environment import keep_compiled_programs
+        from jaxmuscle.ensembles._processes import join, launched
+
+        if states and reduce:
+            raise ValueError("--states belongs to a store of trajectories: leave out --reduce")
+        use(precision, devices, cores(coordinator, processes))
+        if launched() or any(given is not None for given in (coordinator, processes, process_id)):
+            join(coordinator, processes, process_id)
+        keep_compiled_programs()
+        model = task_of(preset, task)
+        settings = {"duration": duration, "dt": dt, "chunk": chunk, "resume": resume, "states": states}
+        if not run(model, swept(model, vary or []), seeds, seed, output, settings, reduce=reduce, as_json=as_json):
+            raise typer.Exit(NOT_CONVERGED)
+
+
+def run(
+    model: "AbstractTask", sweep: Any, seeds: int, seed: int, output: Path, settings: dict, *, reduce: bool, as_json: bool
+) -> bool:
+    """Simulate and say how it went; whether every seed stayed finite."""
+    import jax
+
+    from jaxmuscle._common.text import listed
+    from jaxmuscle.ensembles._ensemble import ensemble as simulate_all
+    from jaxmuscle.ensembles._layout import Watch
+    from jaxmuscle.ensembles._store import attributes_of
+
+    first = jax.process_index() == 0
+    before = attributes_of(output).get("complete") if settings["resume"] and output.exists() else None
+    if settings["resume"] and first and not before and not as_json:
+        err.print(f"{output}: {'there is no store yet, starting one' if before is None else 'resuming'}", highlight=False)
+    begun = time.monotonic()
+    with watching(f"{seeds} seeds", first=first, as_json=as_json) as tell:
+        kept: Any = {"reduce": True} if reduce else {}
+        found: Any = simulate_all(model if sweep is None else sweep, jax.random.key(seed), seeds=seeds, store=output,
+                                  progress=Watch(tell), **kept, **settings)  # fmt: skip
+    failed, elapsed = json.loads(attributes_of(output)["failed"]), time.monotonic() - begun
+    if not first:
+        return not failed
+    if as_json:
+        print(json.dumps({"event": "done", "out": str(output), "seeds": seeds, "elapsed_s": round(elapsed, 3),
+                          "failed": failed}), flush=True)  # fmt: skip
+        return not failed
+    if reduce:
+        out.print(str(found), highlight=False)
+    else:
+        sizes = ", ".join(f"{name} {size}" for name, size in found.sizes.items())
+        out.print(f"{type(model).__name__}: {', '.join(map(str, found.data_vars))} ({sizes})", highlight=False)
+    if failed and not reduce:
+        shown = listed([seed for _, seed in failed])
+        err.print(f"[bold red]failed:[/] {len(failed)} seed(s) did not stay finite ({shown}): lower the noise or dt")
+    said = f"{output}: was complete, nothing to do" if before else f"Written: {output} in {elapsed:.1f} s"
+    out.print(said, highlight=False, soft_wrap=True)
+    return not failed
+
+
+@contextmanager
+def watching(title: str, *, first: bool, as_json: bool) -> Iterator[Callable[["Pace"], None]]:
+    """A bar on a terminal, or a JSON line a second; nothing from the second process on."""
+    if not first:
+        yield lambda pace: None
+    elif as_json:
+        said = 0.0
+
+        def line(pace: "Pace") -> None:
+            nonlocal said
+            now = time.monotonic()
+            if now - said >= 1.0 or pace.done == pace.total:
+                said = now
+                numbers = {name: round(value, 3) for name, value in pace._asdict().items()}
+                print(json.dumps({"event": "progress"} | numbers), flush=True)
+
+        yield line
+    else:
+        with progress(title) as tell:
+            yield lambda pace: tell(str(pace), pace.done / pace.total)
+
+
+@contextmanager
+def alone_or_together(coordinator: str | None, processes: int | None) -> Iterator[None]:
+    """As `reporting`; one of several processes that fails ends at once, so that the others notice."""
+    from jaxmuscle._common.errors import ProcessLostError
+    from jaxmuscle.ensembles._processes import launched, leave
+
+    try:
+        with reporting():
+            try:
+                yield
+            except ProcessLostError as error:
+                err.print(f"[bold red]failed:[/] {error}. What is complete stays: start all processes again with --resume")
+                raise typer.Exit(NOT_CONVERGED) from None
+    except typer.Exit as stop:
+        if stop.exit_code and (launched() or (coordinator is not None and processes not in (None, 1))):
+            leave(stop.exit_code)
+        raise
+
+
+def swept(model: "AbstractTask", vary: list[str]) -> Any:
+    """The grid that --vary asks for, or None."""
+    from jaxmuscle.ensembles._sweep import Sweep
+
+    values = {}
+    for entry in vary:
+        name, _, text = entry.partition("=")
+        try:
+            values[name.strip()] = [float(number) for number in text.split(",")]
+        except ValueError:
+            raise ValueError(f"--vary {entry}: give a name and numbers, such as k_w=4e5,5e5") from None
+    return Sweep.grid(model, **values) if values else None
+
+
+def cores(coordinator: str | None, processes: int | None) -> int:
+    """How many cores of a CPU become devices: all that this process may use, shared by processes of one machine."""
+    usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    host = (coordinator or "").partition(":")[0]
+    return max(1, usable // processes) if host in ("127.0.0.1", "localhost") and processes else usable
+
+
+def use(precision: Precision, devices: int | None, usable: int) -> None:
+    """Set JAX up before it starts: precision, and as many devices as asked for, or as are usable."""
+    import jax
+
+    jax.config.update("jax_enable_x64", precision is Precision.double)
+    try:
+        jax.config.update("jax_num_cpu_devices", usable if devices is None else devices)
+    except RuntimeError:
+        if devices not in (None, jax.local_device_count()):
+            raise ValueError(
+                f"--devices {devices}: JAX runs in this process already, with {jax.local_device_count()}"
+            ) from None

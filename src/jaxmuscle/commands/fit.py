@@ -1,0 +1,144 @@
+"""`jaxmuscle fit`."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.table import Table
+
+from jaxmuscle._common.progress import progress
+
+from .console import CONVERGED, INTERRUPTED, NOT_CONVERGED, err, out, plain, reporting, writable, write_fit
+from .options import AxisName, MethodName, NoiseName, Output, ResidualName, Seed, TaskName, fixed_values
+
+if TYPE_CHECKING:
+    from jaxmuscle.fits._result import FitResult
+
+
+def fit(
+    target: Annotated[
+        list[str], typer.Argument(help="Bundled target (see `jaxmuscle targets`) or path of a .toml, .csv, .json, .tar.")
+    ],
+    task: Annotated[TaskName | None, typer.Option(help="Default: follows from what the target measured.")] = None,
+    method: Annotated[
+        MethodName, typer.Option(help="Spectrum in linear response, then corrected; or simulated.")
+    ] = MethodName.linear,
+    noise: Annotated[NoiseName, typer.Option(help="Colour of the noise.")] = NoiseName.band_limited,
+    residual: Annotated[ResidualName, typer.Option(help="What is compared.")] = ResidualName.log,
+    free: Annotated[str | None, typer.Option(metavar="NAMES", help="Comma-separated; replaces the default set.")] = None,
+    fix: Annotated[
+        list[str] | None, typer.Option(metavar="NAME=VALUE", help="Set a parameter and keep it; repeatable.")
+    ] = None,
+    starts: Annotated[
+        int | None, typer.Option(min=1, help="Starting points; 100, or 8 where there is no linear response.")
+    ] = None,
+    seeds: Annotated[
+        int | None, typer.Option(min=1, help="Noise paths; 32, or 48 where there is no linear response.")
+    ] = None,
+    seed: Seed = 0,
+    segments: Annotated[int | None, typer.Option(min=1, help="Welch segments behind the target.")] = None,
+    quantity: Annotated[str | None, typer.Option(help="force, torque or displacement.")] = None,
+    dataset: Annotated[str | None, typer.Option(metavar="NAME", help="Which dataset of a digitised figure.")] = None,
+    axis: Annotated[
+        AxisName, typer.Option(help="log-log: a digitised figure's points are log10 of Hz and of power.")
+    ] = AxisName.linear,
+    groups: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="CSV with the columns target, group (several targets).")
+    ] = None,
+    output: Output = Path("out"),
+) -> None:
+    """Fit the muscle to a target spectrum, or to those of many people together.
+
+    Prints a table and writes DIR/fit.json, DIR/fit.png and DIR/spectrum.csv. Several targets: DIR/TARGET/... and
+    DIR/cohort.csv, cohort.png (and differences.csv with groups); fitted in linear response, without its last checks.
+
+    Examples:
+
+        jaxmuscle fit vastus-lateralis-26mvc --out out/fit
+
+        jaxmuscle fit my-spectrum.csv --segments 12 --noise ornstein-uhlenbeck
+
+        jaxmuscle fit fdi-abduction-45mvc --fix m_w=0.1 --free c_w,noise_K_w
+
+        jaxmuscle fit people/*.csv --groups groups.csv --out out/cohort
+
+        jaxmuscle fit figure.tar --dataset "95 MVC" --segments 6
+    """
+    with reporting():
+        from jaxmuscle._common.environment import keep_compiled_programs
+        from jaxmuscle.data._target import load_target
+
+        keep_compiled_programs()
+        fixed = fixed_values(fix or [])
+        names = None if free is None else [name.strip() for name in free.split(",") if name.strip()]
+        read = {"quantity": quantity, "segments": segments, "dataset": dataset, "axis": str(axis)}
+        options = {
+            "free": names,
+            "fix": fixed,
+            "noise": str(noise),
+            "residual": str(residual),
+            "starts": starts,
+            "key": seed,
+        }
+        if len(target) > 1:
+            from .cohort import fit_together
+
+            if method != MethodName.linear or seeds is not None:
+                raise ValueError("several targets are fitted together in linear response: leave out --method and --seeds, "
+                                 "or fit them one at a time")  # fmt: skip
+            raise typer.Exit(fit_together(target, read, task, groups, output, options))
+        if groups is not None:
+            raise ValueError("--groups needs several targets")
+        options |= {"method": str(method), "seeds": seeds}
+        converged = _fit_one(load_target(target[0], **read), task, output, options)  # pyright: ignore[reportArgumentType]
+    raise typer.Exit(CONVERGED if converged else NOT_CONVERGED)
+
+
+def _fit_one(target: Any, task: TaskName | None, folder: Path, options: dict[str, Any]) -> bool:
+    from jaxmuscle.fits._fit import fit as fit_task
+    from jaxmuscle.fits._search import FitInterrupted
+    from jaxmuscle.model._tasks import TASKS
+    from jaxmuscle.objective._arguments import task_for
+
+    model = task_for(target) if task is None else TASKS[task](settings=target.settings)
+    writable(folder)
+    for notice in target.notices:
+        err.print(f"[yellow]notice:[/] {plain(notice)}", highlight=False)
+    try:
+        with progress(f"fitting {target.name}") as tell:
+            result = fit_task(model, target, progress=tell, **options)
+    except FitInterrupted as stop:
+        write_fit(stop.result, folder)
+        err.print(f"interrupted: what had been reached is in {folder}")
+        raise typer.Exit(INTERRUPTED) from None
+    write_fit(result, folder)
+    _show_fit(result, folder)
+    return result.success
+
+
+def _show_fit(result: "FitResult", folder: Path) -> None:
+    table = Table(title=f"{result.target.name}: {type(result.task).__name__}, {type(result.task.noise).__name__}",
+                  title_justify="left")  # fmt: skip
+    for column, justify in (("parameter", "left"), ("value", "right"), ("std. error", "right"), ("unit", "left")):
+        table.add_column(column, justify=justify)  # pyright: ignore[reportArgumentType]
+    free = [(name, p) for name, p in result.parameters.items() if p.free]
+    for name, p in [*free, *result.derived.items()]:
+        if name == next(iter(result.derived), None):
+            table.add_section()
+        error = p.error_in_words() if p.stderr is not None else f"[dim]{p.error_in_words()}[/]"
+        table.add_row(name, f"{p.value:.4g}", error, "" if p.unit == "1" else p.unit)
+    out.print(table)
+    if result.chi2_per_bin is not None:
+        out.print(f"chi² per bin {result.chi2_per_bin:.2f}, rms log error {result.rms_log_error:.2f}", highlight=False)
+    for sentence in result.remarks:
+        out.print(plain(sentence[0].upper() + sentence[1:]), highlight=False)
+    if result.undetermined:
+        out.print("Not determined by the data (kept near the default by the prior):", highlight=False)
+        for sentence in result.undetermined:
+            out.print(f"  - {plain(sentence)}", highlight=False)
+    for notice in result.notices:
+        if notice not in result.target.notices:
+            out.print(f"[yellow]notice:[/] {plain(notice)}", highlight=False)
+    word = "[green]converged[/]" if result.success else "[bold red]failed[/]"
+    out.print(f"{word}: {plain(result.message)}", highlight=False)
+    out.print(f"Written: {folder}/fit.json, fit.png, spectrum.csv", highlight=False)

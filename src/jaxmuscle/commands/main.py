@@ -1,0 +1,85 @@
+"""The `jaxmuscle` command."""
+
+import gc
+import os
+import sys
+from typing import Annotated
+
+import typer
+from rich.table import Table
+
+from jaxmuscle.__about__ import __version__
+from jaxmuscle._common.bundled import describe_presets, describe_targets
+
+from .analyse import analyse
+from .compare import compare
+from .console import out, plain
+from .ensemble import ensemble
+from .fit import fit
+from .posterior import posterior
+from .reproduce import reproduce
+from .simulate import simulate
+from .speed import speed
+
+app = typer.Typer(add_completion=False, no_args_is_help=True, rich_markup_mode="markdown", pretty_exceptions_enable=False)
+
+
+app.command()(fit)
+app.command()(simulate)
+app.command()(ensemble)
+app.command()(analyse)
+app.command()(posterior)
+app.command()(compare)
+app.command()(reproduce)
+app.command()(speed)
+
+
+def show_version(wanted: bool) -> bool:
+    if wanted:
+        out.print(f"jaxmuscle {__version__}", highlight=False)
+        raise typer.Exit
+    return wanted
+
+
+@app.callback()
+def common(
+    version: Annotated[
+        bool, typer.Option("--version", is_eager=True, callback=show_version, help="Show the version and exit.")
+    ] = False,
+) -> None:
+    """A stochastic rheological muscle: simulate its force, analyse recordings, fit it to measured force spectra."""
+
+
+@app.command()
+def targets() -> None:
+    """List the bundled targets."""
+    table = Table(title="Bundled targets", title_justify="left")
+    for column in ("name", "provenance", "quantity", "source"):
+        table.add_column(column, overflow="fold", no_wrap=column == "name")
+    for entry in describe_targets():
+        first = entry.source.replace("Fig. ", "Fig.\N{NO-BREAK SPACE}").partition(". ")[0]
+        table.add_row(entry.name, entry.provenance, entry.quantity, plain(first))
+    out.print(table)
+
+
+@app.command()
+def presets() -> None:
+    """List the bundled presets (saved tasks)."""
+    table = Table(title="Bundled presets", title_justify="left")
+    for column in ("name", "task", "description"):
+        table.add_column(column, overflow="fold", no_wrap=column != "description")
+    for entry in describe_presets():
+        table.add_row(entry.name, entry.task, plain(entry.description))
+    out.print(table)
+
+
+def main() -> None:
+    """Entry point of the console script."""
+    os.environ.setdefault("MPLBACKEND", "Agg")
+    # Tracing makes many objects that stay: a tenth of a command would go into looking for cycles among them.
+    gc.set_threshold(200_000, 10, 10)
+    app(prog_name="jaxmuscle")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,51 @@
+"""`jaxmuscle reproduce`."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from .console import err, out, reporting, writable
+from .options import Output
+
+
+def reproduce(
+    output: Output = Path("out/reproduce"),
+    recording: Annotated[
+        list[Path] | None,
+        typer.Option(metavar="FILE", help="One of three people's recordings, for Figures 7 and 8; three times."),
+    ] = None,
+) -> None:
+    """Draw the figures of the paper and check every number that it states.
+
+    Writes DIR/index.html (open it in a browser), DIR/fig2 ... fig8 as .png and .pdf, and DIR/claims.json.
+
+    Examples:
+
+        jaxmuscle reproduce --out out/reproduce
+
+        jaxmuscle reproduce --recording anna.csv --recording ben.csv --recording chris.csv
+    """
+    with reporting():
+        from jaxmuscle._common.environment import keep_compiled_programs
+        from jaxmuscle.paper._numbers import given_recordings
+
+        keep_compiled_programs()
+        writable(output)
+        given = given_recordings(recording) if recording else None
+        _reproduce(output, given)
+
+
+def _reproduce(folder: Path, given) -> None:
+    from collections import Counter
+
+    from jaxmuscle.paper._claims import check
+    from jaxmuscle.paper._reproduce import reproduce
+
+    rows = check(reproduce(folder, given, progress=err.is_terminal))
+    count = Counter(row.verdict for row in rows)
+    out.print(f"{len(rows)} statements: " + ", ".join(f"{n} {verdict}" for verdict, n in count.items()), highlight=False)
+    for row in rows:
+        if row.verdict == "does not agree":
+            out.print(f"does not agree: {row.says} ({row.source}): {row.ours}", highlight=False, markup=False)
+    out.print(f"Written: {folder}/index.html, fig2 to fig8 (.png, .pdf), claims.json", highlight=False)

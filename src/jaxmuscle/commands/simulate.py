@@ -1,0 +1,70 @@
+"""`jaxmuscle simulate`."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from .console import csv_text, err, out, reporting, save_figure, task_of, writable
+from .options import Output, Preset, Seed, TaskName
+
+if TYPE_CHECKING:
+    from jaxmuscle.model._tasks import AbstractTask
+
+
+def simulate(
+    preset: Preset,
+    task: Annotated[TaskName | None, typer.Option(help="Put the same muscle into another task.")] = None,
+    seeds: Annotated[int, typer.Option(min=1, help="Noise paths.")] = 50,
+    seed: Seed = 0,
+    output: Output = Path("out"),
+) -> None:
+    """Simulate a saved task.
+
+    Writes DIR/trajectories.nc, DIR/spectrum.csv and DIR/simulate.png.
+
+    Examples:
+
+        jaxmuscle simulate zagrodny-slifkin --seeds 200 --out out/simulate
+
+        jaxmuscle simulate out/fit/fit.json --task prescribed-force
+    """
+    with reporting():
+        from jaxmuscle._common.environment import keep_compiled_programs
+
+        keep_compiled_programs()
+        model = task_of(preset, task)
+        writable(output)
+        _simulate(model, seeds, seed, output)
+
+
+def _simulate(model: "AbstractTask", seeds: int, seed: int, folder: Path) -> None:
+    import jax
+    import numpy as np
+
+    from jaxmuscle import plot
+    from jaxmuscle._common.files import replacing, write_text
+    from jaxmuscle.ensembles._ensemble import ensemble
+    from jaxmuscle.spectra._measures import coefficient_of_variation, peaks
+
+    runs = ensemble(model, jax.random.key(seed), seeds=seeds, progress=err.is_terminal)
+    spectra = runs.spectrum()
+    estimate = runs.mean_spectrum()
+    mean = estimate.spectrum
+    dataset = runs.to_xarray().assign_attrs(seed=seed)
+    with replacing(folder / "trajectories.nc") as temporary:
+        dataset.to_netcdf(temporary, engine="h5netcdf")
+    low, high = np.quantile(np.asarray(spectra.proportional), [0.05, 0.95], axis=0)
+    columns = {"frequency_hz": np.asarray(mean.frequency), "power": np.asarray(mean.power), "power_stderr": estimate.stderr,
+               "proportional_power": np.asarray(mean.proportional), "quantile_05": low, "quantile_95": high}  # fmt: skip
+    write_text(folder / "spectrum.csv", csv_text(columns))
+    save_figure(plot.simulation(runs), folder / "simulate.png")
+    held = runs.filtered()
+    found = peaks(mean)
+    variation = 100 * np.mean(coefficient_of_variation(held))
+    out.print(f"{type(model).__name__}, {seeds} seeds of {runs.time[-1]:g} s", highlight=False)
+    level = f"{held.mean():.4g} {model.output_unit}"
+    out.print(f"{model.output_name}: mean {level}, coefficient of variation {variation:.3g} %", highlight=False)
+    locals_ = ", ".join(f"{p.frequency:.3f}" for p in found.local_maxima) or "none"
+    out.print(f"Spectrum: maximum at {found.maximum.frequency:.3f} Hz, local maxima at {locals_} Hz", highlight=False)
+    out.print(f"Written: {folder}/trajectories.nc, spectrum.csv, simulate.png", highlight=False)

@@ -1,0 +1,38 @@
+"""`jaxmuscle speed`."""
+
+import json
+from typing import Annotated
+
+import typer
+
+from .console import out, reporting, task_of
+from .ensemble import Devices, Json, Precision, cores, use
+from .options import TaskName
+
+
+def speed(
+    preset: Annotated[str | None, typer.Argument(help="Preset or fit.json; the default isometric task without.")] = None,
+    task: Annotated[TaskName | None, typer.Option(help="Put the same muscle into another task.")] = None,
+    seeds: Annotated[int, typer.Option(min=1, help="Noise paths.")] = 2048,
+    duration: Annotated[float, typer.Option(help="Simulated time [s].")] = 15.0,
+    precision: Annotated[Precision, typer.Option(help="Of the simulation.")] = Precision.single,
+    devices: Devices = None,
+    as_json: Json = False,
+) -> None:
+    """Measure this machine: compile time, steps/s, real-time factor, memory.
+
+    Reduces an ensemble as `jaxmuscle ensemble --reduce` does, without control variate; medians of three calls.
+    """
+    with reporting():
+        from jaxmuscle.ensembles._speed import measure
+        from jaxmuscle.model._tasks import TASKS, Isometric
+
+        use(precision, devices, cores(None, None))
+        model = task_of(preset, task) if preset else Isometric() if task is None else TASKS[task]()
+        found = measure(model, seeds, duration)
+        if as_json:
+            print(json.dumps(found))
+            return
+        for name, value in found.items():
+            shown = f"{value:.4g}" if isinstance(value, float) else str(value)
+            out.print(f"{name.replace('_', ' '):<28}{shown}", highlight=False)

@@ -1,0 +1,177 @@
+"""Which colour of noise, with or without a harmonic, explains a spectrum."""
+
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any, TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from jaxmuscle._common.arrays import as_numbers
+from jaxmuscle._common.progress import teller
+from jaxmuscle._common.text import choices
+from jaxmuscle.data._target import Target
+from jaxmuscle.model._parameters import PARAMETERS
+from jaxmuscle.model._tasks import NOISES, AbstractTask, with_noise
+from jaxmuscle.objective._arguments import planned
+from jaxmuscle.objective._coordinates import at
+from jaxmuscle.objective._problem import Setup
+from jaxmuscle.spectra._bin_law import bin_statistics, standardised
+
+from ._comparison import NEEDED, ComparedModel, Comparison, score_difference
+from ._evidence import Folds, Model, held_out, masked_bins, maxima
+
+Value = TypeVar("Value")
+
+
+def compare_noise(
+    task: AbstractTask,
+    target: Target,
+    *,
+    noises: Iterable[str] = tuple(NOISES),
+    free: Iterable[str] | None = None,
+    fix: Mapping[str, float] | None = None,
+    priors: Mapping[str, float | None] | None = None,
+    bounds: Mapping[str, tuple[float, float]] | None = None,
+    groups: int = 10,
+    key: Array | int = 0,
+    progress: bool | Callable[[str, float], None] = False,
+) -> Comparison:
+    """Fit a spectrum with every colour of noise, with and without harmonic, and say which can be told apart.
+
+    Each model is climbed, in linear response, to the highest of the maxima of its posterior from 64 starting points (16
+    without harmonic). There
+
+        AIC = -2 ln L + 2 p,    p = tr(F (F + Λ)⁻¹),
+
+    L the gamma-copula likelihood of the Welch bins with the total integrated out, F their Fisher information, Λ the prior's
+    precision; and the held-out score `Σ_k ln f(p_k | bins kept)`: the bins are left out in `groups` turns, every
+    `groups`-th at a time, and each is foretold by a fit to the rest. Two models are told apart if their AIC differs by at
+    least 6 and the held-out score says the same (docs/noise-colour.md); a harmonic whose frequency is free has to gain
+    6 + 2 ln(bins).
+
+    **Arguments:** `task`, whose own noise keeps its values while the others take their defaults; `target`; `noises`, names
+    of `NOISES`; `free`, `fix`, `priors`, `bounds` as in `fit`, those of a parameter that one noise has and another has not
+    for those that have it; `groups`; `key`, for an eighth of the starting points; `progress` as in `fit`.
+
+    **Returns:** a `Comparison`. A noise that the task cannot carry is in its `left_out`, with the reason. With a sigma but
+    no segments there is no held-out score.
+
+    **Raises:** `ValueError` if fewer than two noises remain, for a target that states neither segments nor sigma, and as
+    `fit` does.
+
+    **Source:** Akaike 1974, doi:10.1109/TAC.1974.1100705; Murata et al. 1994, doi:10.1109/72.329683; Vehtari, Gelman & Gabry
+    2017, doi:10.1007/s11222-016-9696-4.
+    """
+    if not 2 <= groups <= len(target.bins):
+        raise ValueError(f"groups = {groups}: give a number from 2 to that of the target's bins, {len(target.bins)}")
+    tell = teller(progress)
+    with jax.enable_x64(True):
+        carried, left_out = _carried(task, noises, dict(fix or {}))
+        setups = _setups(carried, target, free, dict(fix or {}), dict(priors or {}), dict(bounds or {}), key)
+        folds = None if target.segments is None else Folds.of([target], groups)
+        found: dict[tuple[str, bool], dict[str, Any]] = {}
+        for number, (noise, setup) in enumerate(setups.items()):
+            for harmonic in (True, False) if float(setup.task["harmonic_amplitude"]) > 0 else (False,):
+                tell(f"{noise}, {'with' if harmonic else 'without'} harmonic", (number + 0.5 * (not harmonic)) / len(setups))
+                found[noise, harmonic] = _fitted(setup, folds, harmonic=harmonic)
+    tell("done", 1.0)
+    sought = any("harmonic_frequency" in setup.coordinates.names for setup in setups.values())
+    needed = NEEDED + 2 * np.log(len(target.bins)) * sought
+    tasks, fitted = ({model: values.pop(name) for model, values in found.items()} for name in ("task", "fitted"))
+    seed = key if isinstance(key, int) else None
+    return Comparison(target, _rows(found), left_out, tasks, fitted, float(needed), groups, seed)
+
+
+def _carried(
+    task: AbstractTask, noises: Iterable[str], fix: dict[str, float]
+) -> tuple[dict[str, AbstractTask], dict[str, str]]:
+    """The task with each noise, or why it cannot have it."""
+    carried: dict[str, AbstractTask] = {}
+    left_out: dict[str, str] = {}
+    for name in dict.fromkeys(noises):
+        if name not in NOISES:
+            raise ValueError(f"noises: {name!r}: {choices(name, NOISES)}")
+        try:
+            carried[name] = task if type(task.noise) is NOISES[name] else with_noise(task, name, fix)
+        except ValueError as error:
+            left_out[name] = str(error)
+    if len(carried) < 2:
+        why = "".join(f"; {name}: {reason}" for name, reason in left_out.items())
+        raise ValueError(f"noises: at least two are needed for a comparison, {len(carried)} can be used{why}")
+    return carried, left_out
+
+
+def _setups(
+    carried: dict[str, AbstractTask],
+    target: Target,
+    free: Iterable[str] | None,
+    fix: dict[str, float],
+    priors: dict[str, float | None],
+    bounds: dict[str, tuple[float, float]],
+    key: Array | int,
+) -> dict[str, Setup]:
+    """The fit of each noise; what concerns a parameter that only other noises have is left to them."""
+    everywhere = {name for task in carried.values() for name in task.parameter_names}
+    everywhere |= {name for name in PARAMETERS if name.startswith("noise_")}
+    chosen = None if free is None else tuple(free)
+    for argument, names in (("free", chosen or ()), ("fix", fix), ("priors", priors), ("bounds", bounds)):
+        for name in names:
+            if name not in everywhere:
+                raise ValueError(f"{argument}: unknown parameter {name!r}: {choices(name, everywhere)}")
+    setups = {}
+    for noise, task in carried.items():
+        own = set(task.parameter_names)
+        names = None if chosen is None else [n for n in chosen if n in own]
+        setups[noise] = planned(task, target, free=names, fix=_of(fix, own), priors=_of(priors, own),
+                                bounds=_of(bounds, own), key=key).setup  # fmt: skip
+    return setups
+
+
+def _of(given: dict[str, Value], names: set[str]) -> dict[str, Value]:
+    return {name: value for name, value in given.items() if name in names}
+
+
+def _fitted(setup: Setup, folds: Folds | None, *, harmonic: bool) -> dict[str, Any]:
+    """One model at its maximum, with its score."""
+    model, target = Model.of(setup, harmonic=harmonic), setup.target
+    moving = np.ones((1, len(setup.prior)))
+    bins = None if folds is None else masked_bins(target, np.ones((1, len(target.bins))))
+    peak = maxima(model, model.starts[None], bins, moving)
+    held = None if folds is None else held_out(model, peak.theta, folds, moving)
+    residual = standardised(target.proportional_power, peak.proportional[0], bin_statistics(target, peak.line[0]))
+    problem = model.likelihood.problem
+    return {
+        "task": as_numbers(at(problem.task, problem.coordinates, jnp.asarray(peak.theta[0]))),
+        "fitted": peak.proportional[0],
+        "log_likelihood": float(peak.log_likelihood[0]),
+        "parameters": float(peak.parameters[0]),
+        "aic": float(2 * (peak.parameters[0] - peak.log_likelihood[0])),
+        "scores": None if held is None else held.scores[0],
+        "chi2_per_bin": float(np.sum(residual**2) / (len(residual) - 1)),
+        "success": bool(peak.settled[0] and (held is None or held.settled[0])),
+    }
+
+
+def _rows(found: dict[tuple[str, bool], dict[str, Any]]) -> tuple[ComparedModel, ...]:
+    """What needs all models: differences to the lowest AIC, and weights."""
+    aic = {model: values["aic"] for model, values in found.items()}
+    best = min(aic, key=lambda model: aic[model] if np.isfinite(aic[model]) else np.inf)
+    weight = {model: np.exp(-0.5 * (value - aic[best])) for model, value in aic.items()}
+    rows = []
+    for model, values in found.items():
+        scores = values["scores"]
+        difference, error = score_difference(scores, found[best]["scores"])
+        rows.append(
+            ComparedModel(
+                *model,
+                delta_aic=aic[model] - aic[best],
+                weight=float(weight[model] / np.nansum(list(weight.values()))),
+                score=None if scores is None else float(scores.sum()),
+                score_difference=difference,
+                score_stderr=error,
+                **values,
+            )
+        )
+    return tuple(rows)

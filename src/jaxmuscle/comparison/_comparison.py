@@ -1,0 +1,298 @@
+"""What a comparison of noises found: a row for each model, which of them can be told apart, in numbers and words."""
+
+import json
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, TypeVar
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Float
+
+from jaxmuscle._common.environment import versions
+from jaxmuscle._common.files import write_text
+from jaxmuscle._common.text import folded
+from jaxmuscle.data._target import Target
+from jaxmuscle.model._presets import task_to_table
+from jaxmuscle.model._tasks import AbstractTask
+
+if TYPE_CHECKING:
+    import xarray
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure, SubFigure
+
+
+FORMAT = 1
+NEEDED = 6.0
+NUMBERS = ("log_likelihood", "parameters", "aic", "delta_aic", "weight", "score", "score_difference", "score_stderr",
+           "chi2_per_bin")  # fmt: skip
+COLUMNS = ("noise", "harmonic", *NUMBERS, "success")
+
+
+class Evidence(NamedTuple):
+    """What a decision looks at: a model's AIC, and its score of every bin, if there is one."""
+
+    aic: float
+    scores: Float[np.ndarray, " bins"] | None
+
+
+class Decision(eqx.Module):
+    """Model `a` against model `b`.
+
+    How much lower the AIC of `a` is (`aic_gain`), how much higher its held-out score (`score_gain`, `score_stderr`; None
+    if nothing was held out). The two are told apart if the AIC differs by at least `needed` and the held-out score, if there
+    is one, says the same.
+    """
+
+    a: str
+    b: str
+    aic_gain: float
+    score_gain: float | None
+    score_stderr: float | None
+    needed: float = NEEDED
+
+    @property
+    def winner(self) -> str | None:
+        """The better one; None if they cannot be told apart."""
+        if not abs(self.aic_gain) >= self.needed or self._score_against:
+            return None
+        return self.a if self.aic_gain > 0 else self.b
+
+    @property
+    def _score_against(self) -> bool:
+        return self.score_gain is not None and not self.score_gain * self.aic_gain > 0
+
+    def __str__(self) -> str:
+        better, worse = (self.a, self.b) if self.aic_gain >= 0 else (self.b, self.a)
+        numbers = f"AIC lower by {abs(self.aic_gain):.1f}"
+        if self.score_gain is not None:
+            gain = self.score_gain if self.aic_gain >= 0 else -self.score_gain
+            numbers += f", held-out score {'higher' if gain >= 0 else 'lower'} by {abs(gain):.1f} ± {self.score_stderr:.1f}"
+        if self.winner is not None:
+            return f"{better} rather than {worse}: {numbers}"
+        open_ = f"{better} and {worse} cannot be told apart"
+        if abs(self.aic_gain) >= self.needed:
+            return f"{open_}: the two measures disagree, {numbers}"
+        return f"{open_}: {numbers}; {self.needed:.3g} in AIC is needed"
+
+
+def decided(names: tuple[str, str], a: Evidence, b: Evidence, needed: float = NEEDED) -> Decision:
+    """The decision between two models, called by `names`."""
+    return Decision(*names, b.aic - a.aic, *score_difference(a.scores, b.scores), needed)
+
+
+def score_difference(
+    a: Float[np.ndarray, " bins"] | None, b: Float[np.ndarray, " bins"] | None
+) -> tuple[float | None, float | None]:
+    """`Σ (a_k - b_k)` and its standard error √n sd(a_k - b_k) (Vehtari, Gelman & Gabry 2017, 10.1007/s11222-016-9696-4)."""
+    if a is None or b is None:
+        return None, None
+    difference = a - b
+    return float(difference.sum()), float(math.sqrt(len(difference)) * difference.std(ddof=1))
+
+
+class ComparedModel(eqx.Module):
+    """One model: a colour of noise, with or without harmonic.
+
+    `log_likelihood` at the maximum of the posterior, the offset integrated out; `parameters`, their effective number
+    p = tr(F (F + Λ)⁻¹); `aic` = -2 ln L + 2 p; `delta_aic` above the lowest; Akaike `weight`; `scores`, log density of every
+    bin foretold from the others, and `score`, their sum; `score_difference` to the model of lowest AIC with `score_stderr`
+    (None where the target has no segments); `chi2_per_bin`; `success`, whether its climbs settled.
+    """
+
+    noise: str
+    harmonic: bool
+    log_likelihood: float
+    parameters: float
+    aic: float
+    delta_aic: float
+    weight: float
+    score: float | None
+    score_difference: float | None
+    score_stderr: float | None
+    chi2_per_bin: float
+    success: bool
+    scores: Float[np.ndarray, " bins"] | None
+
+    needed: ClassVar[float] = NEEDED
+
+    @property
+    def evidence(self) -> "Evidence":
+        """What a decision looks at."""
+        return Evidence(self.aic, self.scores)
+
+    @property
+    def label(self) -> str:
+        """As in "pink, no harmonic"."""
+        return self.noise + ("" if self.harmonic else ", no harmonic")
+
+
+Row = TypeVar("Row", ComparedModel, Evidence)
+
+
+def lowest(rows: list[Row]) -> Row:
+    """The model of lowest AIC."""
+    return min(rows, key=lambda row: row.aic if math.isfinite(row.aic) else math.inf)
+
+
+class Comparison(eqx.Module):
+    """Which noise a spectrum speaks for.
+
+    `rows`, a `ComparedModel` each; `left_out` {noise: why the task cannot carry it}; `tasks` and `fitted` (proportional
+    power on the target's bins) by (noise, harmonic); `harmonic_needed`, by how much the AIC has to be lower with the
+    harmonic; `groups`, the number of turns in which bins were left out; `seed`; `versions`.
+    """
+
+    target: Target
+    rows: tuple[ComparedModel, ...]
+    left_out: dict[str, str]
+    tasks: dict[tuple[str, bool], AbstractTask]
+    fitted: dict[tuple[str, bool], Float[np.ndarray, " bins"]]
+    harmonic_needed: float
+    groups: int
+    seed: int | None
+    versions: dict[str, str] = eqx.field(default_factory=versions)
+
+    @property
+    def success(self) -> bool:
+        """Whether every climb settled."""
+        return all(row.success for row in self.rows)
+
+    @property
+    def best(self) -> ComparedModel:
+        """The model of lowest AIC."""
+        return lowest(list(self.rows))
+
+    @property
+    def noises(self) -> tuple[str, ...]:
+        """The noises compared, lowest AIC first."""
+        names = dict.fromkeys(row.noise for row in self.rows)
+        return tuple(sorted(names, key=lambda name: self.of(name).aic))
+
+    def of(self, noise: str) -> ComparedModel:
+        """The better one, by AIC, of a noise's models with and without harmonic. Raises `ValueError` for another noise."""
+        rows = [row for row in self.rows if row.noise == noise]
+        if not rows:
+            raise ValueError(
+                f"noise = {noise!r}: not compared; there are {', '.join(dict.fromkeys(r.noise for r in self.rows))}"
+            )
+        return lowest(rows)
+
+    def between(self, a: str, b: str) -> Decision:
+        """Two noises, each with or without harmonic, whichever has the lower AIC."""
+        return decided((a, b), self.of(a).evidence, self.of(b).evidence)
+
+    @property
+    def harmonic(self) -> Decision | None:
+        """The best model with a harmonic against the best without; None if the task has none."""
+        sides = [[row for row in self.rows if row.harmonic == present] for present in (True, False)]
+        if not all(sides):
+            return None
+        names = ("a harmonic", "no harmonic")
+        return decided(names, lowest(sides[0]).evidence, lowest(sides[1]).evidence, self.harmonic_needed)
+
+    @property
+    def verdict(self) -> tuple[str, ...]:
+        """Sentences: the best noise against each other one, and whether there is a harmonic."""
+        first, *others = self.noises
+        decisions = [self.between(first, other) for other in others] + ([] if self.harmonic is None else [self.harmonic])
+        said = [str(decision) for decision in decisions]
+        if self.best.scores is None:
+            said.append("the target states no segments: nothing was held out, the AIC decides alone")
+        return tuple(said)
+
+    def table(self) -> list[dict[str, Any]]:
+        """Tidy rows with the keys of `COLUMNS`."""
+        return [{name: getattr(row, name) for name in COLUMNS} for row in self.rows]
+
+    def to_xarray(self) -> "xarray.Dataset":
+        """The numbers over (noise, harmonic), `fitted` and `scores` over frequency as well; NaN for what there is not."""
+        import xarray
+
+        names, present = list(dict.fromkeys(row.noise for row in self.rows)), [True, False]
+        found = {(row.noise, row.harmonic): row for row in self.rows}
+        empty = np.full(len(self.target.bins), np.nan)
+
+        def grid(read: Any, missing: Any) -> list[list[Any]]:
+            values = [[read(found[n, h]) if (n, h) in found else None for h in present] for n in names]
+            return [[missing if value is None else value for value in row] for row in values]
+
+        dims = ("noise", "harmonic")
+        numbers = {name: (dims, grid(lambda row, name=name: getattr(row, name), np.nan)) for name in NUMBERS}
+        spectra = {
+            "fitted": grid(lambda row: self.fitted[row.noise, row.harmonic], empty),
+            "scores": grid(lambda row: row.scores, empty),
+        }
+        return xarray.Dataset(
+            numbers
+            | {name: ((*dims, "frequency"), values) for name, values in spectra.items()}
+            | {
+                "success": (dims, grid(lambda row: row.success, False)),
+                "target": ("frequency", self.target.proportional_power),
+            },
+            coords={"noise": names, "harmonic": present, "frequency": ("frequency", self.target.frequency, {"units": "Hz"})},
+            attrs={"target_name": self.target.name, "verdict": "\n".join(self.verdict)}
+            | {f"left_out_{name}": why for name, why in self.left_out.items()}
+            | {f"version_{package}": number for package, number in self.versions.items()},
+        )
+
+    def to_json(self) -> str:
+        """Everything as JSON, the fitted tasks as presets are."""
+        table = {
+            "format": FORMAT,
+            "target": self.target.name,
+            "rows": [{name: _number(value) for name, value in row.items()} for row in self.table()],
+            "verdict": list(self.verdict),
+            "left_out": self.left_out,
+            "harmonic_needed": self.harmonic_needed,
+            "groups": self.groups,
+            "seed": self.seed,
+            "frequency_hz": self.target.frequency.tolist(),
+            "models": [
+                {
+                    "noise": row.noise,
+                    "harmonic": row.harmonic,
+                    "fitted": [_number(v) for v in self.fitted[row.noise, row.harmonic].tolist()],
+                    "scores": None if row.scores is None else [_number(v) for v in row.scores.tolist()],
+                    "task": task_to_table(self.tasks[row.noise, row.harmonic]),
+                }
+                for row in self.rows
+            ],
+            "target_table": self.target.to_table(),
+            "versions": self.versions,
+        }
+        return json.dumps(table, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
+
+    def save(self, path: str | Path) -> None:
+        """Write `to_json` atomically."""
+        write_text(path, self.to_json())
+
+    def plot(self, ax: "Axes | None" = None) -> "Figure | SubFigure":
+        """The target with the best fit of each noise, AIC and held-out score of every model."""
+        from jaxmuscle.plot._comparison import figure
+
+        return figure(self, ax)
+
+    def __str__(self) -> str:
+        kind = type(next(iter(self.tasks.values()))).__name__
+        head = f"  {'noise':<19}{'line':<5}{'ln L':>9}{'p':>5}{'AIC':>9}{'ΔAIC':>9}{'weight':>7}  held-out"
+        lines = [f"{self.target.name} ({self.target.provenance}), {kind}: which noise?", head]
+        for row in sorted(self.rows, key=lambda row: row.aic):
+            held = "" if row.score is None else f"{_short(row.score_difference)} ± {_short(row.score_stderr)}"
+            line = (
+                f"  {row.noise:<19}{'yes' if row.harmonic else 'no':<5}{_short(row.log_likelihood):>9}{row.parameters:>5.1f}"
+            )
+            line += f"{_short(row.aic):>9}{_short(row.delta_aic):>9}{row.weight:>7.2f}"
+            lines.append(f"{line}  {held if row.success else 'failed'}")
+        said = [f"left out: {noise}: {why}" for noise, why in self.left_out.items()]
+        for sentence in (*self.verdict, *said):
+            lines.append(f"- {sentence}")
+        return folded(lines)
+
+
+def _short(value: Any) -> str:
+    return f"{value:.1f}" if abs(value) < 1e4 else f"{value:.3g}"
+
+
+def _number(value: Any) -> Any:
+    return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -1,0 +1,224 @@
+"""One model against one data set or many: highest maximum, effective parameters, and how well it foretells bins left out."""
+
+import dataclasses
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from jaxmuscle.data._target import Target
+from jaxmuscle.objective._consequences import BATCH, seen_at
+from jaxmuscle.objective._likelihood import Bins, Likelihood, _precision
+from jaxmuscle.objective._problem import Setup
+from jaxmuscle.objective._scoring import Peak, climb
+from jaxmuscle.objective._starts import points_about, starting_points
+from jaxmuscle.response._expected import Moments
+from jaxmuscle.spectra._bin_law import welch_law
+
+SPREAD, RANDOM, PLAIN = 24, 8, 16
+BLOCK, BLOCKS, ENOUGH = 12, 10, 1e-3
+SAME, KEPT = 1e-3, 16
+HARMONIC = ("harmonic_amplitude", "harmonic_frequency")
+
+
+class Maxima(NamedTuple):
+    """The highest maximum of every data set.
+
+    `log_likelihood` has the offset integrated out; `parameters` is the effective number; `line` the harmonic's share of the
+    power of each bin.
+    """
+
+    theta: Float[np.ndarray, "sets free"]
+    log_likelihood: Float[np.ndarray, " sets"]
+    parameters: Float[np.ndarray, " sets"]
+    proportional: Float[np.ndarray, "sets bins"]
+    line: Float[np.ndarray, "sets bins"]
+    settled: Bool[np.ndarray, " sets"]
+
+
+class HeldOut(NamedTuple):
+    """Log density of every bin given the others that were kept, by a fit to those."""
+
+    scores: Float[np.ndarray, "sets bins"]
+    settled: Bool[np.ndarray, " sets"]
+
+
+class Model(NamedTuple):
+    """A likelihood with the precision Λ of its prior, and where to begin."""
+
+    likelihood: Likelihood
+    precision: Float[np.ndarray, " free"]
+    starts: Float[np.ndarray, "starts free"]
+
+    @classmethod
+    def of(cls, setup: Setup, *, harmonic: bool) -> "Model":
+        """Of a setup, or of the same without harmonic: amplitude zero, whatever the coordinates of amplitude and frequency.
+
+        The data then say nothing about these two, so that they stay at their prior's centre and count as no parameters; the
+        compiled programs are those of the model with harmonic.
+        """
+        rng = np.random.default_rng(np.asarray(jax.random.key_data(setup.key)).tolist())
+        names = setup.coordinates.names
+        scattered = 0.5 * rng.standard_normal((RANDOM, len(names)))
+        if harmonic:
+            spread = setup.coordinates.theta(starting_points(setup.coordinates, setup.target, SPREAD))
+            starts = np.concatenate([points_about(setup, np.zeros(len(names))), spread, scattered])
+        else:
+            setup = without_harmonic(setup)
+            spread = setup.coordinates.theta(starting_points(setup.coordinates, setup.target, PLAIN - RANDOM))
+            starts = np.concatenate([spread, scattered])
+            starts[:, [n in HARMONIC for n in names]] = 0.0
+        return cls(Likelihood.of(setup), setup.prior, starts)
+
+
+def without_harmonic(setup: Setup) -> Setup:
+    """The setup with a harmonic of amplitude zero."""
+    names = setup.coordinates.names
+    if "harmonic_amplitude" not in names:
+        return dataclasses.replace(setup, task=setup.task.replace(harmonic_amplitude=0.0))
+    centre = np.where(np.array(names) == "harmonic_amplitude", 0.0, setup.coordinates.centre)
+    return dataclasses.replace(setup, coordinates=eqx.tree_at(lambda c: c.centre, setup.coordinates, centre))
+
+
+def maxima(
+    model: Model,
+    starts: Float[np.ndarray, "sets starts free"],
+    bins: Bins | None,
+    moving: Float[np.ndarray, "sets free"],
+) -> Maxima:
+    """A block of steps from every start, then on from those that stand at different heights to the highest maximum."""
+    sets, count, free = starts.shape
+    owner = np.repeat(np.arange(sets), count)
+    peak = _climbed(model, starts.reshape(-1, free), bins, moving, owner)
+    on = np.concatenate([s * count + _different(cost) for s, cost in enumerate(peak.cost.reshape(sets, count))])
+    peak, settled = _highest(model, peak.theta[on], bins, moving, owner[on])
+    moments = seen_at(model.likelihood.problem, peak.theta).moments
+    return Maxima(
+        peak.theta,
+        marginals(model.likelihood, moments, bins),
+        effective_parameters(peak.curvature, model.precision, moving),
+        moments.power / moments.power.sum(axis=1, keepdims=True),
+        moments.line / moments.power,
+        settled,
+    )
+
+
+def _different(cost: Float[np.ndarray, " starts"]) -> Int[np.ndarray, " kept"]:
+    """The lowest starts, one of those that stand at the same height."""
+    order = np.argsort(np.where(np.isfinite(cost), cost, np.inf), kind="stable")
+    kept = order[np.insert(np.diff(cost[order]) > SAME, 0, True)]
+    return kept[:KEPT]
+
+
+def _highest(
+    model: Model,
+    theta: Float[np.ndarray, "rows free"],
+    bins: Bins | None,
+    moving: np.ndarray,
+    owner: Int[np.ndarray, " rows"],
+) -> tuple[Peak, Bool[np.ndarray, " sets"]]:
+    """The best row of every data set, once a block of steps improves it by less than `ENOUGH`; whether it came to that."""
+    sets, theta = len(moving), theta.copy()
+    best: list[Any] = [None] * sets
+    cost, settled = np.full(sets, np.inf), np.zeros(sets, dtype=bool)
+    for _ in range(BLOCKS):
+        rows = np.flatnonzero(~settled[owner])
+        if not rows.size:
+            break
+        peak = _climbed(model, theta[rows], bins, moving, owner[rows])
+        theta[rows] = peak.theta
+        reached = np.where(np.isfinite(peak.cost), peak.cost, np.inf)
+        for s in np.unique(owner[rows]):
+            own = np.flatnonzero(owner[rows] == s)
+            i = int(own[np.argmin(reached[own])])
+            settled[s] = peak.settled[i] or (np.isfinite(cost[s]) and cost[s] - reached[i] < ENOUGH)
+            best[s], cost[s] = peak.row(i), reached[i]
+    return Peak(*(np.concatenate(x) for x in zip(*best, strict=True))), settled
+
+
+def _climbed(model: Model, theta: np.ndarray, bins: Bins | None, moving: np.ndarray, owner: np.ndarray) -> Peak:
+    own = None if bins is None else jax.tree.map(lambda x: np.asarray(x)[owner], bins)
+    return climb(model.likelihood, theta, model.precision, bins=own, moving=moving[owner], max_steps=BLOCK)
+
+
+def effective_parameters(
+    curvature: Float[np.ndarray, "sets all all"],
+    precision: Float[np.ndarray, " free"],
+    moving: Float[np.ndarray, "sets free"],
+) -> Float[np.ndarray, " sets"]:
+    """`p = tr(F (F + Λ)⁻¹)` over the moving coordinates: F the data's Fisher information, the offset integrated out.
+
+    `curvature` is that of θ and the offset, Λ included. Murata, Yoshizawa & Amari 1994, doi:10.1109/72.329683.
+    """
+    found = []
+    for whole, moves in zip(curvature, moving > 0, strict=True):
+        inner, border, corner = whole[:-1, :-1], whole[:-1, -1], whole[-1, -1]
+        both = (inner - np.outer(border, border) / corner if corner > 0 else inner)[np.ix_(moves, moves)]
+        data = both - np.diag(precision[moves])
+        found.append(np.trace(data @ np.linalg.pinv(both, hermitian=True)))
+    return np.array(found)
+
+
+@eqx.filter_jit
+def _marginals(likelihood: Likelihood, moments: Moments, bins: Bins | None) -> Any:
+    return jax.vmap(likelihood.marginal)(moments, bins)
+
+
+def marginals(likelihood: Likelihood, moments: Moments, bins: Bins | None) -> Float[np.ndarray, " rows"]:
+    """Log likelihood of every row, the offset integrated out; in batches of one size, so that one program serves."""
+    rows = len(moments.mean)
+    found = []
+    for start in range(0, rows, BATCH):
+        part = np.minimum(np.arange(start, start + BATCH), rows - 1)
+        given = jax.tree.map(lambda x, part=part: np.asarray(x)[part], (moments, bins))
+        found.append(np.asarray(_marginals(likelihood, *given)))
+    return np.concatenate(found)[:rows]
+
+
+class Folds(NamedTuple):
+    """Data sets with bins left out: `kept` without group g, `more` without it but for bin k; `group` of every bin."""
+
+    kept: Bins
+    more: Bins
+    group: Int[np.ndarray, " bins"]
+
+    @classmethod
+    def of(cls, targets: list[Target], groups: int) -> "Folds":
+        """Every `groups`-th bin of each target is left out together; leading axes (targets, groups) and (targets, bins)."""
+        group = np.arange(len(targets[0].bins)) % groups
+        masks = (group != np.arange(groups)[:, None]).astype(float)
+        masks = np.concatenate([masks, masks[group] + np.eye(len(group))])
+        both = stacked([masked_bins(target, masks) for target in targets])
+        kept, more = (Bins(*(x[:, part] for x in both)) for part in (slice(groups), slice(groups, None)))
+        return cls(kept, more, group)
+
+
+def masked_bins(target: Target, masks: Float[np.ndarray, "rows bins"]) -> Bins:
+    """The target's bins once for every mask, 0 for what is left out."""
+    if target.segments is None:
+        raise ValueError(f"{target.name}: states no segments, so the law of its bins is unknown; give segments")
+    law = welch_law(target.settings, target.bins, target.segments)
+    power, half = np.log(target.proportional_power), law.degrees / 2
+    return stacked([Bins(power, half, *_precision(law.correlation, mask), mask) for mask in masks])
+
+
+def stacked(bins: list[Bins]) -> Bins:
+    """Data sets along a new leading axis."""
+    return jax.tree.map(lambda *x: np.stack(x), *bins)
+
+
+def held_out(
+    model: Model, theta: Float[np.ndarray, "sets free"], folds: Folds, moving: Float[np.ndarray, "sets free"]
+) -> HeldOut:
+    """`ln f(p_k | bins kept; θ of the fold) = ln f(p_k and bins kept) - ln f(bins kept)`, refitted from `theta`."""
+    sets, groups = np.shape(folds.kept.logdet)
+    owner = np.repeat(np.arange(sets), groups)
+    kept, more = (jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), b) for b in (folds.kept, folds.more))
+    peak, settled = _highest(model, theta[owner], kept, moving[owner], np.arange(sets * groups))
+    moments = seen_at(model.likelihood.problem, peak.theta).moments
+    row = (np.arange(sets)[:, None] * groups + folds.group).ravel()
+    above = marginals(model.likelihood, jax.tree.map(lambda x: x[row], moments), more)
+    scores = above - marginals(model.likelihood, moments, kept)[row]
+    return HeldOut(scores.reshape(sets, -1), np.asarray(settled.reshape(sets, groups).all(axis=1)))

@@ -1,0 +1,7 @@
+"""Public names of this wing."""
+
+from ._recording import Recording as Recording
+from ._recording_files import load_recording as load_recording
+from ._recording_quality import RecordingSummary as RecordingSummary
+from ._target import Target as Target
+from ._target import load_target as load_target

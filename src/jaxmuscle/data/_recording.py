@@ -1,0 +1,345 @@
+"""Recordings: a force, torque or displacement that was measured, its steady part, its spectra, and the target it gives."""
+
+import math
+from collections.abc import Iterable, Sequence
+from fractions import Fraction
+from typing import Any
+
+import equinox as eqx
+import jax
+import numpy as np
+import scipy.signal
+from jaxtyping import Float
+
+from jaxmuscle._common.text import choices, folded
+from jaxmuscle.spectra._measures import approximate_entropy, peaks, sample_entropy
+from jaxmuscle.spectra._settings import SpectrumSettings, require
+from jaxmuscle.spectra._welch import Spectrum, lowpass, spectrum_of
+
+from ._recording_quality import RecordingSummary, clipping, plateau
+from ._target import Target
+from ._target_fields import Quantity
+
+RECORDED = SpectrumSettings(filter_direction="both")
+DRIFT = 0.5  # share of the variance
+LOWEST_RATE = 24.0  # Hz; half of it lies above bin 30
+SEGMENTS = 2  # a steady part holds at least this many
+UNITS: dict[str, Quantity | None] = {
+    "N": "force", "mN": "force", "kN": "force", "% MVC": "force", "N m": "torque", "N cm": "torque", "N mm": "torque",
+    "m": "displacement", "cm": "displacement", "mm": "displacement", "um": "displacement", "V": None, "mV": None,
+    "a.u.": None,
+}  # fmt: skip
+_SPELLINGS = {"nm": "N m", "ncm": "N cm", "nmm": "N mm", "%mvc": "% MVC", "%": "% MVC", "µm": "um", "au": "a.u."}
+
+
+def known_unit(unit: str) -> str | None:
+    """The unit as `UNITS` writes it (`Nm`, `N·m` and `N*m` are `N m`), or `None` if it is not there."""
+    bare = "".join(unit.replace("μ", "µ").translate(str.maketrans("", "", "·*.()[]")).split())
+    exact = {"".join(name.replace(".", "").split()): name for name in UNITS}
+    return exact.get(bare) or _SPELLINGS.get(bare.casefold())
+
+
+class Recording(eqx.Module):
+    """A recording of one signal at a fixed rate, with the window that is to be analysed.
+
+    **Arguments:**
+
+    - `samples`: the signal [`unit`], shape `(times,)`.
+    - `rate`: samples per second [Hz], at least 24, so that bin 30 lies below half of it.
+    - `unit`: N, mN, kN, % MVC (force); N m, N cm, N mm (torque); m, cm, mm, um (displacement); V, mV, a.u.
+    - `name`, `source`: how reports call it and where it comes from.
+    - `start`: time of the first sample [s]; other than 0 if the file begins with a gap.
+    - `window`: (start, stop) [s] of the part that is analysed, or all of it.
+    - `notices`: what was done to the samples, in sentences.
+
+    `whole` holds all samples, since filters run before the window is cut; `samples` and `time` are the window's.
+
+    **Raises:** `ValueError` naming the argument, its value and the remedy; also for a constant signal.
+    """
+
+    whole: Float[np.ndarray, " all"]
+    rate: float = eqx.field(static=True)
+    unit: str = eqx.field(static=True)
+    name: str = eqx.field(static=True)
+    source: str = eqx.field(static=True)
+    start: float = eqx.field(static=True)
+    window: tuple[float, float] | None = eqx.field(static=True)
+    notices: tuple[str, ...] = eqx.field(static=True)
+
+    def __init__(
+        self,
+        samples: Any,
+        rate: float | int,
+        *,
+        unit: str = "N",
+        name: str = "recording",
+        source: str = "given by the user",
+        start: float | int = 0.0,
+        window: Sequence[float | int] | None = None,
+        notices: Iterable[str] = (),
+    ):
+        self.rate, self.start, self.name, self.source = _rate(rate), float(start), name, source
+        spelled = known_unit(unit)
+        require(spelled is not None, "unit", unit, choices(unit, UNITS))
+        self.unit = str(spelled)
+        self.whole = _samples(samples, self.rate, self.start)
+        own = clipping(self.whole, self.rate, self.start)
+        if self.rate < RECORDED.rate:
+            own.append(f"recorded at {self.rate:g} Hz: holds nothing above {self.rate / 2:g} Hz")
+        self.notices = tuple(dict.fromkeys((*notices, *own)))
+        self.window = None if window is None else self._checked(window)
+
+    def _checked(self, window: Any) -> tuple[float, float]:
+        try:
+            a, b = (float(edge) for edge in window)
+        except (TypeError, ValueError):
+            raise ValueError(f"window={window!r}: give two times in s, as (8, 25)") from None
+        remedy = f"give times with {self.start:g} <= start < stop <= {self.stop:g} s, the recording's own"
+        near = 0.5 / self.rate
+        require(self.start - near <= a < b <= self.stop + near, "window", window, remedy)
+        return a, b
+
+    def _span(self, rate: float | int) -> tuple[int, int]:
+        """The window as sample numbers at a rate."""
+        a, b = (self.start, self.stop) if self.window is None else self.window
+        return max(round((a - self.start) * rate), 0), round((b - self.start) * rate)
+
+    def _with(self, samples: Any, rate: float, window: Any, notices: Iterable[str]) -> "Recording":
+        fields = {key: getattr(self, key) for key in ("unit", "name", "source", "start")}
+        return Recording(samples, rate, **fields, window=window, notices=notices)
+
+    @property
+    def stop(self) -> float:
+        """End of the recording [s]: one sampling interval after its last sample."""
+        return self.start + self.whole.size / self.rate
+
+    @property
+    def samples(self) -> Float[np.ndarray, " times"]:
+        """The samples in the window [`unit`], as recorded."""
+        return self.whole[slice(*self._span(self.rate))]
+
+    @property
+    def time(self) -> Float[np.ndarray, " times"]:
+        """Times of `samples` [s]."""
+        return self.start + np.arange(self.whole.size)[slice(*self._span(self.rate))] / self.rate
+
+    @property
+    def duration(self) -> float:
+        """Length of the window [s]."""
+        return self.samples.size / self.rate
+
+    @property
+    def quantity(self) -> Quantity | None:
+        """What the unit measures: force, torque, displacement, or `None` (V, a.u.)."""
+        return UNITS[self.unit]
+
+    def resampled(self, rate: float | int = 100.0) -> "Recording":
+        """The recording at another rate: `scipy.signal.resample_poly`, which low-passes against aliases.
+
+        The ratio of the rates is taken as the nearest fraction with a denominator of at most 10 000. Beyond the ends
+        the straight line from the first to the last sample is assumed (`padtype="line"`).
+
+        **Raises:** `ValueError` if no such fraction is within 0.01 % of the ratio.
+        """
+        rate = _rate(rate)
+        ratio = Fraction(rate / self.rate).limit_denominator(10_000)
+        close = math.isclose(float(ratio), rate / self.rate, rel_tol=1e-4)
+        require(close, "rate", rate, f"is too far from the {self.rate:g} Hz recorded; give a rate nearer to it")
+        if ratio == 1:
+            return self
+        samples = scipy.signal.resample_poly(self.whole, ratio.numerator, ratio.denominator, padtype="line")
+        return self._with(samples, rate, self.window, self.notices)
+
+    def steady(self, window: Sequence[float | int] | None = None) -> "Recording":
+        """The recording with its steady part as window: the one that is given, or the plateau of a ramp-and-hold.
+
+        The plateau is the longest stretch in which the running median over 1 s stays within a tenth of its level,
+        which is the median of what lies more than half-way between rest and extreme. It has to hold at least half of
+        the time spent beyond half-way; one second is taken off at the ramps. Without a ramp (running median within
+        a fifth of its largest value) all of it is steady.
+
+        **Arguments:** `window` (start, stop) [s], in the recording's own time.
+
+        **Raises:** `ValueError` if no plateau is found, and if the window is shorter than two Welch segments (3.84 s).
+        """
+        notices = self.notices
+        if window is None:
+            even = self.resampled(RECORDED.rate)
+            found = plateau(even.whole, even.rate)
+            if found is None:
+                raise ValueError(
+                    f"{self.name}: no plateau found (no level that is held for half of the time spent above half of it, "
+                    f"to within 10 %); give the window, as steady((a, b)) with {self.start:g} <= a < b <= {self.stop:g} s"
+                )
+            window = (self.start + found[0] / even.rate, min(self.start + found[1] / even.rate, self.stop))
+            whole = found == (0, even.whole.size)
+            words = "no ramp found, all of it" if whole else f"{window[0]:.2f} s to {window[1]:.2f} s, found by itself"
+            notices = (*notices, f"steady part: {words}")
+        part = self._with(self.whole, self.rate, window, notices)
+        held, needed = part.segments(), RECORDED.length + (SEGMENTS - 1) * RECORDED.step
+        remedy = f"holds {held} of the {SEGMENTS} Welch segments needed; give at least {needed / RECORDED.rate:g} s"
+        require(held >= SEGMENTS, "window", part.window, remedy)
+        return part
+
+    def segments(self, settings: SpectrumSettings | None = None) -> int:
+        """Number of whole Welch segments in the window."""
+        settings = RECORDED if settings is None else settings
+        first, stop = self._span(settings.rate)
+        return settings.segments(stop - first)
+
+    def filtered(self, settings: SpectrumSettings | None = None) -> Float[np.ndarray, " times"]:
+        """What the spectra are made of [`unit`]: resampled to `settings.rate`, low-passed as a whole, cut to the window."""
+        settings = RECORDED if settings is None else settings
+        even = self.resampled(settings.rate)
+        with jax.enable_x64(True):
+            signal = np.asarray(lowpass(even.whole, settings))
+        return signal[slice(*even._span(settings.rate))]
+
+    def spectrum(self, settings: SpectrumSettings | None = None) -> Spectrum:
+        """Welch spectrum of the window, in float64: resampled and low-passed before it is cut.
+
+        **Arguments:** `settings`, by default `SpectrumSettings(filter_direction="both")`.
+
+        **Raises:** `ValueError` if the window is constant or shorter than one segment, or the bins reach beyond half the
+        recorded rate.
+        """
+        settings = RECORDED if settings is None else settings
+        highest = float(settings.frequency[-1])
+        remedy = f"half of it lies below the last bin, {highest:g} Hz; choose a lower last_bin"
+        require(highest < self.rate / 2, "rate", self.rate, remedy)
+        self._require_change()
+        even = self.resampled(settings.rate)
+        first, stop = even._span(settings.rate)
+        window = (first / settings.rate, stop / settings.rate)
+        with jax.enable_x64(True):
+            power = np.asarray(spectrum_of(even.whole, settings, window).power)
+        return Spectrum(settings.frequency, power, settings, self.unit)
+
+    def fft_spectrum(self, settings: SpectrumSettings | None = None) -> Spectrum:
+        """The same with the whole window as one segment (periodogram), in the frequency range of the settings."""
+        settings = RECORDED if settings is None else settings
+        first, stop = self._span(settings.rate)
+        low, high = (float(settings.frequency[i]) * (stop - first) / settings.rate for i in (0, -1))
+        require(stop - first >= 8 and high >= 1, "window", self.window, "is too short for a spectrum; give a longer one")
+        bins = {"first_bin": math.ceil(low - 1e-9), "last_bin": math.floor(high + 1e-9)}
+        return self.spectrum(settings.replace(length=stop - first, **bins))
+
+    def _require_change(self) -> None:
+        if np.ptp(self.samples) <= 1e-12 * np.max(np.abs(self.samples)):
+            raise ValueError(f"{self.name}: is constant in the window {self.window}; choose another window or column")
+
+    def summary(self, settings: SpectrumSettings | None = None) -> RecordingSummary:
+        """Level, variability, regularity and spectral peaks of the window, after resampling and low-pass.
+
+        **Returns:** a `RecordingSummary`; it prints as a table.
+        """
+        settings = RECORDED if settings is None else settings
+        self._require_change()
+        x = self.filtered(settings)
+        mean, deviation = float(np.mean(x)), float(np.std(x))
+        return RecordingSummary(
+            unit=self.unit,
+            duration=x.size / settings.rate,
+            segments=self.segments(settings),
+            mean=mean,
+            standard_deviation=deviation,
+            coefficient_of_variation=deviation / abs(mean) if mean else math.inf,
+            signal_to_noise=mean / deviation,
+            approximate_entropy=approximate_entropy(x),
+            sample_entropy=sample_entropy(x),
+            peaks=peaks(self.spectrum(settings)),
+        )
+
+    def target(
+        self,
+        name: str | None = None,
+        *,
+        quantity: str | None = None,
+        provenance: str = "measured",
+        mvc: float | int | None = None,
+        settings: SpectrumSettings | None = None,
+    ) -> Target:
+        """The window's proportional power as a `Target` for `jaxmuscle.fit`.
+
+        It states the Welch segments, the settings, and for a force or torque the coefficient of variation of what the
+        low-pass lets through, which fixes the scale of the noise; and says so if most of that is a straight drift.
+
+        **Arguments:** `name`, or that of the recording; `quantity`, or that of the unit; `provenance`; `mvc` [`unit`], the
+        maximal voluntary contraction, for the level (a recording in % MVC needs none); `settings` as for `spectrum`.
+
+        **Raises:** `ValueError` if the unit (V, a.u.) does not say what was measured, and as `spectrum` does.
+        """
+        settings = RECORDED if settings is None else settings
+        quantity = self.quantity if quantity is None else quantity
+        require(quantity is not None, "quantity", quantity, f"unit {self.unit} does not tell; give force, torque, ...")
+        power, x = np.asarray(self.spectrum(settings).power), self.filtered(settings)
+        mean, variation = float(np.mean(x)), float(np.std(x)) / max(abs(float(np.mean(x))), 1e-300)
+        full = 100.0 if mvc is None and self.unit == "% MVC" else mvc
+        require(full is None or 0 < abs(mean) <= full < math.inf, "mvc", mvc, f"give a force above the mean, {mean:.4g}")
+        varying = quantity != "displacement" and variation <= 1
+        return Target(
+            self.name if name is None else name,
+            power / np.sum(power),
+            quantity=str(quantity),
+            provenance=provenance,
+            source=f"{self.source}, {self._window_words()}",
+            segments=self.segments(settings),
+            coefficient_of_variation=variation if varying else None,
+            mvc_fraction=None if full is None else abs(mean) / full,
+            settings=settings,
+            notices=(*self.notices, *(_drift(x) if varying else ())),
+        )
+
+    def _window_words(self) -> str:
+        return "all of it" if self.window is None else f"window {self.window[0]:g} s to {self.window[1]:g} s"
+
+    def plot(self, settings: SpectrumSettings | None = None, ax: Any = None) -> Any:
+        """Draw the trace with its window, and the spectra (Welch, FFT), linear and logarithmic; returns the figure."""
+        from jaxmuscle.plot._recording import figure
+
+        return figure(self, settings, ax)
+
+    def __str__(self) -> str:
+        what = "recording" if self.quantity is None else self.quantity
+        lines = [
+            f"{self.name}: {what} [{self.unit}], {self.whole.size} samples at {self.rate:g} Hz",
+            f"  source    {self.source}",
+            f"  time      {self.start:g} s to {self.stop:g} s; {self._window_words()}",
+            f"  range     {np.min(self.samples):.4g} to {np.max(self.samples):.4g} {self.unit}",
+        ]
+        return folded(lines + [f"  notice    {notice}" for notice in self.notices])
+
+
+def _drift(x: Float[np.ndarray, " times"]) -> tuple[str, ...]:
+    """What to say where a straight line makes more than half of the variance; the model has none."""
+    before, after = np.std(x), np.std(scipy.signal.detrend(x))
+    if after**2 > DRIFT * before**2:
+        return ()
+    mean = abs(float(np.mean(x)))
+    return (f"a straight drift makes {100 * (1 - (after / before) ** 2):.0f} % of the variance: coefficient of variation "
+            f"{before / mean:.3g} with it, {after / mean:.3g} without; the model knows no drift, so remove it first "
+            "(scipy.signal.detrend, and add the mean), or choose a steadier window",)  # fmt: skip
+
+
+def _rate(rate: Any) -> float:
+    number = isinstance(rate, int | float | np.number) and not isinstance(rate, bool) and math.isfinite(rate)
+    require(number and rate > 0, "rate", rate, "give samples per second [Hz], above 0")
+    remedy = f"too slow: half of it lies below the last bin, 11.72 Hz; record at {LOWEST_RATE:g} Hz or more"
+    require(rate >= LOWEST_RATE, "rate", rate, remedy)
+    return float(rate)
+
+
+def _samples(samples: Any, rate: float, start: float) -> Float[np.ndarray, " all"]:
+    try:
+        x = np.array(samples, dtype=float)
+    except (TypeError, ValueError):
+        raise ValueError("samples: give real numbers, one for each time") from None
+    require(x.ndim == 1 and x.size >= 2, "samples shape", x.shape, "give one signal of 2 samples or more")
+    wrong = np.flatnonzero(~(np.abs(x) < 1e100))
+    if wrong.size:
+        first = f"the first at {start + wrong[0] / rate:.3f} s ({x[wrong[0]]:g})"
+        raise ValueError(f"samples: {wrong.size} are no finite numbers, {first}; `load_recording` closes short gaps of NaN")
+    if np.ptp(x) <= 1e-12 * np.max(np.abs(x)):
+        raise ValueError(f"samples: constant at {x[0]:g}; is this the right column, was the sensor connected?")
+    x.setflags(write=False)
+    return x

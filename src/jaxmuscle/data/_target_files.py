@@ -1,0 +1,162 @@
+"""Targets in files: a bundled name or a path to the fields and columns of a TOML, CSV or WebPlotDigitizer file."""
+
+import contextlib
+import os
+import tomllib
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxmuscle._common.bundled import bundled_text, list_targets
+from jaxmuscle._common.errors import TargetError
+from jaxmuscle._common.files import text_of
+from jaxmuscle._common.text import choices
+from jaxmuscle.spectra._settings import SpectrumSettings
+
+from ._digitised import AXES, Points, columns_of, read_datasets, read_project, read_tar
+from ._target_csv import merge_duplicates, read_csv
+from ._target_fields import CHECKS, GRID_TOLERANCE, Columns, check_columns, is_number, metadata
+
+REQUIRED = ("name", "quantity", "provenance", "source", "frequency_hz", "proportional_power")
+METADATA = ("segments", "coefficient_of_variation", "mvc_fraction", "reason", "notices")
+KEYS = (*REQUIRED, "sigma", *METADATA, "settings")
+
+
+class Raw(NamedTuple):
+    """What a file says: its name for messages, its fields other than the columns, the columns, notices.
+
+    `digitised` points carry the error of a pixel; `log_frequency` says that their frequency axis is logarithmic.
+    """
+
+    file: str
+    fields: dict[str, Any]
+    columns: Columns
+    notices: list[str]
+    digitised: bool = False
+    log_frequency: bool = False
+
+
+def read_target(name_or_path: str | os.PathLike[str], dataset: str | None = None, axis: str = "linear") -> Raw:
+    """Read a bundled target, a .toml or .csv file or a digitised figure; the columns are checked, the other fields not yet.
+
+    **Raises:** `TargetError` naming file and line or key.
+    """
+    if axis not in AXES:
+        raise TargetError(f"unknown axis {axis!r}; {choices(str(axis), AXES)}")
+    file, kind, text = _read(name_or_path)
+    if kind == ".json":
+        return _digitised(read_project(text, file, dataset), file, axis, f"WebPlotDigitizer project {Path(file).name}")
+    if kind == ".csv" and (points := read_datasets(text, file, dataset)) is not None:
+        return _digitised(points, file, axis, f"WebPlotDigitizer export {Path(file).name}")
+    if dataset is not None:
+        raise TargetError(f"{file}: has no named datasets; leave dataset={dataset!r} (--dataset) out")
+    return _parse_csv(text, file, axis) if kind == ".csv" else _parse_toml(text, file, axis)
+
+
+def _read(name_or_path: str | os.PathLike[str]) -> tuple[str, str, str]:
+    """What messages call the target, ".toml", ".csv" or ".json" (a tar holds one), and the text."""
+    if not isinstance(name_or_path, str | os.PathLike):
+        raise TargetError(f"target {name_or_path!r}: give the name of a bundled target or a path")
+    given, names = os.fspath(name_or_path), list_targets()
+    if isinstance(name_or_path, str) and given in names:
+        return given, ".toml", bundled_text(given)
+    path = Path(given)
+    is_path = isinstance(name_or_path, os.PathLike) or path.suffix or len(path.parts) > 1 or os.path.exists(given)
+    if not given or not is_path:
+        raise TargetError(f"no bundled target {given!r}; {choices(given, names)} (`jaxmuscle targets`); or give a path")
+    with contextlib.suppress(RuntimeError):
+        path = path.expanduser()
+    hint = f"; the bundled target is called {path.stem!r}" if path.stem in names else ""
+    try:
+        if path.is_dir():
+            raise TargetError(f"{path}: is a folder; give a .toml or .csv file, or a digitised .json or .tar")
+        data = path.read_bytes()
+    except FileNotFoundError:
+        raise TargetError(f"{path}: no such file{hint}") from None
+    except (OSError, ValueError) as error:
+        if isinstance(error, TargetError):
+            raise
+        raise TargetError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from None
+    kind = path.suffix.lower()
+    if kind == ".tar":
+        kind, data = ".json", read_tar(data, str(path)) if data.strip() else data
+    if kind not in (".toml", ".csv", ".json"):
+        problem = f"{path}: a target is a .toml or .csv file, not {kind or 'one without ending'}"
+        raise TargetError(f"{problem}; a WebPlotDigitizer project ends in .json or .tar")
+    return str(path), kind, text_of(data, str(path), TargetError)
+
+
+def _parse_csv(text: str, file: str, axis: str) -> Raw:
+    (columns, has_header, comment), path = read_csv(text, file), Path(file)
+    if not has_header:
+        points = Points(columns.frequency, columns.power, columns.places)
+        return _digitised(points, file, axis, comment or path.name)
+    _linear(axis, file)
+    check_columns(columns, file, ordered=True)
+    fields = {"name": path.stem, "source": comment or path.name, "settings": SpectrumSettings()}
+    return Raw(file, fields, columns, [])
+
+
+def _linear(axis: str, file: str) -> None:
+    if axis != "linear":
+        raise TargetError(f"{file}: states frequency in Hz and power; leave axis={axis!r} (--axis) out")
+
+
+def _digitised(points: Points, file: str, axis: str, source: str) -> Raw:
+    """Points of a figure: in Hz and power, sorted, near-duplicates averaged."""
+    columns, log_frequency = columns_of(points, axis, file)
+    settings = SpectrumSettings()
+    merged = merge_duplicates(columns, GRID_TOLERANCE * settings.resolution)
+    averaged = len(columns.places) - len(merged.places)
+    origin = "no header" if points.dataset is None else f"dataset {points.dataset!r}"
+    what = "log10 of frequency in Hz and of power" if axis == "log-log" else "frequency in Hz and proportional power"
+    notice = f"{origin}: taken as points of a figure, {what}, sorted by frequency"
+    notice += f", {averaged} near-duplicates averaged" if averaged else ""
+    source = source if points.dataset is None else f"{source}, dataset {points.dataset!r}"
+    fields = {"name": Path(file).stem, "provenance": "digitised", "source": source, "settings": settings}
+    return Raw(file, fields, merged, [notice], True, log_frequency)
+
+
+def _parse_toml(text: str, file: str, axis: str) -> Raw:
+    _linear(axis, file)
+    try:
+        fields: dict[str, Any] = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise TargetError(f"{file}: is not valid TOML: {error}") from None
+    for key in fields:
+        if key not in KEYS:
+            raise TargetError(f"{file}: unknown key {key!r}; {choices(key, KEYS)}")
+    for key in REQUIRED:
+        if key not in fields:
+            raise TargetError(f"{file}: the key {key!r} is missing; needed are {', '.join(REQUIRED)}")
+    try:
+        fields |= {key: metadata(key, value) for key, value in fields.items() if key in CHECKS}
+    except TargetError as error:
+        raise TargetError(f"{file}: {error}") from None
+    keys = [key for key in ("frequency_hz", "proportional_power", "sigma") if key in fields]
+    lists = [_numbers(file, key, fields.pop(key)) for key in keys]
+    for key, values in zip(keys, lists, strict=True):
+        if values.size != lists[0].size:
+            raise TargetError(f"{file}: {key} has {values.size} entries, frequency_hz {lists[0].size}; make them equal")
+    places = tuple(f"entry {i}" for i in range(1, lists[0].size + 1))
+    columns = Columns(lists[0], lists[1], lists[2] if len(lists) > 2 else None, places)
+    check_columns(columns, file, ordered=True)
+    settings = fields.get("settings", {})
+    if not isinstance(settings, dict):
+        raise TargetError(f"{file}: settings must be a table: a line [settings], then one setting per line")
+    try:
+        fields["settings"] = SpectrumSettings.from_dict(settings)
+    except ValueError as error:
+        raise TargetError(f"{file}: [settings]: {error}") from None
+    return Raw(file, fields, columns, [])
+
+
+def _numbers(file: str, key: str, values: Any) -> Float[np.ndarray, " rows"]:
+    if not isinstance(values, list) or not values:
+        raise TargetError(f"{file}: {key} must be a list of numbers")
+    for i, value in enumerate(values, 1):
+        if not is_number(value):
+            raise TargetError(f"{file}, entry {i}: {key} {value!r} is not a number")
+    return np.array([float(value) for value in values])

@@ -1,0 +1,172 @@
+"""Ensembles: many seeds, many points, in memory, reduced while they run, or streamed to a store."""
+
+import contextlib
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, overload
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Int, PRNGKeyArray
+
+from jaxmuscle._common.arrays import all_concrete, as_arrays
+from jaxmuscle.model._tasks import AbstractTask
+from jaxmuscle.response._linearised import LinearTask
+from jaxmuscle.simulation._simulate import DT, DURATION, require_finite, trajectories
+from jaxmuscle.simulation._trajectory import Trajectory
+
+from ._layout import Layout, Pace, Watch, companions, covers_window, cut_of, laid_out, plan_of, run_chunks
+from ._run import begun_with, reduced, stored
+from ._running_moments import LEVELS
+from ._summary import EnsembleSummary
+from ._sweep import Population, Sweep
+
+if TYPE_CHECKING:
+    import xarray
+
+
+Seeds = int | Int[np.ndarray, " seeds"]
+Progress = bool | Callable[[str, float], None] | Watch
+
+
+@overload
+def ensemble(task: AbstractTask, key: PRNGKeyArray, *, seeds: Seeds, reduce: Literal[False] = ..., store: None = ...,
+             **given: Any) -> Trajectory: ...  # fmt: skip
+
+
+@overload
+def ensemble(task: Sweep | Sequence[AbstractTask], key: PRNGKeyArray, *, seeds: Seeds, reduce: Literal[False] = ...,
+             store: None = ..., **given: Any) -> Population: ...  # fmt: skip
+
+
+@overload
+def ensemble(task: AbstractTask | Sweep | Sequence[AbstractTask], key: PRNGKeyArray, *, seeds: Seeds,
+             reduce: Literal[True] | tuple[float, ...], store: str | Path | None = ...,
+             **given: Any) -> EnsembleSummary: ...  # fmt: skip
+
+
+@overload
+def ensemble(task: AbstractTask | Sweep | Sequence[AbstractTask], key: PRNGKeyArray, *, seeds: Seeds, store: str | Path,
+             reduce: Literal[False] = ..., **given: Any) -> "xarray.Dataset": ...  # fmt: skip
+
+
+def ensemble(  # pyright: ignore[reportInconsistentOverload]
+    task: AbstractTask | Sweep | Sequence[AbstractTask],
+    key: PRNGKeyArray,
+    *,
+    seeds: Seeds,
+    duration: float = DURATION,
+    dt: float = DT,
+    rate: float | None = None,
+    substeps: int | None = None,
+    sampling: str | None = None,
+    chunk: int | None = None,
+    control: bool | None = None,
+    progress: Progress = False,
+    reduce: bool | tuple[float, ...] = False,
+    store: str | Path | None = None,
+    resume: bool = False,
+    states: bool = False,
+) -> Any:
+    """Simulate many seeds (0 to seeds - 1, or those given) of one task, or of every point of a sweep.
+
+    Seed i is `simulate(..., seed=i)`, whatever the chunk, the devices or the number of processes. Chunks run on all local
+    devices (`jax.config.update("jax_num_cpu_devices", n)` before anything else makes n of a CPU's cores).
+
+    **Arguments:** `task`, or a `Sweep`, or tasks that differ in numbers only; `key`, `duration` [s], `dt` [s], `rate` [Hz],
+    `substeps`, `sampling` as in `simulate`; `chunk`, how many seeds (points times seeds) run at once; `progress`, True for
+    a bar or a function of (text, share).
+
+    `control` carries the linearised task along on the same noise paths, as control variate for the mean spectrum; None
+    does so wherever it pays: the run covers the analysed window and the task has a stable equilibrium whose transients
+    have decayed there.
+
+    `reduce`, True or the levels of the quantiles, keeps moments, quantiles and the mean spectrum only: memory does not
+    depend on the number of seeds. `store`, the path of a zarr store, streams every chunk to disk (`states` with it), or
+    what is reduced from time to time; with `resume` an interrupted one is continued. Under `jax.distributed` all processes
+    make the same call and share its chunks; all must see the store's folder.
+
+    **Returns:** a `Trajectory`, of a sweep a `Population`; with `reduce` an `EnsembleSummary`; with `store` alone the opened
+    `xarray.Dataset` (dimensions (point,) seed, time, frequency).
+
+    **Raises:** as `simulate`: what does not stay finite is an error that names every such seed; with `reduce` or `store` it
+    is left out, or NaN, and listed in `failed`. `ValueError` for a store that exists already or was made with other
+    settings; `OSError` for one that cannot be written; `ProcessLostError` if another process died.
+    """
+    if not isinstance(task, AbstractTask | Sweep):
+        task = Sweep.of(task)
+    numbers: Any = range(seeds) if isinstance(seeds, int) else np.asarray(seeds)
+    if len(numbers) == 0:
+        raise ValueError(f"seeds = {seeds}: an ensemble needs at least one seed")
+    if chunk is not None and chunk < 1:
+        raise ValueError(f"chunk = {chunk} must be at least 1")
+    if (resume or states) and store is None:
+        raise ValueError(f"{'resume' if resume else 'states'} = True belongs to a store: give store=")
+    levels = _levels(reduce)
+    plan = plan_of(task, duration, dt, rate, substeps, sampling)
+    if not all_concrete((task, key)):
+        if isinstance(task, Sweep) or levels or store is not None:
+            raise ValueError(
+                "under a JAX transformation an ensemble can be of one task, in memory: no sweep, reduce or store"
+            )
+        linear = LinearTask.of(as_arrays(task)) if control else None
+        return trajectories(task, linear, key, jnp.asarray(np.asarray(numbers)), plan)
+    linear = companions(task, duration, control)
+    kept = levels is not None or store is not None
+    spectrum = kept and covers_window(plan, task)
+    whole = not kept or (states and levels is None)
+    cut = begun_with(Path(store)) if store is not None and resume and chunk is None else None
+    cut = cut_of(task, len(numbers), plan, chunk, shared=store is not None) if cut is None else cut
+    layout = laid_out(task, key, numbers, plan, linear, cut=cut, states=whole, spectrum=spectrum)
+    with telling(progress, layout) as tell:
+        if levels is not None:
+            return reduced(layout, levels, None if store is None else Path(store), tell, resume=resume)
+        if store is not None:
+            return stored(layout, Path(store), tell, resume=resume, states=states)
+        return _in_memory(layout, tell)
+
+
+def _levels(reduce: bool | tuple[float, ...]) -> tuple[float, ...] | None:
+    """Levels of the quantiles, None if nothing is reduced."""
+    if reduce is False:
+        return None
+    levels = LEVELS if reduce is True else tuple(float(level) for level in reduce)
+    if not all(0 < level < 1 for level in levels):
+        raise ValueError(f"reduce = {reduce}: levels of quantiles lie between 0 and 1")
+    return tuple(sorted(levels))
+
+
+def _in_memory(layout: Layout, tell: Callable[[Pace], None]) -> Trajectory | Population:
+    """Everything, joined; a sweep point by point."""
+    names = ("states", "output", *(("linear",) if layout.linear is not None else ()))
+    parts: list[dict[str, list[np.ndarray]]] = [{name: [] for name in names} for _ in range(layout.points)]
+    for chunk, found in run_chunks(layout, range(layout.chunks), tell):
+        for row, point in enumerate(chunk.points):
+            for name in names:
+                parts[point][name].append(found[name][row])
+    grid, plan, seeds = layout.plan.grid, layout.plan, np.asarray(layout.seeds)
+    members = []
+    for point, part in enumerate(parts):
+        joined = {name: rows[0] if len(rows) == 1 else np.concatenate(rows) for name, rows in part.items()}
+        members.append(Trajectory(layout.task_of(point), joined["states"], joined["output"], seeds, plan.rate, grid.dt,
+                                  grid.substeps, plan.sampling, joined.get("linear")))  # fmt: skip
+        part.clear()
+        require_finite(members[-1], f" at point {point} of the sweep" if isinstance(layout.task, Sweep) else "")
+    return Population(layout.task, tuple(members)) if isinstance(layout.task, Sweep) else members[0]
+
+
+@contextlib.contextmanager
+def telling(progress: Progress, layout: Layout) -> Iterator[Callable[[Pace], None]]:
+    """A bar, a function of (text, share), or silence."""
+    if isinstance(progress, Watch):
+        yield progress.tell
+    elif callable(progress):
+        yield lambda pace: progress(str(pace), pace.done / pace.total)
+    elif not progress:
+        yield lambda pace: None
+    else:
+        from rich.progress import Progress as Bar
+
+        with Bar(transient=True) as bar:
+            row = bar.add_task(f"simulating {layout.points * len(layout.seeds)} seeds", total=1.0)
+            yield lambda pace: bar.update(row, description=str(pace), completed=pace.done / pace.total)

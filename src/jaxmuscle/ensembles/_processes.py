@@ -1,0 +1,77 @@
+"""Several processes, on one machine or many, that share the work on one store: JAX's distributed runtime."""
+
+import os
+import sys
+import time
+from typing import NoReturn
+
+import jax
+import numpy as np
+
+from jaxmuscle._common.errors import ProcessLostError
+
+TEXT = 4096
+LAST_WORDS = 2.0  # seconds
+
+
+def join(coordinator: str | None, processes: int | None, process_id: int | None) -> None:
+    """Become one of several processes; without arguments as the launcher says (SLURM, Open MPI, ...).
+
+    **Raises:** `ValueError` for arguments that do not go together, or if nobody answers.
+    """
+    given = (coordinator, processes, process_id)
+    if any(g is None for g in given) and any(g is not None for g in given):
+        raise ValueError("--coordinator, --processes and --process-id belong together: give all three, or none of them "
+                         "under a launcher that JAX knows (SLURM, Open MPI)")  # fmt: skip
+    if processes is not None and process_id is not None and not 0 <= process_id < processes:
+        raise ValueError(f"--process-id = {process_id} must be from 0 to --processes - 1 = {processes - 1}")
+    try:
+        jax.distributed.initialize(coordinator, processes, process_id)
+    except (RuntimeError, ValueError) as error:
+        raise ValueError(f"the processes did not find each other at {coordinator}: {error}") from None
+
+
+def launched() -> bool:
+    """Whether a launcher that JAX knows started this process as one of several."""
+    counts = ("SLURM_STEP_NUM_TASKS", "OMPI_COMM_WORLD_SIZE")
+    return any(os.environ.get(name, "1") not in ("", "1") for name in counts)
+
+
+def rank_and_count() -> tuple[int, int]:
+    """Number of this process, and of all."""
+    return jax.process_index(), jax.process_count()
+
+
+def agreed(text: str) -> str:
+    """What process 0 says (up to 4096 bytes), once all have asked. Raises `ProcessLostError`."""
+    from jax.experimental import multihost_utils
+
+    if jax.process_count() == 1:
+        return text
+    said = np.frombuffer(text.encode()[:TEXT].ljust(TEXT, b"\0"), np.uint8).astype(np.int32)
+    try:
+        heard = multihost_utils.broadcast_one_to_all(said)
+    except Exception as error:
+        raise ProcessLostError(f"another process of this run died or stopped ({_first_line(error)})") from error
+    return bytes(np.asarray(heard).astype(np.uint8)).rstrip(b"\0").decode(errors="replace")
+
+
+def meet() -> None:
+    """Wait for all processes. Raises `ProcessLostError`."""
+    agreed("")
+
+
+def _first_line(error: Exception) -> str:
+    return str(error).partition("\n")[0][:200]
+
+
+def leave(code: int) -> NoReturn:
+    """End this process: JAX's own end would wait for processes that will not come.
+
+    Process 0 lets the others speak first, since they cannot outlive it.
+    """
+    if jax.process_count() > 1 and jax.process_index() == 0:
+        time.sleep(LAST_WORDS)
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(code)

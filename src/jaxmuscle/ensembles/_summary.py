@@ -1,0 +1,180 @@
+"""What is left of an ensemble that was reduced while it ran: moments, quantiles and the mean spectrum."""
+
+import dataclasses
+import json
+from typing import TYPE_CHECKING, Any
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Float, Int
+
+from jaxmuscle._common.text import folded, listed
+from jaxmuscle.model._tasks import AbstractTask
+from jaxmuscle.spectra._mean import SpectrumEstimate, from_moments
+from jaxmuscle.spectra._settings import SpectrumSettings
+
+from ._running_moments import Tally, quantiles
+from ._sweep import Sweep
+
+if TYPE_CHECKING:
+    import xarray
+    from matplotlib.axes import Axes
+
+
+# Fields of a spectrum, and their names as arrays.
+SPECTRUM = {"power": "power", "stderr": "power_stderr", "plain_power": "plain_power", "plain_stderr": "plain_stderr",
+            "expected": "power_expected"}  # fmt: skip
+
+
+class EnsembleSummary(eqx.Module):
+    """An ensemble reduced to its moments; of a sweep all arrays have a leading axis `point`.
+
+    `mean` and `variance` of the output at every `time` [s] over the seeds that stayed finite, `quantile` at `levels`;
+    `coefficient_of_variation` of single seeds, low-passed, in the analysed window with its standard error, `spectra` (one
+    `SpectrumEstimate` per point): NaN and empty if the run does not cover the window; `seeds` per point; `failed`, rows
+    (point, seed) of those that did not stay finite and were left out; `success`, whether there are none; `about`, how it
+    was run.
+    """
+
+    task: AbstractTask | Sweep
+    seeds: int
+    time: Float[np.ndarray, " samples"]
+    mean: Float[np.ndarray, "*points samples"]
+    variance: Float[np.ndarray, "*points samples"]
+    levels: tuple[float, ...]
+    quantile: Float[np.ndarray, "*points levels samples"]
+    coefficient_of_variation: Float[np.ndarray, "*points 2"]
+    spectra: tuple[SpectrumEstimate, ...]
+    failed: Int[np.ndarray, "failed 2"]
+    about: dict[str, Any]
+
+    @property
+    def success(self) -> bool:
+        """Whether every seed stayed finite."""
+        return len(self.failed) == 0
+
+    @property
+    def message(self) -> str:
+        """What failed, in words."""
+        if self.success:
+            return "every seed stayed finite"
+        swept = isinstance(self.task, Sweep)
+        names = [f"{seed} of point {point}" if swept else seed for point, seed in self.failed]
+        return (f"{len(names)} seed(s) did not stay finite and are left out ({listed(names)}): lower the noise amplitude "
+                "or dt")  # fmt: skip
+
+    @property
+    def spectrum(self) -> SpectrumEstimate:
+        """The mean spectrum of one task. Raises `ValueError` for a sweep (see `spectra`) and where there is none."""
+        if isinstance(self.task, Sweep) or not self.spectra:
+            reason = "a sweep has one per point: use `spectra`" if self.spectra else "the run does not cover 5 s to 15 s"
+            raise ValueError(f"there is no single spectrum: {reason}")
+        return self.spectra[0]
+
+    @property
+    def _first(self) -> AbstractTask:
+        return self.task[0] if isinstance(self.task, Sweep) else self.task
+
+    def plot(self, ax: "Axes | None" = None, point: int = 0) -> "Axes":
+        """Median (or mean) and the band between the outermost quantiles against time. Returns the axes."""
+        from jaxmuscle.plot._wrappers import moments
+
+        return moments(self, ax, point)
+
+    def to_xarray(self) -> "xarray.Dataset":
+        """A Dataset with dimensions (point,) time, quantile, frequency; units, parameters and settings as attributes."""
+        import xarray
+
+        data = {name: (dims, values, {"units": units} if units else {})
+                for name, (dims, values, units) in self.arrays().items()}  # fmt: skip
+        return xarray.Dataset(data, attrs=self.attributes()).set_coords(self.coordinates())
+
+    def coordinates(self) -> list[str]:
+        """Names of what labels the dimensions."""
+        labels = list(self.task.labels) if isinstance(self.task, Sweep) else []
+        return ["time", "quantile", *(["frequency"] if self.spectra else []), *labels]
+
+    def attributes(self) -> dict[str, Any]:
+        """What was run, and which seeds failed."""
+        return self.about | {"failed": json.dumps(self.failed.tolist())}
+
+    def arrays(self) -> dict[str, tuple[tuple[str, ...], np.ndarray, str]]:
+        """Dimensions, values and unit of everything, by name."""
+        unit, swept = self._first.output_unit, isinstance(self.task, Sweep)
+        lead = ("point",) if swept else ()
+        found: dict[str, tuple[tuple[str, ...], np.ndarray, str]] = {
+            "time": (("time",), self.time, "s"),
+            "quantile": (("quantile",), np.array(self.levels), "1"),
+            "mean": ((*lead, "time"), self.mean, unit),
+            "variance": ((*lead, "time"), self.variance, f"{unit}^2"),
+            "quantiles": ((*lead, "quantile", "time"), self.quantile, unit),
+        }
+        if self.spectra:
+            found["frequency"] = ("frequency",), self.spectra[0].frequency, "Hz"
+            found["coefficient_of_variation"] = lead, self.coefficient_of_variation[..., 0], "1"
+            found["coefficient_of_variation_stderr"] = lead, self.coefficient_of_variation[..., 1], "1"
+            for name, label in SPECTRUM.items():
+                rows = [getattr(spectrum, name) for spectrum in self.spectra]
+                if rows[0] is not None:
+                    values = np.stack(rows) if swept else rows[0]
+                    found[label] = ((*lead, "frequency"), values, f"{unit}^2/Hz")
+        if isinstance(self.task, Sweep):
+            found |= {name: (("point",), values, "") for name, values in self.task.labels.items()}
+        return found
+
+    def with_arrays(self, arrays: dict[str, np.ndarray], failed: Int[np.ndarray, "failed 2"]) -> "EnsembleSummary":
+        """A copy with the values of `arrays` (as `arrays()` names them) and other failed seeds."""
+        variation, spectra = self.coefficient_of_variation, self.spectra
+        if spectra:
+            variation = np.stack([arrays["coefficient_of_variation"], arrays["coefficient_of_variation_stderr"]], axis=-1)
+            rows = {name: np.atleast_2d(arrays[label]) for name, label in SPECTRUM.items() if label in arrays}
+            left = [self.seeds - int(np.sum(failed[:, 0] == point)) for point in range(len(spectra))]
+            spectra = tuple(
+                dataclasses.replace(spectrum, seeds=left[i], **{name: values[i] for name, values in rows.items()})
+                for i, spectrum in enumerate(spectra)
+            )
+        return dataclasses.replace(self, mean=arrays["mean"], variance=arrays["variance"], quantile=arrays["quantiles"],
+                                   coefficient_of_variation=variation, spectra=spectra, failed=failed)  # fmt: skip
+
+    def __str__(self) -> str:
+        swept = isinstance(self.task, Sweep)
+        where = f", {len(self.task)} points" if isinstance(self.task, Sweep) else ""
+        lines = [
+            f"ensemble: {type(self._first).__name__}, {self.seeds} seeds{where}, {self.time[-1]:g} s",
+            f"  {self.message}",
+        ]
+        if self.spectra and not swept:
+            value, error = self.coefficient_of_variation
+            lines.append(f"  coefficient of variation {100 * value:.4g} % +- {100 * error:.2g} %")
+        return folded(lines)
+
+
+def summarised(
+    tally: Tally,
+    task: AbstractTask | Sweep,
+    shape: tuple[int, int],
+    time: Float[np.ndarray, " samples"],
+    levels: tuple[float, ...],
+    settings: SpectrumSettings,
+    expected: Float[np.ndarray, "points bins"] | None,
+    failed: Int[np.ndarray, "failed 2"],
+    about: dict[str, Any],
+) -> EnsembleSummary:
+    """A tally in words; `shape` is (seeds, bins of the spectrum or 0), `expected` the exact linear spectra or None."""
+    (seeds, bins), samples = shape, time.size
+    unit = (task[0] if isinstance(task, Sweep) else task).output_unit
+    with np.errstate(invalid="ignore", divide="ignore"):
+        seen = np.where(tally.seeds > 0, tally.seeds, np.nan)[:, None]
+        averages = tally.mean + 0 * seen
+        variance = tally.squares / np.where(seen > 1, seen - 1, np.nan)
+        stderr = np.sqrt(variance / seen)
+    parts = {"power": slice(samples, samples + bins), "left": slice(samples + bins, samples + 2 * bins)}
+    spectra = []
+    for point in range(len(tally.seeds) if bins else 0):
+        plain, left = ((averages[point, part], stderr[point, part]) for part in parts.values())
+        control = None if expected is None else (*left, expected[point])
+        spectra.append(from_moments(plain, control, int(tally.seeds[point]), settings, unit))
+    variation = np.stack([averages[:, -1], stderr[:, -1]], axis=-1) if bins else np.full((len(tally.seeds), 2), np.nan)
+    found = [averages[:, :samples], variance[:, :samples], quantiles(tally, levels), variation]
+    mean, variance, quantile, variation = found if isinstance(task, Sweep) else [values[0] for values in found]
+    return EnsembleSummary(task, seeds, time, mean, variance, levels, quantile, variation, tuple(spectra), failed, about)

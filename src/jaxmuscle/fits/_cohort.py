@@ -1,0 +1,232 @@
+"""Many targets fitted together, and what differs between groups of them."""
+
+import itertools
+from collections.abc import Callable, Iterable, Mapping
+from os import PathLike
+from typing import TYPE_CHECKING, Any
+
+import equinox as eqx
+import jax
+import numpy as np
+import scipy.stats
+
+from jaxmuscle._common.arrays import as_numbers
+from jaxmuscle._common.environment import versions
+from jaxmuscle._common.progress import teller
+from jaxmuscle.data._target import Target, load_target
+from jaxmuscle.model._noise import AbstractNoise
+from jaxmuscle.model._tasks import AbstractTask, with_noise
+from jaxmuscle.objective._arguments import Plan, planned, task_for
+from jaxmuscle.spectra._bin_law import trial_samples
+
+from ._result import FitResult
+from ._search import search_together
+
+if TYPE_CHECKING:
+    import xarray
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure, SubFigure
+
+
+CONFIDENCE = 0.95
+COLUMNS = ("target", "group", "quantity", "value", "stderr", "unit", "determined", "mvc_fraction", "chi2_per_bin", "success")
+
+
+class Difference(eqx.Module):
+    """Mean of `quantity` in group `b` minus that in group `a`, the `difference`, with its 95 % interval (`low`, `high`).
+
+    All in `unit`; `members` is how many the groups have.
+    `basis` says what the interval stands on: "people", the spread within the groups (Welch's t; the fits' own errors are
+    part of that spread), or "fits", the standard errors of the fits, where a group has one member only.
+    """
+
+    quantity: str
+    a: str
+    b: str
+    difference: float
+    low: float
+    high: float
+    unit: str
+    basis: str
+    members: tuple[int, int]
+
+
+class CohortResult(eqx.Module):
+    """`results` by target name; `groups`, the group of each (empty without); `failed`, why others were not fitted."""
+
+    results: dict[str, FitResult]
+    groups: dict[str, str]
+    failed: dict[str, str]
+
+    @property
+    def success(self) -> bool:
+        """Whether every target could be read and its fit succeeded."""
+        return not self.failed and all(result.success for result in self.results.values())
+
+    def table(self) -> list[dict[str, Any]]:
+        """Tidy rows, one per target and quantity (free parameters, then derived ones), with the keys of `COLUMNS`."""
+        return [
+            dict(zip(COLUMNS, (name, self.groups.get(name, ""), quantity, e.value, e.stderr, e.unit, e.identifiable,
+                               result.target.mvc_fraction, result.chi2_per_bin, result.success), strict=True))
+            for name, result in self.results.items()
+            for quantity, e in _quantities(result).items()
+        ]  # fmt: skip
+
+    def to_xarray(self) -> "xarray.Dataset":
+        """`value`, `stderr` (NaN where not determined) and `determined` over (target, quantity); units as coordinate."""
+        import xarray
+
+        names = list(dict.fromkeys(q for result in self.results.values() for q in _quantities(result)))
+        units = {q: e.unit for result in self.results.values() for q, e in _quantities(result).items()}
+
+        def grid(read: Callable[[Any], Any], missing: Any) -> list[list[Any]]:
+            tables = [_quantities(result) for result in self.results.values()]
+            return [[read(t[q]) if q in t else missing for q in names] for t in tables]
+
+        dims = ("target", "quantity")
+        results = self.results.values()
+        return xarray.Dataset(
+            {
+                "value": (dims, grid(lambda e: e.value, np.nan)),
+                "stderr": (dims, grid(lambda e: np.nan if e.stderr is None else e.stderr, np.nan)),
+                "determined": (dims, grid(lambda e: e.identifiable, False)),
+                "chi2_per_bin": ("target", [_or_nan(result.chi2_per_bin) for result in results]),
+                "success": ("target", [result.success for result in results]),
+            },
+            coords={
+                "target": list(self.results),
+                "quantity": names,
+                "unit": ("quantity", [units[q] for q in names]),
+                "group": ("target", [self.groups.get(name, "") for name in self.results]),
+                "mvc_fraction": ("target", [_or_nan(result.target.mvc_fraction) for result in results]),
+            },
+            attrs={f"version_{package}": number for package, number in versions().items()},
+        )
+
+    def differences(self) -> tuple[Difference, ...]:
+        """Every determined quantity, every two groups: difference of the means and its interval.
+
+        Members whose data do not determine the quantity are left out.
+        """
+        found = []
+        groups = list(dict.fromkeys(self.groups.get(name, "") for name in self.results))
+        for quantity in dict.fromkeys(q for result in self.results.values() for q in _determined(result)):
+            for a, b in itertools.combinations(groups, 2):
+                left, right = self._members(quantity, a), self._members(quantity, b)
+                if left and right:
+                    found.append(_difference(quantity, (a, left), (b, right)))
+        return tuple(found)
+
+    def _members(self, quantity: str, group: str) -> list[Any]:
+        return [_determined(result)[quantity] for name, result in self.results.items()
+                if self.groups.get(name, "") == group and quantity in _determined(result)]  # fmt: skip
+
+    def plot(self, by: str = "person", ax: "Axes | None" = None) -> "Figure | SubFigure":
+        """Determined quantities with their standard errors, by "person", "group" or "level" (fraction of MVC)."""
+        from jaxmuscle.plot._cohort import figure
+
+        return figure(self, by, ax)
+
+
+def _or_nan(value: float | None) -> float:
+    return np.nan if value is None else float(value)
+
+
+def _quantities(result: FitResult) -> dict[str, Any]:
+    """Free parameters and derived quantities; what is both (the harmonic's frequency) once."""
+    return {name: p for name, p in result.parameters.items() if p.free} | result.derived
+
+
+def _determined(result: FitResult) -> dict[str, Any]:
+    return {name: e for name, e in _quantities(result).items() if e.stderr is not None}
+
+
+def _difference(quantity: str, a: tuple[str, list[Any]], b: tuple[str, list[Any]]) -> Difference:
+    left, right = ([e.value for e in members] for _, members in (a, b))
+    middle = float(np.mean(right) - np.mean(left))
+    if len(left) > 1 and len(right) > 1:
+        interval = scipy.stats.ttest_ind(right, left, equal_var=False).confidence_interval(CONFIDENCE)
+        low, high, basis = float(interval.low), float(interval.high), "people"
+    else:
+        parts = [np.sum(np.square([e.stderr for e in members])) / len(members) ** 2 for _, members in (a, b)]
+        reach = scipy.stats.norm.ppf(0.5 + CONFIDENCE / 2) * np.sqrt(sum(parts))
+        low, high, basis = float(middle - reach), float(middle + reach), "fits"
+    unit = a[1][0].unit
+    return Difference(quantity, a[0], b[0], middle, low, high, unit, basis, (len(left), len(right)))
+
+
+def fit_cohort(
+    targets: Iterable[Target | str | PathLike[str]],
+    *,
+    groups: Mapping[str, str] | None = None,
+    task: type[AbstractTask] | None = None,
+    noise: str | AbstractNoise | None = None,
+    fix: Mapping[str, float] | None = None,
+    starts: int = 32,
+    progress: bool | Callable[[str, float], None] = False,
+    **options: Any,
+) -> CohortResult:
+    """Fit many targets, in linear response, all starts of all of them in one batch.
+
+    As `fit` with `method="linear"` for each, without its last steps: no nonlinear correction (0.2 % of a bin), no check
+    on simulated seeds, no profile over the harmonic's frequency; fit a target alone for those. Targets that can share a
+    batch are those of the same task, bins and settings.
+
+    **Arguments:** `targets`, or names and paths of them; `groups` {target name: group}; `task`, the same kind for all
+    (by default what each measured); `noise`, `fix`, and other options (`free`, `residual`, `bounds`, `priors`, `key`,
+    `max_steps`, `coefficient_of_variation`) as in `fit`; `starts` for each target; `progress`, True or a function of
+    (text, share).
+
+    **Returns:** a `CohortResult`. A target that cannot be read, or not be fitted with these options, is
+    listed in `failed` with the reason and does not stop the rest.
+
+    **Raises:** `ValueError` for no targets, equal names and a group of an unknown target; `TypeError` for an option that
+    is not one of those above.
+    """
+    loaded, failed = _loaded(targets)
+    unknown = set(groups or {}) - set(loaded) - set(failed)
+    if unknown:
+        raise ValueError(f"groups: no target is called {', '.join(sorted(unknown))}; there are {', '.join(loaded)}")
+    tell = teller(progress)
+    results: dict[str, FitResult] = {}
+    with jax.enable_x64(True):
+        batches: dict[Any, dict[str, Plan]] = {}
+        for name, target in loaded.items():
+            model = task_for(target) if task is None else task(settings=target.settings)
+            model = with_noise(model, noise, fix)
+            try:
+                plan = planned(model, target, fix=fix, method="linear", counts=(starts, None, None), **options)
+            except ValueError as error:
+                failed[name] = str(error)
+                continue
+            batches.setdefault(_alike(plan), {})[name] = plan
+        for batch in batches.values():
+            results |= zip(batch, search_together(list(batch.values()), tell), strict=True)
+    ordered = {name: results[name] for name in loaded if name in results}
+    return CohortResult(ordered, {name: (groups or {})[name] for name in ordered if name in (groups or {})}, failed)
+
+
+def _loaded(targets: Iterable[Target | str | PathLike[str]]) -> tuple[dict[str, Target], dict[str, str]]:
+    loaded: dict[str, Target] = {}
+    failed: dict[str, str] = {}
+    for given in targets:
+        try:
+            target = given if isinstance(given, Target) else load_target(given)
+        except (ValueError, OSError) as error:
+            failed[str(given)] = str(error)
+            continue
+        if target.name in loaded:
+            raise ValueError(f"two targets are called {target.name!r}: rename one")
+        loaded[target.name] = target
+    if not loaded and not failed:
+        raise ValueError("no targets: give at least one")
+    return loaded, failed
+
+
+def _alike(plan: Plan) -> Any:
+    """Equal for fits that differ in their data only, and in the length of their recordings by less than a half."""
+    setup = plan.setup
+    length = round(2 * np.log2(trial_samples(setup.target)))
+    present = tuple(extra is not None for extra in setup.extra)
+    values = tuple(as_numbers(setup.task.parameters).items())
+    return type(setup.task), type(setup.task.noise), values, setup.target.settings, tuple(setup.target.bins), present, length

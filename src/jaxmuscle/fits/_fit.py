@@ -1,0 +1,68 @@
+"""Fit of a task's parameters to a target spectrum, in linear response or by Monte Carlo."""
+
+from collections.abc import Callable, Iterable, Mapping
+
+import jax
+from jaxtyping import PRNGKeyArray
+
+from jaxmuscle.data._target import Target
+from jaxmuscle.model._noise import AbstractNoise
+from jaxmuscle.model._tasks import AbstractTask, with_noise
+from jaxmuscle.objective._arguments import DT, planned
+
+from ._result import FitResult
+from ._search import search
+
+
+def fit(
+    task: AbstractTask,
+    target: Target,
+    *,
+    free: Iterable[str] | None = None,
+    fix: Mapping[str, float] | None = None,
+    noise: str | AbstractNoise | None = None,
+    method: str = "linear",
+    residual: str = "log",
+    starts: int | None = None,
+    seeds: int | None = None,
+    key: PRNGKeyArray | int = 0,
+    bounds: Mapping[str, tuple[float, float]] | None = None,
+    priors: Mapping[str, float | None] | None = None,
+    coefficient_of_variation: bool = True,
+    mean_force: tuple[float, float] | None = None,
+    max_steps: int = 40,
+    dt: float = DT,
+    check_seeds: int | None = None,
+    progress: bool | Callable[[str, float], None] = False,
+) -> FitResult:
+    """Find the parameters whose expected spectrum is the target's: Levenberg-Marquardt from many starts.
+
+    Minimises `½ Σ r_k² + ½ Σ θ_j²`, r the residuals in standard deviations of the target (log residual:
+    `(z_k - z̄) / sd_k`, `z_k = ln(target_k / fitted_k) - bias_k`), θ the free parameters' distance from the task's own
+    values in standard deviations of the prior.
+
+    `method="linear"`: the model's spectrum is that of the linear response (`expected_spectrum`); the best minimum is then
+    polished with the nonlinear model's correction to it, from `seeds` noise paths. `method="montecarlo"`: a mean over
+    `seeds` noise paths that stay the same throughout (common random numbers), with the linear response as control variate
+    where the task has one. The reported spectrum comes from `check_seeds` fresh paths of the nonlinear model.
+
+    **Arguments:** `task` (its values are the prior's centre; `task_for(target)` makes one) and `target`, whose spectrum
+    settings replace the task's; `free`, names to fit (default: `DEFAULT_FREE`, those of them that the task has);
+    `fix`, values to set, which are then not free; `noise`, a name or an object; `residual`, "log", "linear" or
+    "cumulative"; `starts` (100, or 8 for a task without linear response); `seeds` (32, or 48 then); `key`, a `jax.random`
+    key or a seed number; `bounds` {name: (low, high)}; `priors` {name: sd in log, or None for a flat one};
+    `coefficient_of_variation`, whether the target's, if it states one, is one more residual (it fixes the scale of the
+    noise); `mean_force` (value, sd) [N] as a further residual; `max_steps` for each descent; `check_seeds` (64, or 200
+    then); `dt` [s], noise grid of a Monte Carlo fit; `progress`, True or a function of (text, share).
+
+    **Returns:** a `FitResult`; a fit that fails is one, too, and says why.
+
+    **Raises:** `ValueError` for bad arguments (unknown names with the nearest known, too few bins, values outside
+    bounds); `FitInterrupted` on Ctrl-C, with what was reached.
+    """
+    task, counts = with_noise(task, noise, fix), (starts, seeds, check_seeds)
+    with jax.enable_x64(True):
+        plan = planned(task, target, free=free, fix=fix, method=method, residual=residual, counts=counts, key=key,
+                       bounds=bounds, priors=priors, coefficient_of_variation=coefficient_of_variation,
+                       mean_force=mean_force, max_steps=max_steps, dt=dt, progress=progress)  # fmt: skip
+        return search(plan)

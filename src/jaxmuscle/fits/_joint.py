@@ -1,0 +1,186 @@
+"""Several targets of one person fitted together, with shared parameters."""
+
+from collections.abc import Callable, Iterable, Mapping
+from os import PathLike
+from typing import Any
+
+import jax
+from jaxtyping import PRNGKeyArray
+
+from jaxmuscle._common.progress import teller
+from jaxmuscle._common.text import choices
+from jaxmuscle.data._target import Target, load_target
+from jaxmuscle.model._noise import AbstractNoise
+from jaxmuscle.model._tasks import AbstractTask, with_noise
+from jaxmuscle.objective._arguments import base_of, check_shared, free_names, joint_names, planned, target_of, task_for
+
+from ._joint_problem import JointSetup
+from ._joint_result import JointResult
+from ._joint_search import JointPlan, search_jointly
+
+Tasks = dict[str, AbstractTask]
+
+
+def fit_joint(
+    targets: Mapping[str, Target | str | PathLike[str]],
+    *,
+    tasks: Mapping[str, AbstractTask] | None = None,
+    separate: Iterable[str] = (),
+    proportional: Iterable[str] = (),
+    free: Iterable[str] | None = None,
+    fix: Mapping[str, float] | None = None,
+    noise: str | AbstractNoise | None = None,
+    starts: int = 32,
+    seeds: int = 32,
+    key: PRNGKeyArray | int = 0,
+    residual: str = "log",
+    bounds: Mapping[str, tuple[float, float]] | None = None,
+    priors: Mapping[str, float | None] | None = None,
+    coefficient_of_variation: bool = True,
+    mean_force: Mapping[str, tuple[float, float]] | None = None,
+    max_steps: int = 40,
+    progress: bool | Callable[[str, float], None] = False,
+) -> JointResult:
+    """Fit several spectra of the same person with shared parameters: two force levels, or force and displacement.
+
+    Minimises `½ Σ_targets Σ_k r_k² + ½ Σ_j θ_j²`, r as in `fit`, in linear response, from many starts; then with the
+    nonlinear model's correction to every target's spectrum. A parameter of one name is the same number in all tasks that
+    have it; one that only one task has belongs to that. The inputs (`P_w`, `F_ext`, `x_z`) are each task's own.
+
+    **Arguments:** `targets` {name: target, bundled name or path}, two or more; `tasks` {name: task} (`task_for` of each
+    target by default), whose values are the prior's centre and whose spectrum settings the target's replace; `separate`,
+    names of parameters that have a value for each target, then called "c_w@high"; `proportional`, names that keep the ratio
+    which their values have in the tasks (as `at_level` sets them); `free`, names to fit, "P_w@high" for one target's
+    (default as in `fit`); `fix` {name or "name@target": value}; `noise` of all tasks; `starts`; `seeds` of the nonlinear
+    correction (0: none); `bounds`, `priors`, `key`, `residual`, `coefficient_of_variation`, `max_steps`, `progress` as in
+    `fit`; `mean_force` {target: (value, sd)}.
+
+    **Returns:** a `JointResult`; a fit that fails is one, too, and says why.
+
+    **Raises:** `ValueError` for fewer than two targets, names that no target, task or parameter has, tasks that contradict
+    each other in what they share, and what `fit` refuses.
+    """
+    loaded = _loaded(targets)
+    with jax.enable_x64(True):
+        plan = planned_jointly(loaded, tasks=tasks, separate=separate, proportional=proportional, free=free, fix=fix,
+                               noise=noise, starts=starts, seeds=seeds, key=key, residual=residual, bounds=bounds,
+                               priors=priors, coefficient_of_variation=coefficient_of_variation, mean_force=mean_force,
+                               max_steps=max_steps, progress=progress)  # fmt: skip
+        return search_jointly(plan)
+
+
+def planned_jointly(
+    targets: dict[str, Target],
+    *,
+    tasks: Mapping[str, AbstractTask] | None = None,
+    separate: Iterable[str] = (),
+    proportional: Iterable[str] = (),
+    free: Iterable[str] | None = None,
+    fix: Mapping[str, float] | None = None,
+    noise: str | AbstractNoise | None = None,
+    starts: int = 32,
+    seeds: int = 32,
+    key: PRNGKeyArray | int = 0,
+    residual: str = "log",
+    bounds: Mapping[str, tuple[float, float]] | None = None,
+    priors: Mapping[str, float | None] | None = None,
+    coefficient_of_variation: bool = True,
+    mean_force: Mapping[str, tuple[float, float]] | None = None,
+    max_steps: int = 40,
+    progress: bool | Callable[[str, float], None] = False,
+) -> JointPlan:
+    """The arguments of `fit_joint`, checked (see there). Needs double precision."""
+    separate, proportional, fix = tuple(separate), tuple(proportional), dict(fix or {})
+    for argument, named in (("tasks", tasks or {}), ("mean_force", mean_force or {})):
+        for name in named:
+            if name not in targets:
+                raise ValueError(f"{argument}: no target is called {name!r}: {choices(name, targets)}")
+    if starts < 1 or max_steps < 1 or seeds < 0:
+        raise ValueError(f"starts = {starts} and max_steps = {max_steps} must be at least 1, seeds = {seeds} at least 0")
+    models = _models(targets, tasks or {}, noise, fix)
+    check_shared(models, separate, proportional)
+    local = _local_free(models, targets, None if free is None else tuple(free), fix)
+    names = joint_names(local, models, separate)
+    known = list(dict.fromkeys(joint for of in names.values() for joint in of.values()))
+    _check_known("bounds", bounds or {}, known)
+    _check_known("priors", priors or {}, known)
+    setups = {
+        name: planned(models[name], target, free=local[name], residual=residual, counts=(starts, max(seeds, 1), None),
+                      key=key, bounds=_own(bounds or {}, names[name]), priors=_own(priors or {}, names[name]),
+                      coefficient_of_variation=coefficient_of_variation, mean_force=(mean_force or {}).get(name),
+                      max_steps=max_steps, progress=progress).setup
+        for name, target in targets.items()
+    }  # fmt: skip
+    setup = JointSetup.of(setups, names, teller(progress))
+    c = setup.coordinates
+    settings = {
+        "free": list(c.names), "separate": list(separate), "proportional": list(proportional), "residual": residual,
+        "starts": starts, "seeds": seeds, "max_steps": max_steps,
+        "prior_centre": dict(zip(c.names, c.centre.tolist(), strict=True)),
+        "prior_sd": {n: float(sd) if p else None for n, sd, p in zip(c.names, c.sd, setup.prior, strict=True)},
+        "bounds": {n: list(b) for n, b in (bounds or {}).items()},
+        "coefficient_of_variation": {n: s.extra[0] is not None for n, s in setups.items()},
+        "mean_force": {n: list(m) for n, m in (mean_force or {}).items()},
+    }  # fmt: skip
+    return JointPlan(setup, starts, seeds, max_steps, settings, key if isinstance(key, int) else None)
+
+
+def _loaded(targets: Mapping[str, Any]) -> dict[str, Target]:
+    if len(targets) < 2:
+        raise ValueError(f"targets: {len(targets)} given, a joint fit needs at least two; fit(task, target) fits one")
+    for name in targets:
+        if not name or "@" in name:
+            raise ValueError(f"targets: a name must not be empty nor contain '@', as {name!r} does")
+    return {name: t if isinstance(t, Target) else load_target(t) for name, t in targets.items()}
+
+
+def _models(targets: dict[str, Target], tasks: Mapping[str, AbstractTask], noise: Any, fix: dict[str, float]) -> Tasks:
+    """Every target's task with its noise, its fixed values and the target's settings."""
+    found, fixed = {}, {t: {base_of(n): v for n, v in fix.items() if target_of(n) in ("", t)} for t in targets}
+    for name, target in targets.items():
+        task = tasks[name] if name in tasks else task_for(target)
+        if (target.quantity == "displacement") != (task.output_unit == "m"):
+            raise ValueError(f"target {name!r} is a {target.quantity}, but its task {type(task).__name__} gives "
+                             f"{task.output_name} in {task.output_unit}: give tasks={{{name!r}: ...}}")  # fmt: skip
+        found[name] = with_noise(task.with_parts(settings=target.settings), noise, fixed[name])
+    held = {name: _holders("fix", name, found) for name in fix}
+    return {t: task.replace(**{base_of(n): fix[n] for n in fix if t in held[n]}) for t, task in found.items()}
+
+
+def _holders(argument: str, name: str, tasks: Tasks) -> list[str]:
+    """The targets whose task has a parameter, called by its name or as "name@target"."""
+    base, target = base_of(name), target_of(name)
+    if target and target not in tasks:
+        raise ValueError(f"{argument}: {name!r} names no target: {choices(target, tasks)}")
+    known = tasks[target].parameter_names if target else dict.fromkeys(n for t in tasks.values() for n in t.parameter_names)
+    if base not in known:
+        whose = f"task {target!r} has no parameter" if target else "no task has a parameter"
+        raise ValueError(f"{argument}: {whose} {base!r}: {choices(base, known)}")
+    return [t for t, task in tasks.items() if base in task.parameter_names and target in ("", t)]
+
+
+def _local_free(
+    tasks: Tasks, targets: dict[str, Target], free: Iterable[str] | None, fix: Iterable[str]
+) -> dict[str, tuple[str, ...]]:
+    """The free parameters of every target's task."""
+    found = {}
+    fixed, wanted = ({n: _holders(argument, n, tasks) for n in names or ()} for argument, names in
+                     (("fix", fix), ("free", free)))  # fmt: skip
+    for t, task in tasks.items():
+        here = [base_of(n) for n, holders in wanted.items() if t in holders]
+        if free is not None and not here:
+            raise ValueError(f"free: none of these belongs to the task of target {t!r}: free one, or leave the target out")
+        held = {base_of(n): 0.0 for n, holders in fixed.items() if t in holders}
+        found[t] = free_names(task, None if free is None else here, held, len(targets[t].bins))
+    return found
+
+
+def _check_known(argument: str, given: Mapping[str, Any], known: list[str]) -> None:
+    for name in given:
+        if name not in known and name not in map(base_of, known):
+            raise ValueError(f"{argument}: unknown or not free parameter {name!r}: {choices(name, known)}")
+
+
+def _own(given: Mapping[str, Any], names: Mapping[str, str]) -> dict[str, Any]:
+    """What is given for one target's parameters: by joint name, else by the parameter's own name."""
+    return {local: given.get(joint, given.get(local)) for local, joint in names.items() if joint in given or local in given}

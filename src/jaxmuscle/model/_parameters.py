@@ -1,0 +1,179 @@
+"""The one table of parameters: symbol, unit, default, bounds, prior and source; and how a name finds its value."""
+
+import dataclasses
+import math
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import numpy as np
+
+from jaxmuscle._common.arrays import _is_scalar, checked, require
+from jaxmuscle._common.text import choices
+
+_HAND = "mass of a hand, about 0.6 % of body mass (Winter 2009, Biomechanics, table 4.1); design 2: keeps fits non-stiff"
+_STIFF = "K_0 = k x_ref^2 = 200 N/m, the postural stiffness of a hand (order of Mussa-Ivaldi et al. 1985)"
+_DAMP = "C_0 = c v_ref^2; slow eigenvalue near -K/C = -10/s, the corner seen in measured force spectra"
+_REF = "sets the range over which the muscle is linear: displacements here are about 0.01 m"
+_HUMAN = "coefficient of variation of isometric force near 1 %, as people show; the paper: 0.0016"
+_PAPER_C = "the paper: 0.01 % of the initial damping coefficient"
+
+
+def _row(name, symbol, unit, default, meaning, source, lower=0.0, upper=math.inf, sd=1.0, positive=True, **bounds):
+    return Parameter(name, symbol, unit, default, lower, upper, sd, positive, meaning, source, **bounds)
+
+
+def _free_sign(name, symbol, unit, default, meaning, source, sd):
+    bounds = {"fit_lower": -math.inf, "fit_upper": math.inf}
+    return _row(name, symbol, unit, default, meaning, source, -math.inf, math.inf, sd, positive=False, **bounds)
+
+
+DEFAULT_FREE = ("k_w", "k_z", "c_w", "c_z", "harmonic_amplitude", "harmonic_frequency", "noise_K_w", "noise_K_z")
+USUALLY_FREE = (*DEFAULT_FREE, "noise_correlation_time")  # where a task has them
+CHANNELS = ("K_w", "K_z", "C_w", "C_z")
+
+
+def default(name: str) -> float:
+    """The default value of a parameter of the table."""
+    return PARAMETERS[name].default
+
+
+class Parameter(NamedTuple):
+    """One row of the parameter table: `name`, `symbol`, `unit`, `default`, `meaning`, and the `source` of the default.
+
+    `lower` and `upper` bound what is physically possible, `fit_lower` and `fit_upper` what a fit may reach.
+    A positive parameter is fitted in log space; `prior_sd` is then the standard deviation of its logarithm,
+    otherwise it is in the parameter's own unit.
+    """
+
+    name: str
+    symbol: str
+    unit: str
+    default: float
+    lower: float
+    upper: float
+    prior_sd: float
+    positive: bool
+    meaning: str
+    source: str
+    fit_lower: float = 0.0
+    fit_upper: float = math.inf
+
+
+PARAMETERS: dict[str, Parameter] = {
+    row.name: row
+    for row in (
+        _row("m_w", "m_w", "kg", 0.5, "active mass", _HAND),
+        _row("m_z", "m_z", "kg", 0.5, "passive mass", _HAND),
+        _row("k_w", "k_w", "N/m^3", 5e5, "active stiffness factor", _STIFF),
+        _row("k_z", "k_z", "N/m^3", 5e5, "passive stiffness factor", _STIFF),
+        _row("c_w", "c_w", "N s^3/m^3", 60.0, "active damping factor", _DAMP),
+        _row("c_z", "c_z", "N s^3/m^3", 5.0, "passive damping factor", _DAMP),
+        _row("x_ref_w", "x_ref,w", "m", 0.02, "active reference displacement", _REF),
+        _row("x_ref_z", "x_ref,z", "m", 0.02, "passive reference displacement", _REF),
+        _row("v_ref_w", "v_ref,w", "m/s", 1.0, "active reference velocity", _REF),
+        _row("v_ref_z", "v_ref,z", "m/s", 1.0, "passive reference velocity", _REF),
+        _row("noise_K_w", "σ_Kw/K_w0", "1", 0.15, "noise on active stiffness", _HUMAN),
+        _row("noise_K_z", "σ_Kz/K_z0", "1", 0.005, "noise on passive stiffness", _HUMAN),
+        _row("noise_C_w", "σ_Cw/C_w0", "1", 1e-4, "noise on active damping", _PAPER_C),
+        _row("noise_C_z", "σ_Cz/C_z0", "1", 1e-4, "noise on passive damping", _PAPER_C),
+        _row("noise_cutoff", "f_c", "Hz", 50.0, "corner of band-limited noise", "Nyquist frequency of the papers' 100 Hz"),
+        _row("noise_correlation_time", "τ", "s", 0.1, "correlation time of Ornstein-Uhlenbeck noise",
+             "fits of measured force: 0.07 to 0.3 s", fit_lower=0.005, fit_upper=5.0),
+        _row("harmonic_amplitude", "A/K_0", "1", 0.003, "harmonic amplitude", _HUMAN),
+        _row("harmonic_frequency", "f_S", "Hz", 4.25, "harmonic frequency", "the paper: local maximum at 4.251 Hz",
+             fit_lower=0.2, fit_upper=30.0),
+        _free_sign("harmonic_phase", "φ", "rad", 0.0, "harmonic phase", "unknown and without influence", math.pi),
+        _free_sign("P_w", "P_w", "N", 5.0, "active force level", "light pressing, displacement near 0.01 m", 5.0),
+        _free_sign("F_ext", "F_ext", "N", 0.0, "external force level", "the paper's Task 2", 5.0),
+        _free_sign("x_z", "x_z", "m", 0.0, "displacement of the insertion", "the paper: held", 0.01),
+    )
+}  # fmt: skip
+
+
+def _muscle_paths(muscle: Any) -> dict[str, tuple]:
+    paths: dict[str, tuple] = {}
+    for field, value in _dynamic_fields(muscle):
+        if _is_scalar(value) and np.ndim(value) == 0:
+            paths[field] = ("muscle", field)
+        elif isinstance(value, eqx.Module):
+            suffix = field[-2:] if field[-2:] in ("_w", "_z") else ""
+            for inner, leaf in _dynamic_fields(value):
+                if _is_scalar(leaf):
+                    paths[inner + suffix] = ("muscle", field, inner)
+    return paths
+
+
+def _dynamic_fields(module: Any) -> list[tuple[str, Any]]:
+    fields = dataclasses.fields(module)
+    return [(f.name, getattr(module, f.name)) for f in fields if not f.metadata.get("static", False)]
+
+
+def paths_of(task: Any) -> dict[str, tuple]:
+    """Name and path of every parameter of a task: the muscle's, the noise's, the harmonic's and the input levels."""
+    paths = _muscle_paths(task.muscle)
+    for field, value in _dynamic_fields(task.noise):
+        if field == "amplitude":
+            paths |= {f"noise_{channel}": ("noise", "amplitude", i) for i, channel in enumerate(CHANNELS)}
+        elif _is_scalar(value):
+            paths[f"noise_{field}"] = ("noise", field)
+    for field in ("amplitude", "frequency", "phase"):
+        paths[f"harmonic_{field}"] = ("harmonic", field)
+    for field in ("P_w", "F_ext", "x_z"):
+        if hasattr(task, field):
+            paths[field] = (field, "level") if isinstance(getattr(task, field), eqx.Module) else (field,)
+    return paths
+
+
+def get_parameter(task: Any, name: str) -> Any:
+    """Value of a parameter by name."""
+    node = task
+    for step in _path(task, name):
+        node = node[step] if isinstance(step, int) else getattr(node, step)
+    return node
+
+
+def set_parameters(task: Any, values: dict[str, Any]) -> Any:
+    """A copy of the task with the named values, validated as a constructor would."""
+    for name, value in values.items():
+        row = PARAMETERS.get(name)
+        if row is not None:
+            message = f"{name} = {value} {row.unit} is outside [{row.lower}, {row.upper}]: {row.meaning}"
+            require(jax.numpy.isfinite(value) & (value >= row.lower) & (value <= row.upper), message)
+        path = _path(task, name)
+        index = path[-1] if isinstance(path[-1], int) else None
+        node = task
+        fields = path[:-1] if index is not None else path
+        for step in fields:
+            node = getattr(node, step)
+        if index is not None:
+            parts = [node[i] for i in range(len(CHANNELS))]
+            parts[index] = value
+            value = _stack(parts)
+        task = eqx.tree_at(lambda t, f=fields: _follow(t, f), task, value, is_leaf=lambda x: x is None)
+    return checked(task)
+
+
+def _stack(parts: list[Any]) -> Any:
+    """Scalars to one array: NumPy's as long as all are concrete, so that nothing is rounded before it must be."""
+    if any(isinstance(p, jax.Array) for p in parts):
+        return jax.numpy.stack([jax.numpy.asarray(p) for p in _same_dtype(parts)])
+    return np.array([float(p) for p in parts])
+
+
+def _same_dtype(parts: list[Any]) -> list[Any]:
+    dtype = jax.numpy.result_type(*[p.dtype for p in parts if isinstance(p, jax.Array)])
+    return [jax.numpy.asarray(p, dtype=dtype) for p in parts]
+
+
+def _follow(node: Any, fields: tuple) -> Any:
+    for step in fields:
+        node = getattr(node, step)
+    return node
+
+
+def _path(task: Any, name: str) -> tuple:
+    paths = paths_of(task)
+    if name not in paths:
+        raise ValueError(f"unknown parameter {name!r} of {type(task).__name__}: {choices(name, paths)}")
+    return paths[name]

@@ -1,0 +1,163 @@
+"""Saved tasks: one table holds the muscle, its perturbation, the inputs and the spectrum settings."""
+
+import dataclasses
+import json
+import tomllib
+from pathlib import Path
+from typing import Any, Literal, get_origin
+
+import equinox as eqx
+import numpy as np
+import tomli_w
+
+from jaxmuscle._common.arrays import as_numbers
+from jaxmuscle._common.bundled import bundled_text, list_presets
+from jaxmuscle._common.errors import PresetError
+from jaxmuscle._common.files import write_text
+from jaxmuscle._common.text import choices
+from jaxmuscle.spectra._settings import SpectrumSettings
+
+from . import _muscle, _noise
+from . import _muscle as _law
+from . import _pink_noise as _pink
+from . import _signals as _harmonic
+from . import _signals as _signal
+from . import _tasks as _task
+from ._tasks import TASKS, AbstractTask
+
+_KINDS: dict[str, type] = {
+    kind.__name__: kind
+    for module in (_harmonic, _law, _muscle, _noise, _pink, _signal, _task)
+    for kind in vars(module).values()
+    if isinstance(kind, type) and issubclass(kind, eqx.Module) and not kind.__name__.startswith("Abstract")
+}
+_BASES = (_muscle.AbstractMuscle, _law.AbstractLaw, _noise.AbstractNoise, _signal.AbstractSignal)
+_NAMES = {kind: name for name, kind in TASKS.items()}
+
+
+def task_to_table(task: AbstractTask) -> dict[str, Any]:
+    """A task as nested tables of numbers and strings. Raises `PresetError` for a class that is not jaxmuscle's."""
+    return {"task": _NAMES[type(task)]} | _fields_to_table(as_numbers(task)) if type(task) in _NAMES else _refuse(task)
+
+
+def _known() -> dict[str, type]:
+    """Classes by name: jaxmuscle's, and those of the user's that have been imported."""
+    return {kind.__name__: kind for base in _BASES for kind in _below(base)} | _KINDS
+
+
+def _below(kind: type) -> list[type]:
+    return [each for child in kind.__subclasses__() for each in (child, *_below(child))]
+
+
+def _refuse(value: Any) -> dict[str, Any]:
+    raise PresetError(
+        f"{type(value).__name__} is not one of jaxmuscle's own classes and cannot be saved: keep the code that makes it"
+    )
+
+
+def _fields_to_table(module: eqx.Module) -> dict[str, Any]:
+    values = {field.name: getattr(module, field.name) for field in dataclasses.fields(module)}
+    return {name: _to_table(value) for name, value in values.items() if value is not None}
+
+
+def _to_table(value: Any) -> Any:
+    if isinstance(value, SpectrumSettings):
+        return value.to_dict()
+    if isinstance(value, eqx.Module):
+        if _known().get(type(value).__name__) is not type(value):
+            _refuse(value)
+        return {"type": type(value).__name__} | _fields_to_table(value)
+    if isinstance(value, np.ndarray):
+        return value.tolist()
+    return list(value) if isinstance(value, tuple) else value
+
+
+def task_from_table(table: dict[str, Any]) -> AbstractTask:
+    """The task of a table. Raises `PresetError` for one that is not whole."""
+    table = dict(table)
+    name = table.pop("task", None)
+    if name not in TASKS:
+        raise PresetError(f"task = {name!r}: {choices(str(name), TASKS)}")
+    return _build(TASKS[name], table, "task")
+
+
+def _build(kind: type, table: dict[str, Any], where: str) -> Any:
+    fields = {field.name: field for field in dataclasses.fields(kind)}
+    values = {}
+    for key, value in table.items():
+        if key not in fields:
+            raise PresetError(f"unknown key {where}.{key}: {choices(key, fields)}")
+        values[key] = _from_table(key, value, f"{where}.{key}")
+        if not _fits(fields[key].type, values[key]):
+            raise PresetError(f"{where}.{key} = {value!r} is of the wrong kind")
+    if kind in (_noise.OrnsteinUhlenbeckNoise, _pink.PinkNoise):
+        values["std"] = values.pop("amplitude", None)
+    try:
+        return kind(**values)
+    except (TypeError, ValueError) as error:
+        raise PresetError(f"{where}: {error}") from None
+
+
+def _fits(kind: Any, value: Any) -> bool:
+    """Whether a value can be that of a field: a module where one is meant, else a switch, a word, or numbers."""
+    if isinstance(kind, type) and issubclass(kind, eqx.Module):
+        number = isinstance(value, int | float) and not isinstance(value, bool)
+        return isinstance(value, kind) or (kind is _signal.AbstractSignal and number)
+    if kind is bool or isinstance(value, bool):
+        return kind is bool and isinstance(value, bool)
+    return isinstance(value, str) == (get_origin(kind) is Literal) and not isinstance(value, eqx.Module)
+
+
+def _from_table(key: str, value: Any, where: str) -> Any:
+    if key == "settings" and isinstance(value, dict):
+        return SpectrumSettings.from_dict(value)
+    if isinstance(value, dict):
+        kind = value.get("type")
+        known = _known()
+        if kind not in known:
+            raise PresetError(
+                f"{where}.type = {kind!r}: {choices(str(kind), known)}; a class of your own must be imported first"
+            )
+        return _build(known[kind], {k: v for k, v in value.items() if k != "type"}, where)
+    if isinstance(value, list):
+        return tuple(value) if key == "initial" else np.array(value, dtype=float)
+    return value
+
+
+def load_preset(name_or_path: str | Path) -> AbstractTask:
+    """The task of a bundled preset, of a preset file (.toml), or of a `fit.json`: `name_or_path`.
+
+    **Raises:** `PresetError` naming the file or the nearest bundled name, and what is wrong.
+    """
+    name = str(name_or_path)
+    if name in list_presets():
+        return task_from_table(tomllib.loads(bundled_text(name, "presets"))["task_table"])
+    path = Path(name).expanduser()
+    if not path.suffix and not path.exists():
+        raise PresetError(f"unknown preset {name!r}: {choices(name, list_presets())}; or give a path")
+    table = _read(path)
+    if not isinstance(table.get("task_table"), dict):
+        raise PresetError(f"{path}: has no [task_table]: is it a preset or a fit.json?")
+    try:
+        return task_from_table(table["task_table"])
+    except ValueError as error:
+        raise PresetError(f"{path}: {error}") from None
+
+
+def _read(path: Path) -> dict[str, Any]:
+    try:
+        text = path.read_text(encoding="utf-8")
+        table = json.loads(text) if path.suffix == ".json" else tomllib.loads(text)
+    except OSError as error:
+        raise PresetError(f"{path}: cannot be read: {error.strerror}") from None
+    except ValueError as error:
+        raise PresetError(f"{path}: is not valid {'JSON' if path.suffix == '.json' else 'TOML'}: {error}") from None
+    if not isinstance(table, dict):
+        raise PresetError(f"{path}: is not a preset or a fit.json: it holds no table")
+    return table
+
+
+def save_preset(path: str | Path, task: AbstractTask, *, description: str = "", fit: dict[str, Any] | None = None) -> None:
+    """Write a task to `path` as a preset: TOML with a description, the fit that made it and the task table."""
+    table: dict[str, Any] = {"description": description} | ({"fit": fit} if fit else {})
+    write_text(path, tomli_w.dumps(table | {"task_table": task_to_table(task)}))

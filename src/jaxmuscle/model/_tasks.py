@@ -1,0 +1,271 @@
+"""Tasks: which end of the muscle is held or loaded, equations of motion, inputs and output."""
+
+import abc
+import dataclasses
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxmuscle._common.arrays import is_concrete, require
+from jaxmuscle._common.text import choices
+from jaxmuscle._common.types import Scalar
+from jaxmuscle.spectra._settings import SpectrumSettings
+
+from ._muscle import AbstractMuscle, Muscle, Perturbation
+from ._noise import AbstractNoise, BandLimitedNoise, OrnsteinUhlenbeckNoise, WhiteNoise
+from ._parameters import CHANNELS, default, get_parameter, paths_of, set_parameters
+from ._pink_noise import PinkNoise
+from ._signals import AbstractSignal, Harmonic, as_signal, derivatives
+
+NOISES: dict[str, type[AbstractNoise]] = {
+    "white": WhiteNoise,
+    "band-limited": BandLimitedNoise,
+    "ornstein-uhlenbeck": OrnsteinUhlenbeckNoise,
+    "pink": PinkNoise,
+}
+
+State = Float[Array, " states"]
+
+
+class AbstractTask(eqx.Module):
+    """What is simulated: `y' = vector_field(t, y, u)`, observed as `output(t, y, u, u')`.
+
+    `u = (ΔK_w, ΔK_z, ΔC_w, ΔC_z)` [N/m, N s/m] is the perturbation of the coefficients: noise and harmonic. Common to
+    all tasks are the `muscle`, the `noise` (None in a field: the default), the `harmonic`, how the output's spectrum is
+    estimated (`settings`) and the initial state (`initial`, zero by default).
+
+    `task[name]` reads, `task.replace(name=value)` changes a parameter by its name in the parameter table.
+    """
+
+    muscle: AbstractMuscle = eqx.field(default_factory=Muscle, kw_only=True)
+    noise: AbstractNoise = eqx.field(
+        default_factory=BandLimitedNoise, kw_only=True, converter=lambda noise: noise.per_channel()
+    )
+    harmonic: Harmonic = eqx.field(default_factory=Harmonic, kw_only=True)
+    settings: SpectrumSettings = eqx.field(static=True, default_factory=SpectrumSettings, kw_only=True)
+    initial: tuple[Scalar, ...] | None = eqx.field(default=None, kw_only=True)
+
+    state_names: ClassVar[tuple[str, ...]]
+    state_units: ClassVar[tuple[str, ...]]
+    output_name: ClassVar[str]
+    output_unit: ClassVar[str]
+    smoothness_needed: ClassVar[tuple[int, int, int, int]]
+
+    @abc.abstractmethod
+    def vector_field(self, t: Scalar, y: State, u: Perturbation) -> State:
+        """Time derivative of the state."""
+
+    @abc.abstractmethod
+    def output(self, t: Scalar, y: State, u: Perturbation, du: Perturbation) -> Scalar:
+        """What is measured, given the state, the perturbation and its time derivative."""
+
+    def __getitem__(self, name: str) -> Scalar:
+        return get_parameter(self, name)
+
+    def replace(self, **values: Scalar) -> "AbstractTask":
+        """A copy with the named parameters set. Raises `ValueError` for an unknown name or an impossible value."""
+        return set_parameters(self, values)
+
+    def with_parts(self, **parts: Any) -> "AbstractTask":
+        """A copy with whole parts (`muscle`, `noise`, `harmonic`, `settings`, inputs) exchanged."""
+        fields = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+        return type(self)(**(fields | parts))
+
+    def as_task(self, task: "type[AbstractTask]", **inputs: Any) -> "AbstractTask":
+        """The same muscle, perturbation and settings in another task, with that task's default inputs unless given."""
+        return task(muscle=self.muscle, noise=self.noise, harmonic=self.harmonic, settings=self.settings, **inputs)
+
+    @property
+    def parameter_names(self) -> tuple[str, ...]:
+        """Names of all parameters of this task."""
+        return tuple(paths_of(self))
+
+    @property
+    def parameters(self) -> dict[str, Scalar]:
+        """All parameters by name."""
+        return {name: get_parameter(self, name) for name in self.parameter_names}
+
+    def initial_state(self) -> State:
+        """State at t = 0."""
+        size = len(self.state_names)
+        return jnp.zeros(size) if self.initial is None else jnp.stack([jnp.asarray(v) * 1.0 for v in self.initial])
+
+    def noise_scale(self) -> Perturbation:
+        """Amplitude of the noise in the coefficients' own units."""
+        amplitude = jnp.asarray(self.noise.amplitude)
+        return amplitude * self.muscle.base() if self.noise.relative else amplitude
+
+    def harmonic_base(self) -> Perturbation:
+        """What the harmonic is a fraction of: (K_w0, K_z0, 0, 0)."""
+        return self.muscle.base() * np.array([1.0, 1.0, 0.0, 0.0], dtype=jnp.result_type(float))
+
+
+def with_noise(
+    task: AbstractTask, noise: str | AbstractNoise | None, fix: Mapping[str, float] | None = None
+) -> AbstractTask:
+    """The task with another noise, at its default amplitudes except those that `fix` names."""
+    if noise is None:
+        return task
+    if isinstance(noise, AbstractNoise):
+        return task.with_parts(noise=noise)
+    if noise not in NOISES:
+        raise ValueError(f"noise = {noise!r}: {choices(noise, NOISES)}")
+    kind: Any = NOISES[noise]
+    made = kind().per_channel()
+    values = {f"noise_{c}": float(made.amplitude[i]) for i, c in enumerate(CHANNELS)} | dict(fix or {})
+    fixed = [values[f"noise_{c}"] for c in CHANNELS]
+    return task.with_parts(noise=eqx.tree_at(lambda n: n.amplitude, made, np.array(fixed)))
+
+
+def _check_task(task: AbstractTask) -> None:
+    if task.initial is not None and len(task.initial) != len(task.state_names):
+        raise ValueError(f"initial has {len(task.initial)} entries, {type(task).__name__} needs {task.state_names}")
+    _check_noise(task)
+
+
+def _check_noise(task: AbstractTask) -> None:
+    """Refuse a noise that is rougher than the task can sample or differentiate, where its amplitude is not zero."""
+    amplitude, have = task.noise.amplitude, task.noise.smoothness
+    if not is_concrete(amplitude):
+        return
+    what = {1: "appears directly in the output, where white noise has no value", 2: "must be differentiable in time"}
+    for i, (channel, need) in enumerate(zip(CHANNELS, task.smoothness_needed, strict=True)):
+        if have < need and np.asarray(amplitude)[i] != 0:
+            raise ValueError(
+                f"{type(task.noise).__name__} on {channel} cannot be used in {type(task).__name__}: there it {what[need]}. "
+                f"Use BandLimitedNoise, or set noise_{channel} = 0"
+            )
+
+
+def _check_smooth(task: AbstractTask, name: str, need: int) -> None:
+    signal = getattr(task, name)
+    if signal.smoothness < need:
+        raise ValueError(f"{name} is a {type(signal).__name__} with {signal.smoothness} continuous derivatives; "
+                         f"{type(task).__name__} needs {need}: use SmoothStep, RampHold or Sampled")  # fmt: skip
+
+
+class PrescribedMotion(AbstractTask):
+    """Task 1: the insertion moves as prescribed, which internal force P_w does that need?
+
+    State x_w. Equation (1b) gives `x_w' = v` such that `passive_force(x_w, v, x_z, x_z', u) = -(F_ext + m_z x_z'')`, for
+    the paper's muscle `x_w' = x_z' + (F_ext + m_z x_z'' + K_z (x_z - x_w)) / C_z`, and (1a) the output
+
+        P_w = m_w x_w'' + active_force(x_w, x_w', u) + m_z x_z'' + F_ext
+
+    where x_w'' is the total time derivative of the right-hand side along (1, x_w', u').
+
+    **Arguments:** `x_z` [m] and `F_ext` [N], numbers (smooth steps from zero) or signals; the common fields.
+
+    **Raises:** `ValueError` if C_z0 = 0 (x_w' would be infinite at rest), if noise on K_z or C_z is not differentiable,
+    for white noise anywhere (P_w contains it), for inputs that are not smooth enough.
+    """
+
+    x_z: AbstractSignal = eqx.field(converter=as_signal, default=default("x_z"))
+    F_ext: AbstractSignal = eqx.field(converter=as_signal, default=10.0)
+    state_names: ClassVar[tuple[str, ...]] = ("x_w",)
+    state_units: ClassVar[tuple[str, ...]] = ("m",)
+    output_name: ClassVar[str] = "P_w"
+    output_unit: ClassVar[str] = "N"
+    smoothness_needed: ClassVar[tuple[int, int, int, int]] = (1, 2, 1, 2)
+
+    def __check_init__(self):
+        _check_task(self)
+        _check_smooth(self, "x_z", 3)
+        _check_smooth(self, "F_ext", 1)
+        _check_smooth_envelope(self)
+        require(self.muscle.base()[3] > 0, "C_z0 = c_z v_ref_z^2 = 0: in PrescribedMotion x_w' divides by C_z, which "
+                "would vanish whenever the insertion rests; give c_z > 0 and v_ref_z > 0")  # fmt: skip
+
+    def vector_field(self, t: Scalar, y: State, u: Perturbation) -> State:
+        x_z, v_z, a_z = derivatives(self.x_z, t, 2)
+        force = -(self.F_ext(t) + self.muscle.m_z * a_z)
+        return self.muscle.contraction_velocity(y[0], x_z, v_z, force, u)[None]
+
+    def output(self, t: Scalar, y: State, u: Perturbation, du: Perturbation) -> Scalar:
+        t = jnp.asarray(t)
+        v_w = self.vector_field(t, y, u)
+        _, a_w = jax.jvp(self.vector_field, (t, y, u), (jnp.ones_like(t), v_w, du))
+        _, _, a_z = derivatives(self.x_z, t, 2)
+        active = self.muscle.active_force(y[0], v_w[0], u)
+        return self.muscle.m_w * a_w[0] + active + self.muscle.m_z * a_z + self.F_ext(t)
+
+
+class PrescribedForce(AbstractTask):
+    """Task 2: the muscle pulls with a prescribed force P_w, how does the insertion move?
+
+    State (x_w, x_w', x_z, x_z'), equations (1a) and (1b); output x_z.
+
+    **Arguments:** `P_w` and `F_ext` [N], numbers (smooth steps from zero) or signals; the common fields.
+    """
+
+    P_w: AbstractSignal = eqx.field(converter=as_signal, default=default("P_w"))
+    F_ext: AbstractSignal = eqx.field(converter=as_signal, default=default("F_ext"))
+    state_names: ClassVar[tuple[str, ...]] = ("x_w", "v_w", "x_z", "v_z")
+    state_units: ClassVar[tuple[str, ...]] = ("m", "m/s", "m", "m/s")
+    output_name: ClassVar[str] = "x_z"
+    output_unit: ClassVar[str] = "m"
+    smoothness_needed: ClassVar[tuple[int, int, int, int]] = (0, 0, 0, 0)
+
+    def __check_init__(self):
+        _check_task(self)
+
+    def vector_field(self, t: Scalar, y: State, u: Perturbation) -> State:
+        x_w, v_w, x_z, v_z = y[0], y[1], y[2], y[3]
+        muscle = self.muscle
+        passive = muscle.passive_force(x_w, v_w, x_z, v_z, u)
+        a_w = (self.P_w(t) - muscle.active_force(x_w, v_w, u) + passive) / muscle.m_w
+        return jnp.stack([v_w, a_w, v_z, -(self.F_ext(t) + passive) / muscle.m_z])
+
+    def output(self, t: Scalar, y: State, u: Perturbation, du: Perturbation) -> Scalar:
+        return y[2]
+
+
+class Isometric(AbstractTask):
+    """The experiments of [30] and [12]: the insertion is held at x_z, a sensor there reads F_ext.
+
+    State (x_w, x_w'), equation (1a) with x_z fixed; output `F_ext = C_z x_w' + K_z (x_w - x_z)`, the negative passive
+    force.
+
+    **Arguments:** `P_w` [N], a number (a smooth step from zero) or a signal; `x_z` [m], a number; the common fields.
+
+    **Raises:** `ValueError` for white noise on K_z or C_z, which F_ext contains directly.
+    """
+
+    P_w: AbstractSignal = eqx.field(converter=as_signal, default=default("P_w"))
+    x_z: Scalar = default("x_z")
+    state_names: ClassVar[tuple[str, ...]] = ("x_w", "v_w")
+    state_units: ClassVar[tuple[str, ...]] = ("m", "m/s")
+    output_name: ClassVar[str] = "F_ext"
+    output_unit: ClassVar[str] = "N"
+    smoothness_needed: ClassVar[tuple[int, int, int, int]] = (0, 1, 0, 1)
+
+    def __check_init__(self):
+        _check_task(self)
+
+    def _passive(self, y: State, u: Perturbation) -> Scalar:
+        return self.muscle.passive_force(y[0], y[1], jnp.asarray(self.x_z), jnp.zeros_like(y[1]), u)
+
+    def vector_field(self, t: Scalar, y: State, u: Perturbation) -> State:
+        force = self.P_w(t) - self.muscle.active_force(y[0], y[1], u) + self._passive(y, u)
+        return jnp.stack([y[1], force / self.muscle.m_w])
+
+    def output(self, t: Scalar, y: State, u: Perturbation, du: Perturbation) -> Scalar:
+        return -self._passive(y, u)
+
+
+def _check_smooth_envelope(task: AbstractTask) -> None:
+    envelope = task.harmonic.envelope
+    if envelope.smoothness < 1:
+        raise ValueError(f"harmonic envelope {type(envelope).__name__} must have a continuous derivative")
+
+
+TASKS: dict[str, type[AbstractTask]] = {
+    "isometric": Isometric,
+    "prescribed-motion": PrescribedMotion,
+    "prescribed-force": PrescribedForce,
+}

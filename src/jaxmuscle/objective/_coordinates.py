@@ -1,0 +1,118 @@
+"""Free parameters as unconstrained numbers."""
+
+from typing import Any, TypeVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from scipy.special import expit
+
+from jaxmuscle._common.types import Scalar
+from jaxmuscle.model._parameters import PARAMETERS, Parameter, set_parameters
+from jaxmuscle.model._tasks import AbstractTask
+
+Numbers = TypeVar("Numbers", bound=Float[Array | np.ndarray, "*batch free"])
+
+
+class Coordinates(eqx.Module):
+    """Free parameters as unconstrained numbers.
+
+    `θ = (ln v - ln v0) / sd` for positive parameters, `(v - v0) / sd` for others, v0 the task's own value and sd the
+    prior's; a parameter with two finite bounds is `θ = low + (high - low) sigmoid(s)`, otherwise θ = s.
+    """
+
+    names: tuple[str, ...] = eqx.field(static=True)
+    centre: Float[np.ndarray, " free"]
+    sd: Float[np.ndarray, " free"]
+    positive: np.ndarray
+    low: Float[np.ndarray, " free"]
+    high: Float[np.ndarray, " free"]
+
+    @classmethod
+    def of(cls, values: dict[str, float], bounds: dict[str, tuple[float, float]], sds: dict[str, float]) -> "Coordinates":
+        """Coordinates about the given values. Raises `ValueError` for one that cannot be fitted."""
+        rows = {name: PARAMETERS.get(name, _generic(name)) for name in values}
+        low, high = [], []
+        for name, value in values.items():
+            row = rows[name]
+            a, b = bounds.get(name, (row.fit_lower, row.fit_upper))
+            if row.positive and not value > 0:
+                raise ValueError(
+                    f"{name} = {value} cannot be fitted: it is fitted in log space, start from a positive value"
+                )
+            if not a < value < b:
+                raise ValueError(f"{name} = {value} {row.unit} must lie inside its bounds ({a}, {b})")
+            low.append((_log(a) - np.log(value)) / sds[name] if row.positive else (a - value) / sds[name])
+            high.append((_log(b) - np.log(value)) / sds[name] if row.positive else (b - value) / sds[name])
+        positive = np.array([rows[name].positive for name in values])
+        centre = np.array([float(v) for v in values.values()])
+        sd = np.array([sds[name] for name in values])
+        return cls(tuple(values), centre, sd, positive, *_both_or_none(np.array(low), np.array(high)))
+
+    def theta(self, s: Numbers) -> Numbers:
+        """Coordinates in standard deviations of the prior."""
+        xp, sigmoid = self._library(s)
+        bounded = xp.isfinite(self.low)
+        low, high = xp.where(bounded, self.low, 0.0), xp.where(bounded, self.high, 1.0)
+        return xp.where(bounded, low + (high - low) * sigmoid(s), s)
+
+    def stretch(self, s: Float[np.ndarray, "*batch free"]) -> Float[np.ndarray, "*batch free"]:
+        """dθ/ds."""
+        bounded = np.isfinite(self.low)
+        share = expit(s)
+        return np.where(bounded, np.where(bounded, self.high - self.low, 1.0) * share * (1 - share), 1.0)
+
+    def _library(self, given: Any) -> tuple[Any, Any]:
+        """NumPy for numbers, which needs no compilation, else JAX; with its sigmoid."""
+        return (np, expit) if isinstance(given, np.ndarray) and isinstance(self.low, np.ndarray) else (jnp, jax.nn.sigmoid)
+
+    def from_theta(self, theta: Float[np.ndarray, "*batch free"]) -> Float[np.ndarray, "*batch free"]:
+        """The reverse of `theta`, clipped into the bounds."""
+        bounded = np.isfinite(self.low)
+        low, high = np.where(bounded, self.low, 0.0), np.where(bounded, self.high, 1.0)
+        share = np.clip((theta - low) / (high - low), 1e-3, 1 - 1e-3)
+        return np.where(bounded, np.log(share / (1 - share)), theta)
+
+    def values(self, theta: Float[Array | np.ndarray, " free"]) -> dict[str, Scalar]:
+        """Natural values of the parameters at θ."""
+        xp, _ = self._library(theta)
+        step = self.sd * theta
+        natural = xp.where(self.positive, self.centre * xp.exp(xp.where(self.positive, step, 0.0)), self.centre + step)
+        return dict(zip(self.names, natural, strict=True))
+
+    def values_of(self, theta: Float[np.ndarray, "rows free"]) -> Float[np.ndarray, "rows free"]:
+        """Natural values of many θ, in the order of `names`."""
+        step = self.sd * theta
+        return np.where(self.positive, self.centre * np.exp(np.where(self.positive, step, 0.0)), self.centre + step)
+
+    def theta_of(self, name: str, values: Float[np.ndarray, "*values"] | float) -> Float[np.ndarray, "*values"]:
+        """θ of one positive parameter at natural values."""
+        i = self.names.index(name)
+        return np.asarray(np.log(values / self.centre[i]) / self.sd[i])
+
+    def slope(self, values: Float[np.ndarray, " free"]) -> Float[np.ndarray, " free"]:
+        """dv/dθ at natural values."""
+        return np.where(self.positive, values, 1.0) * self.sd
+
+
+def _log(value: float) -> float:
+    return -np.inf if value <= 0 else float(np.log(value))
+
+
+def _generic(name: str) -> Parameter:
+    return Parameter(name, name, "", 1.0, 0.0, np.inf, 1.0, True, "", "a user's own", 0.0, np.inf)
+
+
+def _both_or_none(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Where only one bound is finite the other is set 20 prior standard deviations beyond the centre."""
+    some = np.isfinite(low) | np.isfinite(high)
+    low = np.where(some & ~np.isfinite(low), -20.0, low)
+    high = np.where(some & ~np.isfinite(high), 20.0, high)
+    return np.where(some, low, -np.inf), np.where(some, high, np.inf)
+
+
+def at(task: AbstractTask, coordinates: Coordinates, theta: Float[Array, " free"]) -> AbstractTask:
+    """The task at coordinates θ."""
+    return set_parameters(task, coordinates.values(theta))

@@ -1,0 +1,243 @@
+"""The likelihood of a Welch spectrum: chi-squared bins with their bias and correlation, and spectra drawn from it."""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.scipy.special import i0e
+from jaxtyping import Array, Float
+from scipy.special import gammaincinv, ndtr
+
+from jaxmuscle._common.arrays import as_arrays, is_concrete
+from jaxmuscle._common.types import Scalar
+from jaxmuscle.data._recording import Recording
+from jaxmuscle.data._target import Target
+from jaxmuscle.model._tasks import AbstractTask
+from jaxmuscle.response._expected import Moments, check_line, expected_moments
+from jaxmuscle.spectra._bin_law import bin_statistics, trial_samples, welch_law
+from jaxmuscle.spectra._settings import WINDOW
+
+from ._consequences import Seen, seen_at
+from ._problem import Problem, Setup, target_variation, theta_of
+
+
+def repeated(setup: Setup, task: AbstractTask, count: int) -> Moments:
+    """The task's moments in linear response, in `count` rows; for `drawn_spectra`."""
+    seen = seen_at(setup.linear(), theta_of(setup, task)[None])
+    return Moments(*(np.repeat(np.asarray(x), count, axis=0) for x in seen.moments))
+
+
+Powers = Float[Array | np.ndarray, " bins"]
+NEWTON = 12
+NODES = 33
+REACH = 6.0
+LEAST = 1e-3
+
+
+class Bins(NamedTuple):
+    """Measured log proportional powers with their law; `mask` is 0 for bins that are left out."""
+
+    log_power: Float[Array | np.ndarray, "*rows bins"]
+    half: Float[Array | np.ndarray, "*rows bins"]
+    precision: Float[Array | np.ndarray, "*rows bins bins"]
+    logdet: Float[Array | np.ndarray, "*rows"]
+    mask: Float[Array | np.ndarray, "*rows bins"]
+
+
+def measured_bins(target: Target, mask: np.ndarray | None = None) -> Bins:
+    """A target's bins with their law, those with `mask` 0 left out. Raises `ValueError` for one that states no segments."""
+    if target.segments is None:
+        raise ValueError(f"{target.name}: states no segments, so the law of its bins is unknown; give segments")
+    law = welch_law(target.settings, target.bins, target.segments)
+    kept = np.ones(len(target.bins)) if mask is None else np.asarray(mask, dtype=float)
+    return Bins(np.log(target.proportional_power), law.degrees / 2, *_precision(law.correlation, kept), kept)
+
+
+def _precision(correlation: np.ndarray, mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    kept = np.flatnonzero(mask)
+    part = correlation[np.ix_(kept, kept)]
+    whole = np.zeros_like(correlation)
+    whole[np.ix_(kept, kept)] = np.linalg.inv(part)
+    return whole, np.asarray(np.linalg.slogdet(part)[1])
+
+
+def log_density(bins: Bins, power: Powers, line: Powers, offset: Scalar) -> Scalar:
+    """Log density of proportional powers p and of the log of their total, `offset` above the model's.
+
+    `x_k = e^u (p_k / Σp) / (E_k / ΣE)` are gamma variables of shape ν_k/2 and mean 1, ν_k raised by 1 / (1 - ρ_k²) where a
+    line holds the share ρ_k of the bin. They are joined by a Gaussian copula: their normal scores (Wilson & Hilferty 1931,
+    `z = 3 √a (x^⅓ - 1 + 1/(9a))`, a = ν/2) have the correlation matrix R of the bins. With a flat density of u the total,
+    which proportional powers do not show, is integrated out by integrating over u.
+    """
+    share = jnp.clip(line / power, 0.0, 1.0)
+    a = bins.half / jnp.maximum(1 - share**2, LEAST)
+    total = jax.nn.logsumexp(bins.log_power)
+    log_x = offset + bins.log_power - total - jnp.log(power) + jnp.log(jnp.sum(power))
+    root = jnp.exp(log_x / 3)
+    marginal = a * jnp.log(a) - _log_gamma(a) + a * (log_x - root**3) - bins.log_power
+    z = bins.mask * 3 * jnp.sqrt(a) * (root - 1 + 1 / (9 * a))
+    return jnp.sum(bins.mask * marginal) - 0.5 * (z @ bins.precision @ z - z @ z) - 0.5 * bins.logdet
+
+
+def _log_gamma(a: Powers) -> Powers:
+    """ln Γ(a) for a >= 0.5 to 1e-7, by Stirling's series at a + 3: JAX's own would take most of the time."""
+    b = a + 3
+    series = (1 / 12 - (1 / 360 - 1 / (1260 * b**2)) / b**2) / b
+    return (b - 0.5) * jnp.log(b) - b + 0.5 * np.log(2 * np.pi) + series - jnp.log(a * (a + 1) * (a + 2))
+
+
+def likeliest_offset(bins: Bins, power: Powers, line: Powers) -> tuple[Scalar, Scalar]:
+    """The u of highest density and its standard deviation by the curvature there."""
+    slope = jax.grad(lambda u: log_density(bins, power, line, u))
+    curvature = jax.grad(slope)
+    least = 0.05 * jnp.sum(bins.mask * bins.half)  # keeps Newton's steps finite far from the maximum
+
+    def step(_, u):
+        return u + jnp.clip(slope(u) / jnp.maximum(-curvature(u), least), -1.0, 1.0)
+
+    u = jax.lax.fori_loop(0, NEWTON, step, jnp.zeros(()))
+    return u, 1 / jnp.sqrt(jnp.maximum(-curvature(u), least))
+
+
+def log_marginal(bins: Bins, power: Powers, line: Powers) -> Scalar:
+    """Log density of proportional powers: `log_density` integrated over the offset, by the trapezoidal rule."""
+    middle, width = jax.tree.map(jax.lax.stop_gradient, likeliest_offset(bins, power, line))
+    nodes = middle + width * jnp.linspace(-REACH, REACH, NODES)
+    values = jax.vmap(lambda u: log_density(bins, power, line, u))(nodes)
+    return jax.nn.logsumexp(values) + jnp.log(width * 2 * REACH / (NODES - 1))
+
+
+class Likelihood(eqx.Module):
+    """Log likelihood of a fit's data as a function of its model's moments.
+
+    With segments: the gamma law of Welch bins. Without, but with a sigma: Gaussian in the residual of the fit. Further
+    residuals (coefficient of variation, mean force) are Gaussian. `bins` is None in the Gaussian case.
+    """
+
+    problem: Problem
+    bins: Bins | None
+
+    @classmethod
+    def of(cls, setup: Setup) -> "Likelihood":
+        """Of the setup's target. Raises `ValueError` if that states neither segments nor sigma."""
+        target = setup.target
+        if target.segments is None and target.sigma is None:
+            raise ValueError(
+                f"{target.name}: states neither segments nor sigma, so nothing says how much it scatters: give segments, "
+                "the number of Welch segments that were averaged (--segments), or a sigma per bin"
+            )
+        return cls(setup.linear(), None if target.segments is None else as_arrays(measured_bins(target)))
+
+    def at(self, moments: Moments, offset: Scalar, bins: Bins | None = None) -> Scalar:
+        """Log density of data and offset (which counts in the gamma law only) where the model has these moments."""
+        bins = self.bins if bins is None else bins
+        data = self.problem.data
+        if bins is None:
+            return _gaussian(self.problem.data_residuals(moments, data))
+        return log_density(bins, moments.power, moments.line, offset) + self._further(moments)
+
+    def marginal(self, moments: Moments, bins: Bins | None = None) -> Scalar:
+        """The same with the offset integrated out."""
+        bins = self.bins if bins is None else bins
+        if bins is None:
+            return self.at(moments, jnp.zeros(()))
+        return log_marginal(bins, moments.power, moments.line) + self._further(moments)
+
+    def information(self, seen: Seen, bins: Bins | None = None) -> Float[Array, "all all"]:
+        """Fisher information of (θ, offset), `Jᵀ C⁻¹ J`: C the bins' covariance in the log, 2 R_kl / √(ν_k ν_l).
+
+        What the line tells by how little a bin scatters is left out.
+        """
+        bins = self.bins if bins is None else bins
+        if bins is None:
+            slope = jax.jacfwd(lambda theta: self.problem.data_residuals(seen.nearby(theta), self.problem.data))(seen.theta)
+            return _bordered(slope.T @ slope)
+        further = jax.jacfwd(lambda theta: self._further_rows(seen.nearby(theta)))(seen.theta)
+        moments, slopes = seen.moments, seen.slopes
+        weight = bins.mask * jnp.sqrt(bins.half / jnp.maximum(1 - jnp.clip(moments.line / moments.power, 0, 1) ** 2, LEAST))
+        total = jnp.sum(moments.power)
+        logs = jnp.sum(slopes.power, axis=0) / total - slopes.power / moments.power[:, None]
+        rows = weight[:, None] * jnp.concatenate([logs, jnp.ones((len(logs), 1))], axis=1)
+        return jnp.asarray(rows.T @ bins.precision @ rows) + _bordered(further.T @ further)
+
+    def _further(self, moments: Moments) -> Scalar:
+        return _gaussian(self._further_rows(moments))
+
+    def _further_rows(self, moments: Moments) -> Float[Array | np.ndarray, " rows"]:
+        variation, mean = self.problem.data.extra
+        rows = [] if variation is None else [(jnp.log(moments.variation) - variation[0]) / variation[1]]
+        rows += [] if mean is None else [(moments.mean - mean[0]) / mean[1]]
+        return jnp.stack([jnp.asarray(row) for row in rows]) if rows else jnp.zeros(0)
+
+
+def drawn_spectra(likelihood: Likelihood, target: Target, moments: Moments, key: Array) -> Float[np.ndarray, "rows bins"]:
+    """Proportional powers scattering about the model's: correlated gamma variables, or Gaussian in the log with a sigma."""
+    normal = np.asarray(jax.random.normal(key, np.shape(moments.power)))
+    power = np.asarray(moments.power)
+    bins: Any = likelihood.bins
+    if bins is None:
+        drawn = power * np.exp(normal * np.asarray(bin_statistics(target).sd))
+    else:
+        share = np.clip(np.asarray(moments.line) / power, 0.0, 1.0)
+        half = np.asarray(bins.half) / np.maximum(1 - share**2, LEAST)
+        root = np.linalg.cholesky(np.linalg.inv(np.asarray(bins.precision)))
+        drawn = power * gammaincinv(half, ndtr(normal @ root.T)) / half
+    return drawn / drawn.sum(axis=-1, keepdims=True)
+
+
+def _bordered(curvature: Float[Array, "free free"]) -> Float[Array, "all all"]:
+    """With a row and column of zeros for the offset."""
+    return jnp.pad(curvature, ((0, 1), (0, 1)))
+
+
+def _gaussian(residuals: Float[Array | np.ndarray, " rows"]) -> Scalar:
+    return -0.5 * jnp.sum(jnp.asarray(residuals) ** 2)
+
+
+@eqx.filter_jit
+def _target_likelihood(task, bins, chosen, variation, samples):
+    moments = expected_moments(task, task.settings, WINDOW, samples)[0]
+    found = log_marginal(bins, moments.power[chosen], moments.line[chosen])
+    if variation is not None:
+        found += _gaussian(((jnp.log(moments.variation) - variation[0]) / variation[1])[None]) - jnp.log(variation[1])
+    return found
+
+
+@eqx.filter_jit
+def _whittle(task, settings, power, window):
+    moments = expected_moments(task, settings, window)[0]
+    noise, line = moments.power - moments.line, moments.line
+    argument = 2 * jnp.sqrt(power * line) / noise
+    return jnp.sum(jnp.log(i0e(argument)) - jnp.log(noise) - (jnp.sqrt(power) - jnp.sqrt(line)) ** 2 / noise)
+
+
+def log_likelihood(task: AbstractTask, data: Target | Recording) -> Scalar:
+    """Log likelihood of measured data under a task in linear response; differentiable in the task.
+
+    A `Target` with segments: its Welch bins are correlated gamma variables about the expected spectrum (`log_density`),
+    their unknown total integrated out; with its coefficient of variation as one more datum, Gaussian in the log with the
+    standard deviation that it has under this task, if it states one.
+    A `Recording`: the Whittle likelihood of the periodogram of its window, in its own units, between the first and last
+    bin of the task's settings, about the *expected* periodogram of a window of that length (leakage and aliases included:
+    debiased Whittle, Sykulski et al. 2019, doi:10.1093/biomet/asy071). With a line L_k in noise N_k,
+
+        Σ_k [ln I0(2 √(I_k L_k) / N_k) - (I_k + L_k) / N_k - ln N_k],
+
+    the noncentral chi-squared law with two degrees of freedom; without, `-Σ (ln E_k + I_k / E_k)`.
+
+    **Raises:** `ValueError` for a target without segments, a harmonic beyond half the sampling rate, and what
+    `Recording.fft_spectrum` refuses.
+    """
+    if all(is_concrete(leaf) for leaf in jax.tree.leaves(task)):
+        check_line(task, task.settings)
+    if isinstance(data, Target):
+        task = task.with_parts(settings=data.settings)
+        bins = jax.tree.map(jnp.asarray, measured_bins(data))
+        variation = target_variation(data, task)
+        samples = jnp.asarray(trial_samples(data))
+        return _target_likelihood(as_arrays(task), bins, data.bins - data.settings.first_bin, variation, samples)
+    whole = data.fft_spectrum(task.settings.replace(window="boxcar"))
+    duration = whole.settings.length / whole.settings.rate
+    return _whittle(as_arrays(task), whole.settings, jnp.asarray(whole.power), (0.0, duration))

@@ -1,0 +1,141 @@
+"""How a fit predicts moments: in linear response, or by Monte Carlo over fixed noise paths."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.signal
+from jaxtyping import Array, Float, Int
+
+from jaxmuscle.model._noise import Realisation
+from jaxmuscle.model._tasks import AbstractTask
+from jaxmuscle.response._expected import Moments, expected_moments, response
+from jaxmuscle.response._linearised import LinearTask, settled
+from jaxmuscle.simulation._batch import respond
+from jaxmuscle.simulation._integrator import Grid
+from jaxmuscle.spectra._settings import SpectrumSettings, samples_in
+from jaxmuscle.spectra._welch import lowpass
+
+
+def welch_operator(
+    settings: SpectrumSettings, samples: int, window: tuple[float, float]
+) -> Float[np.ndarray, "parts samples"]:
+    """The linear part of `spectrum_of` as one matrix.
+
+    Low-pass, window, detrending, taper and transform are linear, so a Welch power is `Σ (A x)²` over the rows of its
+    bin; the rows are ordered (segments and real/imaginary part, bins), scaled so that the sum is the power itself.
+    """
+    x = np.eye(samples)
+    if settings.sections is not None:
+        both = settings.filter_direction == "both"
+        low_pass: Any = scipy.signal.sosfiltfilt if both else scipy.signal.sosfilt
+        x = np.asarray(low_pass(settings.sections, x))
+    x = x[:, round(window[0] * settings.rate) : round(window[1] * settings.rate)]
+    count, n = settings.segments(x.shape[1]), settings.length
+    if count < 1:
+        raise ValueError(f"window {window} s is shorter than one segment of {n} samples at {settings.rate} Hz")
+    parts = []
+    bins = np.arange(settings.first_bin, settings.last_bin + 1)
+    doubled = np.where((bins == 0) | (2 * bins == n), 1.0, 2.0)
+    scale = np.sqrt(doubled / (settings.rate * np.sum(settings.taper**2) * count))
+    for k in range(count):
+        segment = x[:, k * settings.step : k * settings.step + n]
+        if settings.detrend != "none":
+            segment = scipy.signal.detrend(segment, type=settings.detrend)
+        transform = np.fft.rfft(np.asarray(segment) * settings.taper)[:, bins] * scale
+        parts += [transform.real.T, transform.imag.T]
+    return np.concatenate(parts)
+
+
+class Linear(eqx.Module):
+    """The expected spectrum of a task in linear response, times a `correction` (of a nonlinear simulation, say).
+
+    Its variance is that of a recording of so many `samples`.
+    """
+
+    chosen: np.ndarray
+    correction: Moments
+    samples: Int[Array | np.ndarray, ""]
+    window: tuple[float, float] = eqx.field(static=True)
+
+    def moments(self, task: AbstractTask) -> Moments:
+        """Expected moments of the task's output."""
+        found = expected_moments(task, task.settings, self.window, self.samples)[
+            0
+        ]  # compiled apart, so that it is traced once
+        found = found._replace(power=found.power[self.chosen], line=found.line[self.chosen])
+        return jax.tree.map(jnp.multiply, found, self.correction)
+
+
+class MonteCarlo(eqx.Module):
+    """Mean spectrum of a task over fixed noise paths (common random numbers).
+
+    `noise` holds normals, or unit paths when no free parameter changes them. With `control` the task starts settled and
+    the linearised task runs on the same paths as control variate. Without it the first entry of `noise` is zero, which
+    gives the harmonic's own response; that is taken off every seed before the spectrum and its power added after: the
+    cross term between line and noise has expectation zero, yet for fixed paths it makes the cost ripple with the frequency.
+    """
+
+    noise: Any
+    operator: Float[Array, "parts samples"]
+    chosen: np.ndarray
+    samples: Int[Array | np.ndarray, ""]
+    grid: Grid
+    window: tuple[float, float] = eqx.field(static=True)
+    control: bool = eqx.field(static=True)
+
+    @classmethod
+    def of(cls, task: AbstractTask, normals: Any, grid: Grid, chosen: np.ndarray, window: tuple[float, float], *,
+           colour_free: bool, control: bool, samples: int | None = None) -> "MonteCarlo":  # fmt: skip
+        """Prepare for the task's settings; `chosen` are the positions of the compared bins among the settings' bins.
+
+        With a control variate the variance is that of a recording of so many `samples`, by default as many as simulated.
+        """
+        if not control:
+            normals = jnp.concatenate([jnp.zeros_like(normals[:1]), normals])
+        noise = normals if colour_free else jax.jit(jax.vmap(lambda z: task.noise.realise(z, grid.dt)))(normals)
+        operator = welch_operator(task.settings, grid.steps // grid.every + 1, window)
+        samples = samples_in(window, task.settings) if samples is None else samples
+        return cls(noise, jnp.asarray(operator), chosen, jnp.asarray(samples), grid, window, control)
+
+    @property
+    def seeds(self) -> int:
+        """How many noise paths there are."""
+        return jax.tree.leaves(self.noise)[0].shape[0] - (not self.control)
+
+    def moments(self, task: AbstractTask) -> Moments:
+        """Moments of the task's output."""
+        settings = task.settings
+        start, stop = (round(edge * settings.rate) for edge in self.window)
+
+        def outputs(task):
+            def one(entry):
+                path = entry if isinstance(entry, Realisation) else task.noise.realise(entry, self.grid.dt)
+                return respond(task, path, self.grid, settings.sampling)[1]
+
+            return jax.vmap(one)(self.noise)
+
+        task = settled(task) if self.control else task
+
+        def swing(seen):
+            return jnp.var(lowpass(seen, settings)[..., start:stop], axis=-1)
+
+        seen = outputs(task)
+        mean = jnp.mean(seen[int(not self.control) :, start:stop])
+        if self.control:
+            exact, system = response(task, settings, self.window, self.samples)
+            beside = outputs(LinearTask.of(task, system))
+            power = exact.power[self.chosen] + jnp.mean(self._power(seen, settings) - self._power(beside, settings), 0)
+            spread = jnp.mean(swing(seen) - swing(beside))
+            return Moments(power, exact.line[self.chosen], mean, exact.variance + spread)
+        quiet, noisy = seen[:1], seen[1:] - seen[:1]
+        line, random = jnp.mean(self._power(quiet, settings), 0), jnp.mean(self._power(noisy, settings), 0)
+        variance = swing(quiet[0]) + jnp.mean(swing(noisy))
+        return Moments(line + random, line, mean, variance)
+
+    def _power(self, outputs: Float[Array, "seeds samples"], settings: SpectrumSettings) -> Float[Array, "seeds bins"]:
+        bins = settings.last_bin - settings.first_bin + 1
+        parts = (outputs @ self.operator.T).reshape(len(outputs), -1, bins)
+        return jnp.sum(parts**2, axis=1)[:, self.chosen]

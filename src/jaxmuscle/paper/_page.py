@@ -1,0 +1,139 @@
+"""The page of `jaxmuscle reproduce`: figures, the table of statements, the three readings. One file, no network."""
+
+from collections import Counter
+from html import escape
+from importlib.metadata import version
+from pathlib import Path
+
+from jaxmuscle._common.files import write_text
+
+from ._claims import AGREES, DIFFERS, GRID, Row, claims_json
+from ._numbers import SINES, Experiment, Reproduction
+from ._readings import FACTS, conclusion
+
+CAPTIONS = {
+    "fig2": "<b>Figure 2.</b> Force P<sub>w</sub> in Task 1, tuned to [30] at 95 % MVC, over its mean: rise before 5 s, "
+    "hold analysed to 15 s. The sine is the harmonic at 4.25 Hz; slower changes are relaxation.",
+    "fig3": "<b>Figure 3.</b> Its power spectrum: 100 samples/s, 30 Hz low-pass, Welch with 256 points.",
+    "fig4a": "<b>Figure 4a.</b> Proportional power (bin power over the sum of bins 1 to 30).",
+    "fig4b": "<b>Figure 4b.</b> The same with logarithmic axes.",
+    "fig5": "<b>Figure 5.</b> Displacement of the insertion at constant force (Task 2), same muscle, over its mean. "
+    "P<sub>w</sub>(t) is what Task 1 needs, without noise, to hold the insertion at 1 mm against 10 N.",
+    "fig6a": "<b>Figure 6a.</b> Force in Task 1 tuned to [12], over its mean. The 0.391 Hz harmonic fades from 5 s on.",
+    "fig6b": "<b>Figure 6b.</b> Its displacement in Task 2: one dominant frequency.",
+    "fig7": "<b>Figure 7.</b> Three people: FFT of the whole recording above, Welch below.",
+    "fig8": "<b>Figure 8.</b> Power of one person against another, bin by bin, with the Spearman correlation.",
+}
+CLASSES = {AGREES: "yes", GRID: "grid", DIFFERS: "no"}
+STYLE = """
+:root{color-scheme:light}*{box-sizing:border-box}
+body{margin:0 auto;max-width:62rem;padding:1rem;font:16px/1.5 system-ui,sans-serif;color:#1a1a1a;background:#fff}
+h1{font-size:1.5rem;line-height:1.25}h2{font-size:1.2rem;margin-top:2.2rem}a{color:#0058a3}
+.figures{display:grid;grid-template-columns:repeat(auto-fit,minmax(min(100%,24rem),1fr));gap:1.5rem}
+figure{margin:0}figcaption{font-size:.9rem}img{width:100%;height:auto;display:block}
+table{border-collapse:collapse;width:100%;font-size:.9rem}th,td{text-align:left;vertical-align:top;padding:.45rem .6rem;
+border-bottom:1px solid #ddd;overflow-wrap:anywhere}thead th{border-bottom:2px solid #555}
+.verdict{font-weight:600}.yes{color:#00664a}.grid{color:#0058a3}.no{color:#a33c00}.open{color:#555}
+.source{color:#555;font-size:.85rem}.plain th,.plain .holds{overflow-wrap:normal;white-space:nowrap;padding:.45rem .3rem}
+.plain th:not(:first-child),.holds{text-align:center}
+@media(max-width:46rem){table.stack thead{position:absolute;left:-999rem}table.stack tr{display:block;padding:.6rem 0;
+border-bottom:2px solid #bbb}table.stack td{display:block;border:0;padding:.15rem 0}
+table.stack td::before{content:attr(data-label);display:block;font-size:.75rem;color:#555}.scroll{overflow-x:auto}}
+""".strip()
+
+
+def write_page(found: Reproduction, rows: tuple[Row, ...], out: Path) -> None:
+    """Write index.html and claims.json."""
+    write_text(out / "claims.json", claims_json(rows))
+    write_text(out / "index.html", page(found, rows))
+
+
+def page(found: Reproduction, rows: tuple[Row, ...]) -> str:
+    """The whole page."""
+    count = Counter(row.verdict for row in rows)
+    summary = ", ".join(f"{n} {verdict}" for verdict, n in count.items())
+    body = "\n".join(
+        (
+            "<h1>Enhancing rheological muscle models with stochastic processes: reproduced</h1>",
+            "<p>The figures and every stated number of Zagrodny, Wojnicz, Ludwicki and Barański (<i>the paper</i>), from "
+            f"jaxmuscle {version('jaxmuscle')}. [30] is Slifkin &amp; Newell 1999, [12] Hamilton, Jones &amp; Wolpert 2004. "
+            "What is stated was taken from texts; the figures were not available as data.</p>",
+            f"<p><b>{len(rows)} statements</b>: {escape(summary)}. As data: <a href='claims.json'>claims.json</a>.</p>",
+            "<h2>Figures</h2>",
+            f"<div class='figures'>{''.join(_figure(name, _caption(name, found.experiment)) for name in CAPTIONS)}</div>",
+            "<h2>Statements</h2>",
+            _claims(rows),
+            "<h2>Where do 0.391 and 4.251 Hz come from? Three readings</h2>",
+            _readings(found),
+            "<h2>Comparison signals</h2>",
+            _regularity(found),
+        )
+    )
+    return (
+        "<!doctype html>\n<html lang='en'>\n<head>\n<meta charset='utf-8'>\n"
+        "<meta name='viewport' content='width=device-width, initial-scale=1'>\n<title>jaxmuscle reproduce</title>\n"
+        f"<style>{STYLE}</style>\n</head>\n<body>\n{body}\n</body>\n</html>\n"
+    )
+
+
+def _caption(name: str, experiment: Experiment) -> str:
+    if name not in ("fig7", "fig8"):
+        return CAPTIONS[name]
+    names = ", ".join(escape(r.name) for r in experiment.recordings)
+    simulated = (
+        "<b>Simulated, not measured</b>: displacement in Task 2 with Ornstein-Uhlenbeck noise, parameters 10 % apart: "
+    )
+    return f"{CAPTIONS[name]} {simulated if experiment.simulated else 'Your own recordings: '}{names}."
+
+
+def _figure(name: str, caption: str) -> str:
+    return (
+        f"<figure id='{name}'><a href='{name}.png'><img src='{name}.png' alt='{name}' loading='lazy'></a>"
+        f"<figcaption>{caption} <a href='{name}.pdf'>PDF</a></figcaption></figure>"
+    )
+
+
+def _table(head: tuple[str, ...], body: list[str], kind: str = "stack") -> str:
+    columns = "".join(f"<th scope='col'>{escape(h)}</th>" for h in head)
+    table = f"<table class='{kind}'><thead><tr>{columns}</tr></thead><tbody>{''.join(body)}</tbody></table>"
+    return f"<div class='scroll'>{table}</div>"
+
+
+def _claims(rows: tuple[Row, ...]) -> str:
+    head = ("Paper says", "We get", "How it was obtained", "Agrees, or why not")
+    body = []
+    for row in rows:
+        says = f"{escape(row.says)} <span class='source'>({escape(row.source)})</span>"
+        verdict = f"<span class='verdict {CLASSES.get(row.verdict, 'open')}'>{row.verdict}</span>"
+        cells = (says, escape(row.ours), escape(row.how), verdict + (f": {escape(row.why)}" if row.why else ""))
+        filled = "".join(f"<td data-label='{label}'>{cell}</td>" for label, cell in zip(head, cells, strict=True))
+        body.append(f"<tr id='{row.key}'>{filled}</tr>")
+    return _table(head, body)
+
+
+def _readings(found: Reproduction) -> str:
+    keys = tuple(r.key for r in found.readings)
+    listed = "".join(f"<li><b>{r.key}</b>: {escape(r.words)}</li>" for r in found.readings)
+    body = []
+    for key, words in FACTS.items():
+        marks = "".join(f"<td class='holds'>{'yes' if r.facts[key] else '–'}</td>" for r in found.readings)
+        body.append(f"<tr><td>{escape(words)}</td>{marks}</tr>")
+    for words, value in (("share of a sine in bin 1", "sine_share"), ("share of the variance above 10 Hz", "fast_share")):
+        marks = "".join(f"<td class='holds'>{getattr(r, value):.0%}</td>" for r in found.readings)
+        body.append(f"<tr><td>{words}</td>{marks}</tr>")
+    picture = _figure("readings", "Force in the window, one run, and proportional power of each reading.")
+    return f"<ul>{listed}</ul>{_table(('Stated', *keys), body, 'plain')}<p>{escape(conclusion(found.readings))}</p>{picture}"
+
+
+def _regularity(found: Reproduction) -> str:
+    r = found.regularity
+    values = [("white Gaussian noise, as drawn", r.white_unfiltered), ("white Gaussian noise, low-passed", r.white),
+              ("force of Figure 2, as sampled", r.force_unfiltered), ("force of Figure 2, low-passed", r.force)]  # fmt: skip
+    values += [(f"sine of {f:g} Hz", value) for f, value in zip(SINES, r.sines, strict=True)]
+    body = [f"<tr><td>{name}</td><td>{value:.3f}</td></tr>" for name, value in values]
+    words = "<p>Approximate entropy (m = 2, r = 0.2 SD) of 10 s at 100 samples/s: low is regular. [30] reports it for force "
+    return (
+        words
+        + "beside white noise and sines; its values are not known here.</p>"
+        + _table(("Signal", "ApEn"), body, "plain")
+    )

@@ -1,0 +1,163 @@
+"""Three readings of the 0.391 Hz and 4.251 Hz maxima: which of the facts that the paper states does each of them give?"""
+
+import equinox as eqx
+import jax
+import numpy as np
+from jaxtyping import Float
+
+from jaxmuscle._common.arrays import as_arrays
+from jaxmuscle.ensembles._ensemble import ensemble
+from jaxmuscle.model._muscle import Muscle
+from jaxmuscle.model._noise import BandLimitedNoise
+from jaxmuscle.model._parameters import CHANNELS
+from jaxmuscle.model._signals import Harmonic, Sampled
+from jaxmuscle.model._tasks import AbstractTask, Isometric, PrescribedForce, PrescribedMotion
+from jaxmuscle.response._expected import expected_moments
+from jaxmuscle.spectra._measures import peaks
+from jaxmuscle.spectra._settings import WINDOW, SpectrumSettings
+from jaxmuscle.spectra._welch import Spectrum
+
+LOW, HIGH = 0.391, 4.251  # Hz, the paper's maxima
+LOW_BIN, HIGH_BIN = 1, 11
+LINE = 0.5  # a bin is called a sine if at least half of its power is one
+FAST, FAST_SHARE = 10.0, 0.1  # Hz, and the share of the variance above it that is seen as fast noise
+HELD = 0.001  # m; Task 2 about x_z = 0, as in Task 1, has a displacement that cannot be normalised
+PAPER_NOISE = [0.0016, 0.0016, 0.0001, 0.0001]
+SEEDS = 16
+
+FACTS = {
+    "low": "maximum of proportional force power in bin 1 (0.391 Hz)",
+    "high": "one local maximum of at least 1 % of it, in bin 11 (4.297 Hz)",
+    "sine": "the slow part of the force is a sine, of the lower frequency",
+    "fast": "fast noise in the force",
+    "displacement": "displacement at constant force oscillates",
+    "task": "the force is that of the paper's Task 1",
+}
+
+
+def fast_share(samples: Float[np.ndarray, " times"], rate: float) -> float:
+    """Share of a signal's variance above 10 Hz, up to half the sampling rate (nothing is filtered)."""
+    power = np.abs(np.fft.rfft(samples - samples.mean())) ** 2
+    return float(power[np.fft.rfftfreq(samples.size, 1 / rate) > FAST].sum() / power.sum())
+
+
+class Reading(eqx.Module):
+    """One explanation of the two maxima, built as a task and judged.
+
+    **Fields:** `key`; `words`, what it says; `task`; `force`, one seed's output in the window [N]; `spectrum`, the mean
+    one of the force; `displacement`, the expected spectrum in Task 2; `sine_share`, of bin 1's power; `fast_share`, of the
+    force's variance above 10 Hz; `facts`, the keys of `FACTS` with whether they hold.
+    """
+
+    key: str
+    words: str
+    task: AbstractTask
+    force: Float[np.ndarray, " times"]
+    spectrum: Spectrum
+    displacement: Spectrum
+    sine_share: float
+    fast_share: float
+    facts: dict[str, bool]
+
+    @property
+    def missing(self) -> tuple[str, ...]:
+        """The facts that it does not give, in words."""
+        return tuple(FACTS[key] for key, holds in self.facts.items() if not holds)
+
+
+def pulled(task: AbstractTask) -> AbstractTask:
+    """The same muscle in Task 2, constant forces from 5 s on.
+
+    For Task 1 the P_w(t) that it needs, without noise and harmonic, to hold the insertion at 1 mm against its load: so
+    nothing else than noise and harmonic moves x_z in the window. For another task its own P_w without load.
+    """
+    if not isinstance(task, PrescribedMotion):
+        return task.as_task(PrescribedForce, P_w=float(task["P_w"]))
+    silent = {f"noise_{channel}": 0.0 for channel in CHANNELS} | {"harmonic_amplitude": 0.0}
+    needed = ensemble(task.replace(x_z=HELD, **silent), jax.random.key(0), seeds=1, control=False)
+    force = Sampled.through(needed.time, np.asarray(needed.output)[0])
+    return task.as_task(PrescribedForce, P_w=force, F_ext=task.F_ext)
+
+
+def resonant() -> AbstractTask:
+    """Isometric, the paper's noise, a harmonic at 0.391 Hz, and masses and springs that resonate near 4.25 Hz."""
+    muscle = Muscle(m_w=0.5, m_z=0.5)
+    harmonic = Harmonic(amplitude=0.002, frequency=LOW)
+    task = Isometric(P_w=3.5, muscle=muscle, harmonic=harmonic, noise=BandLimitedNoise(PAPER_NOISE))
+    return task.replace(k_w=2.1e5, k_z=2.1e5, c_w=1.2, c_z=0.5)
+
+
+def readings(preset: AbstractTask) -> tuple[Reading, ...]:
+    """A, B (as it is and in Task 1), C (leakage of the mean, slow transient) about the preset of Figures 2 to 5."""
+    pwelch = SpectrumSettings.pwelch()
+    return (
+        _stationary("A", "a harmonic at 4.25 Hz on slow relaxation", preset),
+        _stationary("B", "a harmonic at 0.391 Hz, a resonance near 4.25 Hz (isometric: two states)", resonant()),
+        _stationary("B1", "the same in Task 1, whose one state cannot resonate", preset.replace(harmonic_frequency=LOW)),
+        _simulated(
+            "C1", "no slow part; the mean leaks into bin 1 (pwelch: Hamming, no detrend)", preset.replace(c_z=5.0), pwelch
+        ),
+        _simulated("C2", "a transient slower than the window, mean removed", preset.replace(c_z=1000.0), preset.settings),
+    )
+
+
+def _stationary(key: str, words: str, task: AbstractTask) -> Reading:
+    """By the expected spectrum; the time series from one seed."""
+    moments, _ = expected_moments(as_arrays(task), task.settings, WINDOW)
+    runs = ensemble(task, jax.random.key(0), seeds=SEEDS, control=False)
+    return _judged(key, words, task, np.asarray(runs.between())[0], _spectrum(task, moments.power), _sine(moments))
+
+
+def _simulated(key: str, words: str, task: AbstractTask, settings: SpectrumSettings) -> Reading:
+    """By the mean spectrum of 16 seeds: neither a mean that leaks nor a transient has an expected spectrum."""
+    runs = ensemble(task, jax.random.key(0), seeds=SEEDS, control=False)
+    moments, _ = expected_moments(as_arrays(task), settings, WINDOW)
+    mean = runs.spectrum(settings).mean()
+    spectrum = Spectrum(settings.frequency, np.asarray(mean.power), settings, mean.unit)
+    sine = float(moments.line[0] / spectrum.power[0])
+    return _judged(key, words, task, np.asarray(runs.between())[0], spectrum, sine)
+
+
+def _judged(
+    key: str, words: str, task: AbstractTask, force: Float[np.ndarray, " times"], spectrum: Spectrum, sine: float
+) -> Reading:
+    second = pulled(task)
+    moments, _ = expected_moments(as_arrays(second), second.settings, WINDOW)
+    displacement = _spectrum(second, moments.power)
+    found, moved, fast = peaks(spectrum), peaks(displacement), fast_share(force, task.settings.rate)
+    facts = {
+        "low": found.maximum.bin == LOW_BIN,
+        "high": [peak.bin for peak in found.local_maxima] == [HIGH_BIN],
+        "sine": sine >= LINE,
+        "fast": fast >= FAST_SHARE,
+        "displacement": bool(moved.local_maxima) or _sine(moments) >= LINE,
+        "task": isinstance(task, PrescribedMotion),
+    }
+    return Reading(key, words, task, force, spectrum, displacement, sine, fast, facts)
+
+
+def _sine(moments) -> float:
+    return float(moments.line[0] / moments.power[0])
+
+
+def _spectrum(task: AbstractTask, power) -> Spectrum:
+    return Spectrum(task.settings.frequency, np.asarray(power), task.settings, task.output_unit)
+
+
+def conclusion(found: tuple[Reading, ...]) -> str:
+    """Which reading reproduces all that is stated, in a few sentences."""
+    complete = [r.key for r in found if not r.missing]
+    by = {r.key: r for r in found}
+    if complete:
+        first = f"Reading {' and '.join(complete)} gives all that is stated."
+    else:
+        first = "No reading gives all that is stated."
+    lacking = {key: "; ".join(by[key].missing) for key in ("A", "B")}
+    return (
+        f"{first} A lacks: {lacking['A'] or 'nothing'}. B lacks: {lacking['B'] or 'nothing'}. In Task 1 there is no "
+        "resonance at all: with x_z prescribed x_w obeys one equation of first order, so white noise gives P_w the density "
+        "(a + bω² + cω⁴)/(ω² + p²), which has a minimum at most, never a local maximum; there the local maximum can only be "
+        "the harmonic. C puts all power into bin 1 and leaves no local maximum of 1 %, and its force holds no sine. So A is "
+        "the reading of the figures of Task 1, with the 4.25 Hz sine as the slow one beside noise that reaches 50 Hz; if "
+        "the text of Figure 2 means the lower frequency, only B has that sine, and then the force is not that of Task 1."
+    )

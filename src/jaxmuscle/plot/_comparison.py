@@ -1,0 +1,101 @@
+"""The figure of a comparison of noises: how the best of each fits, and whether they can be told apart."""
+
+import textwrap
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure, SubFigure
+
+from ._spectra import target
+from ._style import BLACK, GREY, PALETTE, canvas, styled
+
+WIDTH, HEIGHT, LINE = 9.0, 3.0, 0.17  # inches
+SIZES = (1.7, 0.9, 1.0)
+WRAP = 150  # characters on a line of WIDTH
+MARK: dict[str, Any] = {"ms": 5.5, "zorder": 3}
+DASHES: tuple[Any, ...] = ("-", (0, (5, 1.5)), (0, (2, 1)), (0, (5, 1, 1, 1)))
+
+
+@styled
+def figure(comparison: Any, ax: Axes | None = None) -> Figure | SubFigure:
+    """The target with the best fit of each noise; AIC and held-out score of every model; the verdict below."""
+    lines = _lines(comparison)
+    low = LINE * (len(lines) + 0.5)
+    fig = canvas(ax, (WIDTH, HEIGHT + low + 0.3))
+    parts: Any = fig.subfigures(2, 1, height_ratios=[HEIGHT, low])
+    above, below = parts
+    spectra, criterion, scores = above.subplots(1, 3, width_ratios=SIZES)
+    names = dict.fromkeys(row.noise for row in comparison.rows)
+    colours = {name: PALETTE[i % len(PALETTE)] for i, name in enumerate(names)}
+    rows = sorted(comparison.rows, key=lambda row: row.aic)
+    _spectra(spectra, comparison, colours)
+    _criterion(criterion, rows, colours)
+    _scores(scores, rows, colours)
+    for i, line in enumerate(lines):
+        below.text(0.012, 1 - (i + 0.5) * LINE / low, line, va="center", parse_math=False, size=7.5)
+    return fig
+
+
+def _spectra(ax: Axes, comparison: Any, colours: dict[str, str]) -> None:
+    target(comparison.target, ax, log=True)
+    dots = ax.lines[0]
+    dots.set_label("target")
+    dots.set_linewidth(0.0)
+    frequency, power = comparison.target.frequency, comparison.target.proportional_power
+    for number, noise in enumerate(comparison.noises):
+        best = comparison.of(noise)
+        style = {"color": colours[noise], "ls": DASHES[number % len(DASHES)], "lw": 1.3, "zorder": 5 - 0.1 * number}
+        ax.plot(frequency, comparison.fitted[noise, best.harmonic], label=best.label, **style)
+    ax.set(title="Best fit of each noise", ylim=(0.5 * power.min(), 2 * power.max()))
+    ax.legend(loc="lower left", fontsize=7)
+
+
+def _criterion(ax: Axes, rows: list[Any], colours: dict[str, str]) -> None:
+    """AIC above the lowest; filled with a harmonic, open without."""
+    ax.axvspan(0, rows[0].needed, color="0.92", lw=0, zorder=0)
+    for i, row in enumerate(rows):
+        ax.plot(row.delta_aic, i, "o", color=colours[row.noise], mfc=_face(row, colours), **MARK)
+    if len({row.harmonic for row in rows}) > 1:
+        for name, face in (("with harmonic", GREY), ("without", "white")):
+            ax.plot([], [], "o", color=GREY, mfc=face, label=name, **MARK)
+        ax.legend(
+            loc="lower right", bbox_to_anchor=(1.02, 1.0), ncols=2, borderaxespad=0.0, columnspacing=0.8, handletextpad=0.1
+        )
+    _rows(ax, [row.noise for row in rows])
+    ax.set(xlim=(-0.06 * _span(rows), _span(rows)), xlabel="AIC above the lowest\n(grey: not told apart)")
+
+
+def _span(rows: list[Any]) -> float:
+    return max(1.6 * rows[0].needed, 1.1 * max((row.delta_aic for row in rows if np.isfinite(row.delta_aic)), default=0.0))
+
+
+def _scores(ax: Axes, rows: list[Any], colours: dict[str, str]) -> None:
+    """Held-out score minus that of the model of lowest AIC."""
+    _rows(ax, [""] * len(rows))
+    if rows[0].scores is None:
+        ax.set(xticks=[])
+        ax.text(0.5, 0.5, "nothing held out:\nno segments", transform=ax.transAxes, ha="center", va="center", color=GREY)
+        return
+    ax.axvline(0, color=BLACK, lw=0.6, zorder=1)
+    for i, row in enumerate(rows):
+        error = row.score_stderr or None
+        ax.errorbar(row.score_difference, i, xerr=error, fmt="o", capsize=2, lw=1, color=colours[row.noise],
+                    mfc=_face(row, colours), **MARK)  # fmt: skip
+    ax.set_xlabel("Held-out score minus\nthat of the first (± SE)")
+
+
+def _rows(ax: Axes, labels: list[str]) -> None:
+    ax.set_yticks(range(len(labels)), labels)
+    ax.set_ylim(len(labels) - 0.5, -0.5)
+    ax.grid(axis="y", color="0.9", lw=0.5)
+
+
+def _face(row: Any, colours: dict[str, str]) -> str:
+    return colours[row.noise] if row.harmonic else "white"
+
+
+def _lines(comparison: Any) -> list[str]:
+    said = [*comparison.verdict, *(f"left out: {noise}: {why}" for noise, why in comparison.left_out.items())]
+    wrap = textwrap.TextWrapper(WRAP, initial_indent="•  ", subsequent_indent="    ")
+    return [line for sentence in said for line in wrap.wrap(sentence)]

@@ -1,0 +1,259 @@
+"""The figure of a fit, for `jaxmuscle.plot.fit`: is the fit good, and what does it say?"""
+
+import math
+import re
+import textwrap
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure, SubFigure
+
+from ._spectra import target
+from ._style import BLACK, BLUE, GREY, ORANGE, VERMILLION, canvas, legend, output_label, styled
+
+WIDTH, LINE, FONT = 7.5, 0.165, 7.5  # inches, inches, points
+TABLE = (0.55, 0.565, 0.83)  # where values end, errors begin, units begin
+WRAP = 116  # characters of FONT on a line of WIDTH
+
+ALLOWED = 3.84  # 95 % quantile of χ² with one degree of freedom
+DARK_GREEN = "#00664A"  # the palette's green is too light for small letters
+_ORIGIN = {"measured": "Measured", "digitised": "Digitised", "user": "User's"}
+_Line = tuple[str, dict[str, Any]]
+
+
+@styled
+def figure(result: Any, ax: Axes | None = None) -> Figure | SubFigure:
+    """Header, spectra, residuals and output, tables, notes; each as high as what it has to hold."""
+    header, notes = _header(result), _notes(result)
+    free = {name: estimate for name, estimate in result.parameters.items() if estimate.free}
+    rows = 1 + max(len(free), len(result.derived), 1)
+    profile = result.profile is not None
+    heights = [
+        LINE * (len(header) + 0.7),
+        2.35,
+        1.75,
+        *[1.35] * profile,
+        LINE * (rows + 1),
+        *[LINE * len(notes)] * bool(notes),
+    ]
+    fig = canvas(ax, (WIDTH, sum(heights) + 1.25), w_pad=0.08, h_pad=0.05)
+    grid = fig.add_gridspec(len(heights), 2, height_ratios=heights)
+    _lines(fig.add_subplot(grid[0, :]), header)
+    _spectra(fig.add_subplot(grid[1, 0]), result, log=False)
+    _spectra(fig.add_subplot(grid[1, 1]), result, log=True)
+    _residuals(fig.add_subplot(grid[2, 0]), result)
+    _stretch(fig.add_subplot(grid[2, 1]), result)
+    _table(fig.add_subplot(grid[3 + profile, 0]), "Fitted parameters", free, rows)
+    _table(fig.add_subplot(grid[3 + profile, 1]), "Derived quantities", result.derived, rows)
+    if notes:
+        _lines(fig.add_subplot(grid[4 + profile, :]), notes)
+    if profile:
+        _profile(fig.add_subplot(grid[3, :]), result)
+    return fig
+
+
+def _header(result: Any) -> list[_Line]:
+    aim = result.target
+    facts = [f"{type(result.task).__name__} ({type(result.task.noise).__name__})", result.method]
+    if result.chi2_per_bin is not None:
+        facts.append(f"χ² per bin {result.chi2_per_bin:.2f}")
+    elif result.rms_log_error is not None:
+        facts.append("no χ² (spread unknown)")
+    if result.rms_log_error is not None:
+        facts.append(f"rms log error {result.rms_log_error:.2f}")
+    facts.append(f"{len(result.starts)} starts" + ("" if result.seed is None else f", seed {result.seed}"))
+    verdict, colour = ("Converged", DARK_GREEN) if result.success else ("Did not converge", VERMILLION)
+    lines = [(aim.name if len(aim.name) <= 60 else f"{aim.name[:59]}…", {"size": 11, "weight": "bold"})]
+    if aim.provenance == "reconstructed":
+        told = f"RECONSTRUCTED, not measured: {aim.reason}"
+        lines += _wrapped(told, color=VERMILLION, weight="bold")
+    else:
+        lines += _wrapped(f"{_ORIGIN[aim.provenance]} {aim.quantity}: {aim.source}", most=2, color=GREY)
+    lines += _wrapped("  ·  ".join(facts))
+    lines += _wrapped(f"{verdict}: {result.message}", color=colour)
+    for notice in result.notices:
+        if not (aim.provenance == "reconstructed" and aim.reason in notice):
+            lines += _wrapped(f"Note: {notice}", most=3)
+    return lines
+
+
+def _notes(result: Any) -> list[_Line]:
+    """What was checked, and what the data do not determine, one bullet for each direction."""
+    lines: list[_Line] = []
+    for sentence in result.remarks:
+        lines += _wrapped(sentence[0].upper() + sentence[1:])
+    if not result.undetermined:
+        return lines
+    lines += [("What the data do not determine", {"weight": "bold"})]
+    for sentence in result.undetermined:
+        lines += _wrapped(sentence, first="•  ", rest="    ")
+    return lines
+
+
+def _wrapped(text: str, most: int = 4, first: str = "", rest: str = "", **style: Any) -> list[_Line]:
+    # Bold letters are wider.
+    width = int(WRAP * (0.88 if style.get("weight") == "bold" else 1.0))
+    wrap = textwrap.TextWrapper(width, initial_indent=first, subsequent_indent=rest, max_lines=most, placeholder=" …")
+    return [(line, style) for line in wrap.wrap(text)]
+
+
+def _lines(ax: Axes, lines: list[_Line]) -> None:
+    """Text from the top of the axes down; the first line has half a line more room."""
+    _text_only(ax, len(lines) + 0.7)
+    for i, (text, style) in enumerate(lines):
+        _text(ax, 0.0, i + 0.5 + 0.3 * (i > 0), text, **({"size": FONT} | style))
+
+
+def _text_only(ax: Axes, rows: float) -> None:
+    ax.axis("off")
+    ax.set(xlim=(0, 1), ylim=(rows, 0))
+
+
+def _text(ax: Axes, x: float, y: float, text: str, **style: Any) -> None:
+    """Text that neither takes part in the layout nor is read as mathematics (a name may hold a dollar)."""
+    ax.text(x, y, text, va="center", parse_math=False, **style).set_in_layout(False)
+
+
+def _spectra(ax: Axes, result: Any, *, log: bool) -> None:
+    frequency, fitted = np.asarray(result.frequency_hz), np.asarray(result.fitted)
+    target(result.target, ax, log=log)
+    dots = ax.lines[0]
+    dots.set_label("target, reconstructed" if result.target.provenance == "reconstructed" else "target")
+    if np.isfinite(fitted).any():
+        dots.set_linewidth(0.0)
+        ax.plot(frequency, fitted, color=BLUE, label="fit", zorder=4)
+        _harmonic(ax, result, frequency, fitted)
+    ax.set_title("Logarithmic" if log else "Linear")
+    if log:
+        ax.set_xlim(frequency[frequency > 0][0] / 1.15, frequency[-1] * 1.15)
+        _log_limits(ax, result, fitted)
+        ax.legend().remove()  # the other panel's says it
+    else:
+        ax.set(xlim=(0, frequency[-1] + frequency[0]), ylim=(0, None))
+        legend(ax, "upper right")
+
+
+def _log_limits(ax: Axes, result: Any, fitted: Any) -> None:
+    band = result.target.sampling_band()
+    seen = np.concatenate([result.target.proportional_power, fitted, *(band or ())])
+    seen = seen[np.isfinite(seen) & (seen > 0)]
+    ax.set_ylim(seen.min() / 1.4, seen.max() * 1.4)
+
+
+def _harmonic(ax: Axes, result: Any, frequency: Any, fitted: Any) -> None:
+    """The harmonic's part of the fitted power, and its frequency."""
+    share = np.asarray(result.harmonic_share)
+    total, where = float(np.sum(fitted * share)), float(result.task["harmonic_frequency"])
+    if not (math.isfinite(total) and total > 0):
+        return
+    percent = "<0.1" if total < 1e-3 else f"{100 * total:.2g}"
+    held = fitted * share > 0
+    ax.fill_between(frequency, fitted * (1 - share), fitted, where=held | np.roll(held, 1) | np.roll(held, -1),
+                    color=ORANGE, alpha=0.7, lw=0, zorder=2)  # fmt: skip
+    label = f"harmonic: {where:.2f} Hz, {percent} % of power"
+    inside = frequency[0] / 2 <= where <= frequency[-1] * 1.05
+    ax.plot([where] if inside else [], [0.03] if inside else [], color=ORANGE, marker="^", ms=5, lw=0, label=label,
+            transform=ax.get_xaxis_transform(), clip_on=False, zorder=5)  # fmt: skip
+    if inside:
+        ax.axvline(where, color=ORANGE, lw=0.8, ls=(0, (4, 2)), zorder=0)
+
+
+def _residuals(ax: Axes, result: Any) -> None:
+    """Bars, with the range that one and two standard deviations cover if these are known."""
+    frequency, residual = np.asarray(result.frequency_hz), np.asarray(result.residual)
+    known = result.deviation is not None
+    outside = np.abs(residual) > 2 if known else np.zeros(residual.shape, bool)
+    width = 0.7 * np.min(np.diff(frequency), initial=math.inf)
+    bars = {"width": width if math.isfinite(width) else 0.1, "zorder": 3}
+    ax.bar(frequency, np.where(np.isfinite(residual), residual, 0.0), color=np.where(outside, VERMILLION, BLUE), **bars)
+    ax.set_title("Residual per bin: target above (+) or below (–) fit")
+    ax.set(xlabel="Frequency (Hz)", xlim=(0, frequency[-1] + frequency[0]))
+    reach = float(np.max(np.abs(residual), where=np.isfinite(residual), initial=3.0 if known else 0.1)) * 1.1
+    ax.set(ylim=(-reach, reach), ylabel="Residual (SD)" if known else "Residual (ln units)")
+    if known:
+        for deviations, shade in ((2, "0.94"), (1, "0.87")):
+            ax.axhspan(-deviations, deviations, color=shade, lw=0, zorder=0)
+    if not np.isfinite(residual).all():
+        _say(ax, "no finite fit")
+    ax.axhline(0, color=BLACK, lw=0.6, zorder=4)
+
+
+def _stretch(ax: Axes, result: Any) -> None:
+    task = result.task
+    time, output = map(np.asarray, result.stretch or ((), ()))
+    ax.set(xlabel="Time (s)", ylabel=output_label(task.output_name, task.output_unit))
+    ax.set_title("Simulated output, one noise path")
+    if result.settings.get("check_seeds") == 0:
+        _say(ax, "not simulated: fitted together with others", color=GREY)
+        return
+    if output.size < 2 or not np.isfinite(output).all():
+        _say(ax, "no finite simulation")
+        return
+    ax.plot(time, output, color=BLUE, lw=0.9)
+    ax.set_xlim(time[0], 2 * time[-1] - time[-2])
+
+
+def _profile(ax: Axes, result: Any) -> None:
+    """Which other frequencies of the harmonic the spectrum allows."""
+    frequency, rise = map(np.asarray, result.profile)
+    ax.axhspan(0, ALLOWED, color="0.9", lw=0, zorder=0)
+    ax.plot(frequency, rise, color=BLUE, marker=".", ms=3)
+    ax.axvline(float(result.task["harmonic_frequency"]), color=ORANGE, lw=0.8, ls=(0, (4, 2)), zorder=0)
+    title = "Profile: rise of χ² with the harmonic held at a frequency (grey: 95 % interval)"
+    if result.harmonic_p_value is not None:
+        title += f"; harmonic p = {result.harmonic_p_value:.2g}"
+    ax.set_title(title)
+    top = float(np.max(rise, where=np.isfinite(rise), initial=2 * ALLOWED))
+    ax.set(xlabel="Frequency (Hz)", ylabel="Δχ²", xlim=(0, frequency[-1] + frequency[0]), ylim=(0, 1.05 * top))
+
+
+def _say(ax: Axes, message: str, color: str = VERMILLION) -> None:
+    """A panel that has nothing to show."""
+    ax.set(xticks=[], yticks=[])
+    style: dict[str, Any] = {"ha": "center", "va": "bottom", "color": color, "weight": "bold"}
+    ax.text(0.5, 0.52, message, transform=ax.transAxes, **style)
+
+
+def _table(ax: Axes, title: str, estimates: Mapping[str, Any], rows: int) -> None:
+    """Name, value ± standard error, unit; powers of ten stand with the unit."""
+    _text_only(ax, rows + 1.0)
+    _text(ax, 0.0, 0.5, title, weight="bold", size=8)
+    _row(ax, 0.5, ("value", "± standard error", "unit"), color=GREY, size=FONT - 1)
+    ax.axhline(1.0, color=BLACK, lw=0.6)
+    if not estimates:
+        _text(ax, 0.0, 1.6, "none", color=GREY, size=FONT)
+    for i, (name, estimate) in enumerate(estimates.items()):
+        style = {"size": FONT - 0.5, "color": BLACK if estimate.identifiable else GREY}
+        _text(ax, 0.0, 1.6 + i, name if len(name) <= 24 else f"{name[:12]}…{name[-8:]}", **style)
+        _row(ax, 1.6 + i, quantity(estimate), **style)
+
+
+def _row(ax: Axes, y: float, cells: tuple[str, str, str], **style: Any) -> None:
+    for x, text, side in zip(TABLE, cells, ("right", "left", "left"), strict=True):
+        _text(ax, x, y, text, ha=side, **style)
+
+
+def quantity(estimate: Any) -> tuple[str, str, str]:
+    """Value, standard error and unit of an estimate in print: the error to two digits, the value to as many places."""
+    value, stderr = float(estimate.value), estimate.stderr
+    if not math.isfinite(value):
+        return "not finite", "", _unit(estimate.unit)
+    stderr = float(stderr) if stderr is not None and 0 < stderr < math.inf else 0.0
+    largest = max(abs(value), stderr)
+    power = math.floor(math.log10(largest)) if largest > 0 else 0
+    power = 0 if -2 <= power <= 3 else power
+    value, stderr = value / 10.0**power, stderr / 10.0**power
+    if estimate.identifiable and stderr > 0:
+        places = min(max(1 - math.floor(math.log10(stderr)), 0), 6)
+        return f"{value:.{places}f}", f"± {stderr:.{places}f}", _unit(estimate.unit, power)
+    error = "–" if estimate.identifiable else "not determined"
+    return f"{value:#.3g}".rstrip("."), error, _unit(estimate.unit, power)
+
+
+def _unit(unit: str, power: int = 0) -> str:
+    digits = str.maketrans("0123456789-", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻")
+    raised = re.sub(r"\^(-?\d+)", lambda match: match[1].translate(digits), unit)
+    ten = f"10{str(power).translate(digits)}" if power else ""
+    return " ".join(part for part in (ten, raised if raised != "1" or not ten else "") if part)

@@ -1,0 +1,136 @@
+"""Figures of a posterior: corner, predictive spectra, traces."""
+
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+
+from jaxmuscle._common.errors import NotMixedError
+
+from ._style import BLUE, ORANGE, PALETTE, PROPORTIONAL, SKY, VERMILLION, axes_or_new, canvas, styled
+
+ORDER = ("corner_frequency", "harmonic_frequency", "harmonic_share", "high_frequency_floor", "coefficient_of_variation")
+MOST, PANEL = 6, 1.25  # quantities, inches
+CUT = (0.002, 0.998)
+BANDS = ((0.025, 0.975, 0.18), (0.25, 0.75, 0.35))
+MASS = (0.95, 0.8, 0.5)
+
+
+def chosen(found: Any) -> list[str]:
+    """What a corner figure shows: the quantities that the data determine, and the harmonic's frequency."""
+    names = [n for n in ORDER if n in found.quantities and (n in found.determined or n == "harmonic_frequency")]
+    more = [n for n in found.quantities if n in found.determined and n not in names]
+    return (names + more)[:MOST]
+
+
+@styled
+def corner(found: Any, ax: Axes | None = None) -> Any:
+    """Densities of the determined quantities and of each pair (50, 80 and 95 % regions)."""
+    if not found.success:
+        raise NotMixedError(f"{found.target.name}: {found.message}")
+    names = chosen(found)
+    if not names:
+        raise ValueError(f"{found.target.name}: the data determine no quantity, so there is nothing to draw")
+    count = len(names)
+    draws = [found.quantities[name].ravel() for name in names]
+    limits = [np.quantile(x, CUT) for x in draws]
+    size = max(PANEL * count + 0.6, 3.4)
+    fig = canvas(ax, (size, size))
+    axes = fig.subplots(count, count, squeeze=False)
+    for i in range(count):
+        for j in range(count):
+            panel = axes[i, j]
+            if j > i:
+                panel.remove()
+                continue
+            panel.set_xlim(*limits[j])
+            panel.locator_params(nbins=3)
+            panel.tick_params(labelbottom=i == count - 1, labelleft=j == 0 and i > 0)
+            if i == j:
+                _density(panel, draws[i])
+            else:
+                _pair(panel, draws[j], draws[i], limits[j], limits[i])
+            if i == count - 1:
+                panel.set_xlabel(_label(found, names[j]))
+                panel.tick_params(axis="x", rotation=30)
+            if j == 0 and i > 0:
+                panel.set_ylabel(_label(found, names[i]))
+    fig.align_labels()
+    kind = f"{type(found.task).__name__}, {type(found.task.noise).__name__}"
+    fig.suptitle(f"Posterior: {found.target.name} ({kind})", x=0.01, ha="left", fontsize=9, fontweight="bold")
+    return fig
+
+
+def _label(found: Any, name: str) -> str:
+    words = name.replace("_", " ")
+    words = words if len(words) < 15 else words.replace(" ", "\n", 1)
+    return words + ("" if found.unit(name) == "1" else f" ({found.unit(name)})")
+
+
+def _density(ax: Axes, x: np.ndarray) -> None:
+    ax.hist(x, bins=60, range=ax.get_xlim(), density=True, histtype="stepfilled", color=SKY, alpha=0.6, lw=0)
+    low, middle, high = np.quantile(x, (0.025, 0.5, 0.975))
+    ax.axvline(float(middle), color=BLUE, lw=1.0)
+    ax.axvspan(float(low), float(high), color=BLUE, alpha=0.08, lw=0)
+    ax.set_yticks([])
+    ax.spines["left"].set_visible(False)
+    ax.set_title(f"{middle:.3g}\n{low:.3g} to {high:.3g}", fontsize=6.5, fontweight="normal", loc="center", pad=3)
+
+
+def _pair(ax: Axes, x: np.ndarray, y: np.ndarray, wide: np.ndarray, high: np.ndarray) -> None:
+    from scipy.ndimage import gaussian_filter
+
+    counts, xs, ys = np.histogram2d(x, y, bins=40, range=[wide, high])
+    smooth = gaussian_filter(counts, 1.2)
+    order = np.sort(smooth.ravel())[::-1]
+    inside = np.cumsum(order) / order.sum()
+    levels = np.unique([order[np.searchsorted(inside, mass)] for mass in MASS])
+    mid = 0.5 * (xs[1:] + xs[:-1]), 0.5 * (ys[1:] + ys[:-1])
+    ax.contourf(*mid, smooth.T, levels=[*levels, smooth.max() * 1.01], colors=["#cfe6f5", SKY, BLUE][-len(levels) :])
+    ax.set_ylim(*high)
+    ax.locator_params(nbins=3)
+
+
+@styled
+def predictive(found: Any, ax: Axes | None = None) -> Axes:
+    """The target among spectra that the posterior predicts: 50 and 95 % of them, and of the model itself."""
+    if not found.success:
+        raise NotMixedError(f"{found.target.name}: {found.message}")
+    ax = axes_or_new(ax)
+    f = np.asarray(found.target.frequency)
+    power = found.replicates.power.reshape(-1, len(f))
+    expected = found.replicates.expected.reshape(-1, len(f))
+    for low, high, alpha in BANDS:
+        label = f"predicted, {100 * (high - low):.0f} %"
+        ax.fill_between(f, *np.quantile(power, (low, high), axis=0), color=SKY, alpha=alpha + 0.1, lw=0, label=label)
+    ax.plot(f, np.median(expected, axis=0), color=BLUE, lw=1.2, label="model, median")
+    ax.plot(f, np.asarray(found.target.proportional_power), color=VERMILLION, marker="o", ms=3, lw=0, label="target")
+    ax.set_yscale("log")
+    ax.set(xlabel="Frequency (Hz)", ylabel=PROPORTIONAL, xlim=(0, f[-1] + f[0]))
+    ax.set_title(f"{found.target.name}: posterior-predictive χ², p = {found.replicates.p_value:.2g}")
+    ax.legend(frameon=False, ncols=2)
+    return ax
+
+
+@styled
+def traces(found: Any, ax: Axes | None = None) -> Any:
+    """Every chain's draws of what the data determine; also of chains that did not mix."""
+    names = chosen(found) or list(found.samples)[:MOST]
+    fig = canvas(ax, (6.5, 1.1 * len(names) + 0.5))
+    axes = fig.subplots(len(names), 1, sharex=True, squeeze=False)
+    for panel, name in zip(axes[:, 0], names, strict=True):
+        for number, chain in enumerate(found.quantities[name]):
+            panel.plot(chain, lw=0.3, color=PALETTE[number % len(PALETTE)])
+        r_hat, bulk, _ = found.diagnostics[name]
+        panel.set_title(
+            f"{name.replace('_', ' ')}: R-hat {r_hat:.3f}, effective sample size {bulk:.0f}", fontweight="normal"
+        )
+        panel.set_ylabel("(ratio)" if found.unit(name) == "1" else f"({found.unit(name)})")
+        for draw in np.unique(np.nonzero(found.chains.diverging)[1]):
+            panel.axvline(draw, color=ORANGE, lw=0.5, zorder=0)
+    axes[-1, 0].set_xlabel("Draw")
+    if not found.success:
+        fig.suptitle(f"NOT MIXED: {found.message}", x=0.01, ha="left", fontsize=7.5, color=VERMILLION, wrap=True)
+    else:
+        fig.suptitle(f"{found.target.name}: chains", x=0.01, ha="left", fontsize=9, fontweight="bold")
+    return fig

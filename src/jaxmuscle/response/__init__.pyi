@@ -1,0 +1,12 @@
+"""Public names of this wing."""
+
+from ._characteristics import StaticCharacteristics as StaticCharacteristics
+from ._characteristics import static_characteristics as static_characteristics
+from ._equilibrium import equilibrium as equilibrium
+from ._expected import expected_spectrum as expected_spectrum
+from ._linearised import settled as settled
+from ._scaling import at_level as at_level
+from ._scaling import relative_variation as relative_variation
+from ._scaling import scaled as scaled
+from ._sensitivity import Sensitivity as Sensitivity
+from ._sensitivity import sensitivity as sensitivity

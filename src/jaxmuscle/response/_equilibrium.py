@@ -1,0 +1,88 @@
+"""The operating point of a task: equilibrium under its held inputs, and its eigenvalues."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+from jaxtyping import Array, Float
+
+from jaxmuscle._common.arrays import as_arrays
+from jaxmuscle._common.errors import OperatingPointError
+from jaxmuscle.model._signals import AbstractSignal
+from jaxmuscle.model._tasks import AbstractTask
+
+HOLD = 15.0
+GUESS = 1e-3
+
+
+def equilibrium(task: AbstractTask, time: float = HOLD) -> Float[Array, " states"]:
+    """State y of `task` with `vector_field(time, y, 0) = 0` [m, m/s], by Newton's method; differentiable (implicitly).
+
+    Not finite where there is none: `operating_point` turns that into an error.
+    """
+    task = as_arrays(task)
+    dtype = jnp.result_type(float)
+    tolerance = 1e-12 if dtype == jnp.float64 else 1e-6
+
+    def field(y):
+        return task.vector_field(jnp.asarray(time, dtype), y, jnp.zeros(4))
+
+    def newton(function, y):
+        method = optx.Newton(rtol=tolerance, atol=tolerance)
+        solution = optx.root_find(lambda y, _: function(y), method, y, max_steps=200, throw=False)
+        return jnp.where(solution.result == optx.RESULTS.successful, solution.value, jnp.nan)
+
+    # optimistix's own implicit derivative checks its linear solve by a host callback, which JAX's compilation cache
+    # cannot keep: the same derivative without it.
+    # Off the origin, where the literal equation (2) has no stiffness and Newton's method no direction.
+    start = task.initial_state() + GUESS
+    held = getattr(task, "x_z", None)
+    if task.initial is None and held is not None:
+        start = start.at[0].add(held(jnp.asarray(time, dtype)) if isinstance(held, AbstractSignal) else held)
+    # In units of the state, so that one tolerance suits accelerations and displacements in either precision.
+    slope = jnp.sum(jnp.abs(jax.lax.stop_gradient(jax.jacfwd(field)(start))), axis=1)
+    scale = jnp.where((slope > 0) & jnp.isfinite(slope), slope, 1.0)
+
+    def at_rest(y):
+        return field(y) / scale
+
+    return jax.lax.custom_root(at_rest, start, newton, lambda g, y: jnp.linalg.solve(jax.jacfwd(g)(y), y))
+
+
+def jacobian(task: AbstractTask, y: Float[Array, " states"], time: float = HOLD) -> Float[Array, "states states"]:
+    """Jacobian [1/s] of the vector field with respect to the state at y."""
+    task = as_arrays(task)
+    return jax.jacfwd(lambda y: task.vector_field(jnp.asarray(time, y.dtype), y, jnp.zeros(4)))(y)
+
+
+def slowest_rate(task: AbstractTask, time: float = HOLD) -> Float[Array, ""]:
+    """Smallest |eigenvalue| [1/s] at the operating point; differentiable."""
+    eigenvalues = jnp.linalg.eigvals(jacobian(task, equilibrium(task, time), time))
+    return jnp.min(jnp.abs(eigenvalues))
+
+
+def operating_point(task: AbstractTask, time: float = HOLD) -> tuple[np.ndarray, np.ndarray]:
+    """Equilibrium and its eigenvalues as numbers. Raises `OperatingPointError` if there is no equilibrium."""
+    with jax.enable_x64(True):
+        points, jacobians = _linearisations(as_arrays(task), (time,))
+        if not np.all(np.isfinite(points[-1])):
+            raise OperatingPointError(
+                f"{type(task).__name__} has no equilibrium at t = {time} s under its inputs "
+                f"(K_w0, K_z0, C_w0, C_z0 = {np.asarray(as_arrays(task).muscle.base())}): a stiffness must balance them"
+            )
+        return np.asarray(points[-1]), np.linalg.eigvals(np.asarray(jacobians[-1]))
+
+
+def fastest_rate(task: AbstractTask, duration: float) -> float:
+    """Largest |eigenvalue| [1/s] at the start and under the inputs at mid-run and end, for the stability of a step."""
+    with jax.enable_x64(True):
+        _, jacobians = _linearisations(as_arrays(task), (duration / 2, duration))
+        return float(max(np.abs(np.linalg.eigvals(j)).max() for j in np.asarray(jacobians) if np.all(np.isfinite(j))))
+
+
+@eqx.filter_jit
+def _linearisations(task, times):
+    """Initial state and equilibria at the given times, with the Jacobians there."""
+    points = jnp.stack([task.initial_state(), *(equilibrium(task, t) for t in times)])
+    return points, jnp.stack([jacobian(task, y, t) for y, t in zip(points, (times[-1], *times), strict=True)])

@@ -1,0 +1,169 @@
+"""The harmonic's line in a Welch spectrum, and how a segment is transformed."""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Complex, Float, Int
+
+from jaxmuscle.model._muscle import Perturbation
+from jaxmuscle.model._signals import Constant
+from jaxmuscle.model._tasks import AbstractTask
+from jaxmuscle.spectra._bin_law import bin_rows
+from jaxmuscle.spectra._settings import SpectrumSettings
+from jaxmuscle.spectra._welch import lowpass, spectrum_of
+
+from ._linearised import Linearisation
+
+
+def _turn(angle: Float[Array, "*any"]) -> Complex[Array, "*any"]:
+    """exp(i angle)."""
+    return jax.lax.complex(jnp.cos(angle), jnp.sin(angle))
+
+
+def _times_i(x: Float[Array, "*any"]) -> Complex[Array, "*any"]:
+    return jax.lax.complex(jnp.zeros_like(x), x)
+
+
+def _transfer(system: Linearisation, base: Perturbation, omega: Float[Array, ""]) -> Complex[Array, ""]:
+    """Response of the output to the harmonic on all its channels, `C (s - A)⁻¹ B + D + s E` times base, s = iω."""
+    s = _times_i(omega)
+    A, B, C = (x.astype(s.dtype) for x in (system.A, system.B @ base, system.C))
+    inside = jnp.linalg.solve(s * jnp.eye(len(A), dtype=s.dtype) - A, B)
+    return C @ inside + jax.lax.complex(system.D @ base, omega * (system.E @ base))
+
+
+def _low_pass(settings: SpectrumSettings, turn: Complex[Array, ""]) -> Complex[Array, ""]:
+    """Frequency response of the digital low-pass at z = `turn`."""
+    if settings.sections is None:
+        return jnp.ones_like(turn)
+    back = jnp.stack([jnp.ones_like(turn), 1 / turn, 1 / turn**2])
+    sections = jnp.asarray(settings.sections, turn.dtype)
+    gain = jnp.prod((sections[:, :3] @ back) / (sections[:, 3:] @ back))
+    return gain * jnp.conj(gain) if settings.filter_direction == "both" else gain
+
+
+def _sample_mean(angle: Float[Array, ""], sampling: str) -> Complex[Array, ""]:
+    """What averaging over the sampling interval before each sample does to a line that turns by `angle` in it."""
+    return (1 - _turn(-angle)) / _times_i(angle) if sampling == "average" else jnp.ones_like(_turn(angle))
+
+
+class LineTable(NamedTuple):
+    """What a line `Im(r e^(iωt))` of one frequency gives.
+
+    Welch power `|r|² level - Re(r² turning)` in every bin, phase and leakage included; variance of a recording
+    `½ |r|² passed - ½ Re(r² twice) - Im(r once)²`; both after the low-pass.
+    """
+
+    level: Float[Array, "*frequencies bins"]
+    turning: Complex[Array, "*frequencies bins"]
+    passed: Float[Array, "*frequencies"]
+    once: Complex[Array, "*frequencies"]
+    twice: Complex[Array, "*frequencies"]
+
+    def power(self, reply: Complex[Array, "*frequencies"]) -> Float[Array, "*frequencies bins"]:
+        """Welch power of every bin."""
+        r = reply[..., None]
+        return jnp.maximum(jnp.abs(r) ** 2 * self.level - jnp.real(r**2 * self.turning), 0.0)
+
+    def variance(self, reply: Complex[Array, "*frequencies"]) -> Float[Array, "*frequencies"]:
+        """Variance of the recording."""
+        return 0.5 * (jnp.abs(reply) ** 2 * self.passed - jnp.real(reply**2 * self.twice)) - jnp.imag(reply * self.once) ** 2
+
+
+def _turns(turns: Float[Array, ""], start: int, samples: Int[Array | np.ndarray, ""] | int) -> Complex[Array, ""]:
+    """Mean of `exp(2πi turns m)` over so many successive m from `start` on."""
+    n = jnp.asarray(samples, turns.dtype)
+    size = jnp.sinc(n * turns) / jnp.sinc(turns)
+    spin = _turn(2 * jnp.pi * turns * (start + 0.5 * (n - 1)))
+    return spin * size.astype(spin.dtype)
+
+
+def line_table(
+    settings: SpectrumSettings,
+    window: tuple[float, float],
+    frequency: Float[Array, ""],
+    samples: Int[Array | np.ndarray, ""] | int,
+) -> LineTable:
+    """The table for one frequency [Hz]: the line is sampled, low-passed, cut into segments, tapered and transformed.
+
+    Segments are those of the window; its variance is that of so many samples from the window's begin on.
+    """
+    angle = 2 * jnp.pi * frequency / settings.rate
+    turn, gain = _turn(angle), _sample_mean(angle, settings.sampling)
+    start, stop = (round(edge * settings.rate) for edge in window)
+    begins = start + settings.step * np.arange(settings.segments(stop - start))
+    rows = jnp.asarray(bin_rows(settings), turn.dtype)
+    spin = _turn(angle * np.arange(settings.length, dtype=angle.dtype))
+    ahead, behind = rows @ spin, rows @ jnp.conj(spin)
+    through = gain * _low_pass(settings, turn)
+    level = 0.25 * jnp.abs(through) ** 2 * (jnp.abs(ahead) ** 2 + jnp.abs(behind) ** 2)
+    turning = 0.5 * through**2 * jnp.mean(_turn(2 * angle * begins.astype(angle.dtype))) * ahead * jnp.conj(behind)
+    once, twice = (through**k * _turns(k * frequency / settings.rate, start, samples) for k in (1, 2))
+    return LineTable(level, turning, jnp.abs(through) ** 2, once, twice)
+
+
+def harmonic_line(
+    task: AbstractTask,
+    system: Linearisation,
+    settings: SpectrumSettings,
+    window: tuple[float, float],
+    samples: Int[Array | np.ndarray, ""] | int,
+) -> tuple[Float[Array, " bins"], Float[Array, ""]]:
+    """Welch power of the harmonic's response, phase and leakage included, and its variance in a recording.
+
+    With an envelope that changes, its variance in the window.
+    """
+    harmonic = task.harmonic
+    if not isinstance(harmonic.envelope, Constant):
+        return _enveloped_line(task, system, settings, window)
+    frequency = jnp.asarray(harmonic.frequency, system.A.dtype)
+    table = line_table(settings, window, frequency, samples)
+    reply = harmonic_size(task, system.A.dtype) * _transfer(system, task.harmonic_base(), 2 * jnp.pi * frequency)
+    return table.power(reply), table.variance(reply)
+
+
+def harmonic_size(task: AbstractTask, dtype: Any) -> Complex[Array, ""]:
+    """Amplitude, steady envelope and phase of the harmonic as one complex number."""
+    harmonic = task.harmonic
+    assert isinstance(harmonic.envelope, Constant)
+    size = jnp.asarray(harmonic.amplitude, dtype) * jnp.asarray(harmonic.envelope.level, dtype)
+    turn = _turn(jnp.asarray(harmonic.phase, dtype))
+    return size.astype(turn.dtype) * turn
+
+
+def _enveloped_line(
+    task: AbstractTask, system: Linearisation, settings: SpectrumSettings, window: tuple[float, float]
+) -> tuple[Float[Array, " bins"], Float[Array, ""]]:
+    """The same for an envelope that changes: the deterministic response, slow in the frame that turns with the harmonic.
+
+    `Y' = (A - iω) Y + B b a(t)` for y = Im(Y e^{i(ωt + φ)}) is stepped exactly for an envelope a linear between samples,
+    from the steady state of its value at t = 0.
+    """
+    harmonic, base, dtype = task.harmonic, task.harmonic_base(), system.A.dtype
+    omega, interval = 2 * jnp.pi * jnp.asarray(harmonic.frequency, dtype), 1 / settings.rate
+    start, stop = (round(edge * settings.rate) for edge in window)
+    time = jnp.arange(stop, dtype=dtype) * interval
+    level, slope = jax.vmap(lambda t: jax.jvp(harmonic.envelope, (t,), (jnp.ones_like(t),)))(time)
+    whirl = _times_i(omega)
+    n, drive = len(system.A), (system.B @ base).astype(whirl.dtype)
+    turning = system.A.astype(whirl.dtype) - whirl * jnp.eye(n, dtype=whirl.dtype)
+    blocks = jnp.zeros((n + 2, n + 2), whirl.dtype)
+    blocks = blocks.at[:n, :n].set(turning * interval).at[:n, n].set(drive * interval).at[n, n + 1].set(1.0)
+    whole = jax.scipy.linalg.expm(blocks)
+    step, held, ramp = whole[:n, :n], whole[:n, n], whole[:n, n + 1]
+
+    def advance(Y, pair):
+        Y = step @ Y + held * pair[0] + ramp * (pair[1] - pair[0])
+        return Y, Y
+
+    pairs = jnp.stack([level[:-1], level[1:]], axis=1).astype(whirl.dtype)
+    first = -jnp.linalg.solve(turning, drive * pairs[0, 0])
+    _, later = jax.lax.scan(advance, first, pairs)
+    Y = jnp.concatenate([first[None], later])
+    around = _turn(omega * time + jnp.asarray(harmonic.phase, dtype)) * _sample_mean(omega * interval, settings.sampling)
+    through, ahead = system.D @ base, system.E @ base
+    direct = jax.lax.complex(through * level + ahead * slope, ahead * omega * level)
+    z = jnp.asarray(harmonic.amplitude, dtype) * jnp.imag((Y @ system.C.astype(Y.dtype) + direct) * around)
+    return jnp.asarray(spectrum_of(z, settings, window).power), jnp.var(lowpass(z, settings)[start:stop])

@@ -1,0 +1,126 @@
+"""A task linearised about its equilibrium."""
+
+import dataclasses
+from typing import Any, ClassVar, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxmuscle._common.arrays import as_arrays, is_concrete
+from jaxmuscle._common.errors import OperatingPointError
+from jaxmuscle._common.types import Scalar
+from jaxmuscle.model._muscle import Perturbation
+from jaxmuscle.model._signals import AbstractSignal, Constant
+from jaxmuscle.model._tasks import AbstractTask, State
+
+from ._equilibrium import HOLD, equilibrium
+
+
+class Linearisation(NamedTuple):
+    """`y' = A (y - point) + B u`, `z = rest + C (y - point) + D u + E u'`: a task about its equilibrium."""
+
+    point: Float[Array, " states"]
+    rest: Float[Array, ""]
+    A: Float[Array, "states states"]
+    B: Float[Array, "states 4"]
+    C: Float[Array, " states"]
+    D: Float[Array, "4"]
+    E: Float[Array, "4"]
+
+
+def linearise(task: AbstractTask, time: float = HOLD) -> Linearisation:
+    """Jacobians of the task's own vector field and output at its equilibrium under the inputs at `time` [s]."""
+    point = equilibrium(task, time)
+    n, t, still = point.shape[0], jnp.asarray(time, point.dtype), jnp.zeros(4, point.dtype)
+
+    def field(both):
+        return task.vector_field(t, both[:n], both[n:])
+
+    def output(all_three):
+        z = task.output(t, all_three[:n], all_three[n : n + 4], all_three[n + 4 :])
+        return z, z
+
+    AB = jax.jacfwd(field)(jnp.concatenate([point, still]))
+    CDE, rest = jax.jacfwd(output, has_aux=True)(jnp.concatenate([point, still, still]))
+    return Linearisation(point, rest, AB[:, :n], AB[:, n:], CDE[:n], CDE[n : n + 4], CDE[n + 4 :])
+
+
+class LinearTask(AbstractTask):
+    """A task replaced by its linearisation about the equilibrium, where it starts; same noise, harmonic and settings."""
+
+    system: Linearisation
+    state_names: ClassVar[tuple[str, ...]] = ()
+    state_units: ClassVar[tuple[str, ...]] = ()
+    output_name: ClassVar[str] = "z"
+    output_unit: ClassVar[str] = ""
+    smoothness_needed: ClassVar[tuple[int, int, int, int]] = (0, 0, 0, 0)
+
+    @classmethod
+    def of(cls, task: AbstractTask, system: Linearisation | None = None) -> "LinearTask":
+        """The linearisation of a task, if it is known already as `system`."""
+        parts = {"muscle": task.muscle, "noise": task.noise, "harmonic": task.harmonic, "settings": task.settings}
+        return cls(linearise(task) if system is None else system, **parts)
+
+    def initial_state(self) -> State:
+        return self.system.point
+
+    def vector_field(self, t: Scalar, y: State, u: Perturbation) -> State:
+        return self.system.A @ (y - self.system.point) + self.system.B @ u
+
+    def output(self, t: Scalar, y: State, u: Perturbation, du: Perturbation) -> Scalar:
+        s = self.system
+        return s.rest + s.C @ (y - s.point) + s.D @ u + s.E @ du
+
+
+def settled(task: AbstractTask, time: float = HOLD) -> AbstractTask:
+    """The task with its inputs held at their values at `time` [s] from the start, and starting from equilibrium.
+
+    Its simulation has no rise and no transient of the mean: what the linear response describes.
+    """
+    traced = not all(is_concrete(leaf) for leaf in jax.tree.leaves(task))
+    point = equilibrium(task, time) if traced else np.asarray(linearised(as_arrays(task), time).system.point).tolist()
+    held = {field.name: Constant(getattr(task, field.name)(jnp.asarray(time))) for field in dataclasses.fields(task)
+            if isinstance(getattr(task, field.name), AbstractSignal)}  # fmt: skip
+    return task.with_parts(**held, initial=tuple(point))
+
+
+@eqx.filter_jit
+def linearised(task: AbstractTask, time: float = HOLD) -> LinearTask:
+    """`LinearTask.of`, compiled."""
+    return LinearTask.of(task, linearise(task, time))
+
+
+def check_equilibrium(task: Any, point: np.ndarray, A: np.ndarray) -> float:
+    """The slowest decay rate [1/s]; refuses what has no linear response: no equilibrium, an unstable or undamped one."""
+    name = type(task).__name__
+    if not (np.all(np.isfinite(point)) and np.all(np.isfinite(A))):
+        raise OperatingPointError(
+            f"{name} has no equilibrium at t = {HOLD} s under its inputs (K_w0, K_z0, C_w0, C_z0 = "
+            f"{np.asarray(as_arrays(task).muscle.base())}): a stiffness must balance them"
+        )
+    eigenvalues = np.linalg.eigvals(A)
+    margin = 1e3 * np.finfo(A.dtype).eps * np.abs(eigenvalues).max()
+    if eigenvalues.real.max() > -margin:
+        kind = "unstable" if eigenvalues.real.max() > margin else "undamped"
+        listed = ", ".join(f"{v:.4g}" for v in eigenvalues)
+        raise OperatingPointError(
+            f"the equilibrium of this {name} is {kind}: eigenvalues {listed} 1/s at {point}; a linear response needs "
+            f"damping at rest (c_w, c_z, v_ref_w, v_ref_z > 0) and stiffness (k_w, x_ref_w > 0)"
+        )
+    return float(-eigenvalues.real.max())
+
+
+def has_response(task: AbstractTask, *, required: bool) -> bool:
+    """Whether a task has a stable, damped equilibrium; with `required`, why not is an error."""
+    with jax.enable_x64(True):
+        system = linearised(as_arrays(task)).system
+        try:
+            check_equilibrium(task, np.asarray(system.point), np.asarray(system.A))
+        except OperatingPointError:
+            if required:
+                raise
+            return False
+    return True

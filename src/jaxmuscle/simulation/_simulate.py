@@ -1,0 +1,161 @@
+"""Simulation of a task: the grid, the sub-steps that keep it stable, one seed."""
+
+import math
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Int, PRNGKeyArray
+
+from jaxmuscle._common.arrays import all_concrete, as_arrays, as_numbers
+from jaxmuscle._common.errors import OperatingPointError, SimulationError
+from jaxmuscle._common.text import listed
+from jaxmuscle.model._tasks import AbstractTask
+from jaxmuscle.response._equilibrium import fastest_rate
+from jaxmuscle.response._linearised import LinearTask, check_equilibrium, linearised
+from jaxmuscle.spectra._settings import WINDOW
+
+from ._batch import Recipe, run_seeds
+from ._integrator import Grid
+from ._trajectory import Trajectory, one
+
+MAX_RATE_STEP = 0.5
+MAX_SUBSTEPS = 256
+DURATION = 15.0
+DT = 1e-3
+TRANSIENT = 1e-3
+
+
+def simulate(
+    task: AbstractTask,
+    key: PRNGKeyArray,
+    *,
+    seed: int | Int[Array, ""] = 0,
+    duration: float = DURATION,
+    dt: float = DT,
+    rate: float | None = None,
+    substeps: int | None = None,
+    sampling: str | None = None,
+) -> Trajectory:
+    """Simulate one seed: the Stratonovich equation `dy = f(t, y, S) dt + (∂f/∂u) σ ∘ dW`, or with coloured noise in u.
+
+    Heun's method at fixed steps in diffrax. Differentiable in both modes with respect to the task's parameters.
+
+    **Arguments:** `task`; `key`, a `jax.random` key, from which seed i takes `fold_in(key, i)`; `seed`; `duration` [s];
+    `dt` [s], the grid on which noise is drawn, which must divide the sampling interval; `rate` [Hz] of the samples
+    returned, the task's spectrum settings by default; `substeps` per dt (by default as many as stability asks for,
+    a power of two, so that max |eigenvalue| dt / substeps <= 0.5); `sampling`, "instant" or "average" over the sampling
+    interval (the task's settings by default).
+
+    **Returns:** a `Trajectory`. **Raises:** `ValueError` for a grid that does not fit, `SimulationError` if the result is
+    not finite (not under a JAX transformation, where it is returned as it is).
+    """
+    seeds = jnp.atleast_1d(jnp.asarray(seed))
+    result = one(trajectories(task, None, key, seeds, planned(task, duration, dt, rate, substeps, sampling)))
+    require_finite(result)
+    return result
+
+
+def companion(task: AbstractTask, duration: float, *, required: bool) -> LinearTask | None:
+    """The linearised task, if its response is stationary in the analysed window; else None, or an error if required."""
+    with jax.enable_x64(True):
+        linear = linearised(as_arrays(task))
+        try:
+            slowest = check_equilibrium(task, np.asarray(linear.system.point), np.asarray(linear.system.A))
+        except OperatingPointError:
+            if required:
+                raise
+            return None
+        moved = np.abs(np.asarray(as_arrays(task).initial_state()) - np.asarray(linear.system.point))
+    # A task that starts settled has nothing to forget.
+    left = math.exp(-slowest * WINDOW[0]) if np.max(moved) > 1e-9 else 0.0
+    if duration < WINDOW[1] or left > TRANSIENT:
+        if required:
+            raise ValueError(
+                f"control = True: duration = {duration} s must reach {WINDOW[1]} s, and by {WINDOW[0]} s the slowest motion "
+                f"must have decayed to {TRANSIENT:g} of its start, but {left:.2g} is left: simulate settled(task)"
+            )
+        return None
+    return linear
+
+
+class Plan(NamedTuple):
+    """On which grid a task is simulated and how it is sampled, at which rate [Hz]."""
+
+    grid: Grid
+    sampling: str
+    rate: float
+
+
+def planned(
+    task: AbstractTask,
+    duration: float,
+    dt: float,
+    rate: float | None,
+    substeps: int | None,
+    sampling: str | None,
+) -> Plan:
+    """The plan of a simulation. Raises `ValueError` for a grid that does not fit."""
+    rate = task.settings.rate if rate is None else rate
+    sampling = task.settings.sampling if sampling is None else sampling
+    if sampling not in ("instant", "average"):
+        raise ValueError(f"sampling = {sampling!r} must be 'instant' or 'average'")
+    if not (dt > 0 and rate > 0 and duration > 0):
+        raise ValueError(f"dt = {dt} s, rate = {rate} Hz and duration = {duration} s must be positive")
+    every = whole(1 / (rate * dt), f"dt = {dt} s does not divide the sampling interval {1 / rate} s: use one of "
+                  f"{', '.join(f'{1 / rate / n:.6g}' for n in (1, 2, 4, 5, 10, 20))} s")  # fmt: skip
+    samples = whole(duration * rate, f"duration = {duration} s is not a whole number of sampling intervals {1 / rate} s")
+    if all_concrete(task):
+        task.noise.check_step(dt)
+    if substeps is None:
+        substeps = stable_substeps(task, dt, duration) if all_concrete(task) else 1
+    return Plan(Grid(dt, samples * every, every, substeps, reverse=not all_concrete(task)), sampling, rate)
+
+
+def whole(value: float, message: str) -> int:
+    """A number that must be whole (up to rounding) and positive, else a `ValueError` with the message."""
+    if round(value) < 1 or abs(value - round(value)) > 1e-6 * max(1.0, value):
+        raise ValueError(message)
+    return round(value)
+
+
+def stable_substeps(task: AbstractTask, dt: float, duration: float = DURATION) -> int:
+    """The power of two of sub-steps that brings max |eigenvalue| dt to at most 0.5; Heun diverges above 2."""
+    fastest = fastest_rate(as_numbers(task), duration)
+    needed = fastest * dt / MAX_RATE_STEP
+    substeps = 2 ** max(0, math.ceil(math.log2(max(needed, 1.0))))
+    if substeps > MAX_SUBSTEPS:
+        raise ValueError(
+            f"this task has an eigenvalue of {fastest:.3g}/s, which asks for {substeps} sub-steps of dt = {dt} s "
+            f"(at most {MAX_SUBSTEPS}): use heavier masses, less damping or a smaller dt"
+        )
+    return substeps
+
+
+def trajectories(
+    task: AbstractTask, linear: LinearTask | None, key: PRNGKeyArray, seeds: Any, plan: Plan, mesh: Any = None
+) -> Trajectory:
+    """Every seed of one task in one program, finite or not; arrays stay where they were computed."""
+    recipe = Recipe(plan.grid, plan.sampling, True, task.settings)
+    found = run_seeds(as_arrays(task), as_arrays(linear), key, seeds, recipe, mesh)
+    grid = plan.grid
+    return Trajectory(task, found["states"], found["output"], seeds, plan.rate, grid.dt, grid.substeps, plan.sampling,
+                      found["linear"])  # fmt: skip
+
+
+def require_finite(found: Trajectory, where: str = "") -> None:
+    """Raises `SimulationError` for seeds that did not stay finite, as far as the values are known."""
+    if not all_concrete(found.output):
+        return
+    bad = np.atleast_1d(found.seeds)[~np.atleast_1d(np.asarray(found.finite))]
+    if bad.size:
+        raise SimulationError(
+            f"{len(bad)} seed(s) did not stay finite ({listed(bad)}) in {type(found.task).__name__}{where} at dt = "
+            f"{found.dt} s, {found.substeps} sub-step(s): lower the noise amplitude or dt. Parameters: {told(found.task)}"
+        )
+
+
+def told(task: AbstractTask) -> str:
+    """Parameters with their values."""
+    return ", ".join(f"{name} = {float(value):.6g}" for name, value in as_numbers(task.parameters).items())

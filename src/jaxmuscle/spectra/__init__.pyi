@@ -1,0 +1,16 @@
+"""Public names of this wing."""
+
+from ._mean import SpectrumEstimate as SpectrumEstimate
+from ._measures import approximate_entropy as approximate_entropy
+from ._measures import coefficient_of_variation as coefficient_of_variation
+from ._measures import normalised as normalised
+from ._measures import peaks as peaks
+from ._measures import sample_entropy as sample_entropy
+from ._measures import signal_to_noise as signal_to_noise
+from ._measures import spearman as spearman
+from ._settings import SpectrumSettings as SpectrumSettings
+from ._welch import Spectrum as Spectrum
+from ._welch import lowpass as lowpass
+from ._welch import periodogram as periodogram
+from ._welch import spectrum_of as spectrum_of
+from ._welch import welch as welch

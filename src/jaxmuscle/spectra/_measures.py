@@ -1,0 +1,220 @@
+"""Numbers that describe a force record and its spectrum: variability, regularity, rank correlation, peaks."""
+
+from typing import Literal, get_args
+
+import equinox as eqx
+import jax.core
+import jax.numpy as jnp
+import numpy as np
+import scipy.stats
+from jaxtyping import Array, Float, Real
+from scipy.spatial import KDTree
+
+from ._settings import require
+from ._welch import Spectrum, floating
+
+Reference = Literal["mean", "maximum", "mvc"]
+
+
+def _standard_deviation(signal: Float[Array, "*batch times"]) -> Float[Array, "*batch"]:
+    variance = jnp.var(signal, axis=-1)
+    # The root has no derivative at zero; a constant signal gets zero instead of NaN.
+    positive = variance > 0
+    return jnp.where(positive, jnp.sqrt(jnp.where(positive, variance, 1.0)), 0.0)
+
+
+def coefficient_of_variation(signal: Real[Array | np.ndarray, "*batch times"]) -> Float[Array, "*batch"]:
+    """Coefficient of variation, CV = σ / |μ|, along the last axis; differentiable.
+
+    **Arguments:** `signal` in any unit, time along the last axis. σ divides by the number of samples.
+
+    **Returns:** a fraction without unit, not a percentage; 0 for a constant signal, infinite for a zero mean.
+
+    **Raises:** `ValueError` for a signal without samples.
+    """
+    signal = floating(signal)
+    return _standard_deviation(signal) / jnp.abs(jnp.mean(signal, axis=-1))
+
+
+def signal_to_noise(signal: Real[Array | np.ndarray, "*batch times"]) -> Float[Array, "*batch"]:
+    """Signal-to-noise ratio, SNR = μ / σ, along the last axis; differentiable.
+
+    **Arguments:** `signal` in any unit, time along the last axis. σ divides by the number of samples.
+
+    **Returns:** a ratio without unit and with the sign of the mean; infinite for a constant signal.
+
+    **Raises:** `ValueError` for a signal without samples.
+
+    **Source:** Slifkin & Newell 1999, J Exp Psychol HPP 25(3):837-851.
+    """
+    signal = floating(signal)
+    return jnp.mean(signal, axis=-1) / _standard_deviation(signal)
+
+
+def _record(signal: Real[Array | np.ndarray, "..."], m: int, tolerance: float) -> tuple[np.ndarray, float]:
+    """One checked record, and the radius within which its templates match."""
+    x = np.asarray(signal, dtype=float)
+    require(m >= 1, "m", m, "give the template length, at least 1")
+    require(0 < tolerance < np.inf, "tolerance", tolerance, "give a positive fraction of the deviation")
+    remedy = f"give one record of at least m + 2 = {m + 2} samples"
+    require(x.ndim == 1 and x.size >= m + 2, "signal shape", x.shape, remedy)
+    require(np.all(np.isfinite(x)), "signal", x, "remove or interpolate what is not finite")
+    require(np.ptp(x) > 0, "signal", x, "entropy needs a signal that is not constant")
+    return x, tolerance * float(np.std(x))
+
+
+def _templates(x: Float[np.ndarray, " times"], m: int) -> Float[np.ndarray, "templates m"]:
+    return np.lib.stride_tricks.sliding_window_view(x, m)
+
+
+def _matches(templates: Float[np.ndarray, "templates m"], radius: float) -> np.ndarray:
+    """For each template how many lie within `radius` of it in the maximum norm, itself included."""
+    # Counting without listing the neighbours: memory grows with the number of samples, not its square.
+    return KDTree(templates).query_ball_point(templates, radius, p=np.inf, return_length=True)
+
+
+def approximate_entropy(signal: Real[Array | np.ndarray, "..."], m: int = 2, tolerance: float = 0.2) -> float:
+    """Approximate entropy, ApEn = Φ_m - Φ_{m+1}, of one record: low is regular. Not traceable.
+
+    Φ_m is the mean of ln C_i over the N - m + 1 templates of m successive samples. C_i is the fraction of
+    templates, i itself included, whose samples all lie within r = `tolerance` σ of those of template i.
+
+    **Arguments:** `signal` (times,) in any unit; template length `m`; `tolerance` as a fraction of σ.
+
+    **Raises:** `ValueError` if the signal is constant, not finite, or has fewer than m + 2 samples.
+
+    **Source:** Pincus 1991, doi:10.1073/pnas.88.6.2297.
+    """
+    x, radius = _record(signal, m, tolerance)
+    counts = [_matches(_templates(x, length), radius) for length in (m, m + 1)]
+    phi, phi_longer = (float(np.mean(np.log(count / len(count)))) for count in counts)
+    return phi - phi_longer
+
+
+def sample_entropy(signal: Real[Array | np.ndarray, "..."], m: int = 2, tolerance: float = 0.2) -> float:
+    """Sample entropy, SampEn = ln(B / A), of one record: low is regular. Not traceable.
+
+    B and A count the pairs of different templates, of m and of m + 1 successive samples and both starting in
+    the first N - m samples, whose samples all lie within r = `tolerance` σ of each other.
+
+    **Arguments:** `signal` (times,) in any unit; template length `m`; `tolerance` as a fraction of σ.
+
+    **Returns:** the entropy; infinite if no longer templates match, NaN if no shorter ones do either.
+
+    **Raises:** `ValueError` if the signal is constant, not finite, or has fewer than m + 2 samples.
+
+    **Source:** Richman & Moorman 2000, doi:10.1152/ajpheart.2000.278.6.H2039.
+    """
+    x, radius = _record(signal, m, tolerance)
+    longer = _templates(x, m + 1)
+    b, a = (int(np.sum(_matches(t, radius) - 1)) for t in (longer[:, :m], longer))
+    if a == 0:
+        return float("nan") if b == 0 else float("inf")
+    return float(np.log(b / a))
+
+
+def spearman(a: Real[Array | np.ndarray, "..."], b: Real[Array | np.ndarray, "..."]) -> float:
+    """Spearman's rank correlation, for instance between the spectra of two people. Not traceable.
+
+    **Arguments:** `a`, `b` (bins,), paired values in any units.
+
+    **Returns:** a number from -1 to 1 (`scipy.stats.spearmanr`).
+
+    **Raises:** `ValueError` for unequal shapes, fewer than 3 values, and constant or non-finite values.
+    """
+    left, right = np.asarray(a, dtype=float), np.asarray(b, dtype=float)
+    paired = left.shape == right.shape and left.ndim == 1 and left.size >= 3
+    require(paired, "shapes of a, b", (left.shape, right.shape), "give two equally long rows of 3 or more")
+    for name, values in (("a", left), ("b", right)):
+        ranked = np.all(np.isfinite(values)) and np.ptp(values) > 0
+        require(ranked, name, values, "ranks need finite values that are not all equal")
+    return float(np.asarray(scipy.stats.spearmanr(left, right))[0])
+
+
+def normalised(
+    signal: Real[Array | np.ndarray, "*batch times"],
+    by: Reference = "mean",
+    *,
+    mvc: float | Real[Array | np.ndarray, ""] | None = None,
+) -> Float[Array, "*batch times"]:
+    """The signal over its mean, its largest absolute value, or the maximal voluntary contraction (MVC).
+
+    **Arguments:** `signal` [unit], force or displacement, time along the last axis; `by`, one of `"mean"`,
+    `"maximum"`, `"mvc"`; `mvc` [unit], for `by="mvc"` only.
+
+    **Returns:** the signal without unit, same shape and dtype; not finite where the reference is zero.
+
+    **Raises:** `ValueError` for an unknown `by`, and an `mvc` that is missing, not positive, or not needed.
+    """
+    signal = floating(signal)
+    require(by in get_args(Reference), "by", by, f"choose one of {', '.join(get_args(Reference))}")
+    remedy = f"by={by!r}; give mvc together with by='mvc', and only then"
+    require((mvc is not None) == (by == "mvc"), "mvc", mvc, remedy)
+    if by == "mean":
+        return signal / jnp.mean(signal, axis=-1, keepdims=True)
+    if by == "maximum":
+        return signal / jnp.max(jnp.abs(signal), axis=-1, keepdims=True)
+    positive = isinstance(mvc, jax.core.Tracer) or 0 < float(np.asarray(mvc)) < np.inf
+    require(positive, "mvc", mvc, "give the force at maximal voluntary contraction, above zero")
+    return signal / jnp.asarray(mvc, signal.dtype)
+
+
+class Peak(eqx.Module):
+    """One maximum of a spectrum.
+
+    `bin` number, `frequency` of that bin [Hz], `interpolated` frequency [Hz], proportional `power`, and
+    `prominence`, the height in proportional power above the higher of the two valleys beside it.
+    """
+
+    bin: int
+    frequency: float
+    interpolated: float
+    power: float
+    prominence: float
+
+
+class Peaks(eqx.Module):
+    """The `maximum` of a spectrum, wherever it lies, and the interior `local_maxima` by rising frequency.
+
+    A maximum inside the range is one of the local maxima as well.
+    """
+
+    maximum: Peak
+    local_maxima: tuple[Peak, ...]
+
+
+def peaks(spectrum: Spectrum, *, min_prominence: float = 0.01) -> Peaks:
+    """Global and local maxima of proportional power. Not traceable.
+
+    The interpolated frequency is the vertex of the parabola through the log power l of a bin and of its two
+    neighbours, f_k + Δf (l_{k-1} - l_{k+1}) / (2 (l_{k-1} - 2 l_k + l_{k+1})). A maximum in the first or last
+    bin is no local maximum, is not interpolated, and has one valley only.
+
+    **Arguments:** `spectrum` without leading axes; `min_prominence` of local maxima, relative to the
+    maximum (by default 1 %: smaller ones are mostly the scatter of the estimate).
+
+    **Raises:** `ValueError` for leading axes, fewer than 3 bins, and power that is not finite or all zero.
+    """
+    p = np.asarray(spectrum.proportional, dtype=float)
+    one = p.ndim == 1 and p.size >= 3
+    require(one, "spectrum.power shape", p.shape, "give one spectrum of 3 bins or more, as spectrum.mean()")
+    require(np.all(np.isfinite(p)), "spectrum.power", spectrum.power, "give finite power, not all zero")
+    require(0 <= min_prominence <= 1, "min_prominence", min_prominence, "give a fraction of the maximum")
+    indices, found = scipy.signal.find_peaks(p, prominence=min_prominence * p.max())
+    pairs = zip(indices, found["prominences"], strict=True)
+    top = int(np.argmax(p))
+    inside = 0 < top < p.size - 1
+    height = scipy.signal.peak_prominences(p, [top])[0][0] if inside else p[top] - p.min()
+    return Peaks(_peak(spectrum, p, top, height), tuple(_peak(spectrum, p, k, h) for k, h in pairs))
+
+
+def _peak(spectrum: Spectrum, p: Float[np.ndarray, " bins"], k: int | np.integer, prominence: float) -> Peak:
+    f = np.asarray(spectrum.frequency, dtype=float)
+    interpolated = f[k]
+    if 0 < k < p.size - 1 and np.all(p[k - 1 : k + 2] > 0):
+        left, middle, right = np.log(p[k - 1 : k + 2])
+        curvature = left - 2 * middle + right
+        if curvature < 0:
+            interpolated += (f[k + 1] - f[k - 1]) / 4 * (left - right) / curvature
+    number = round(f[k] / spectrum.settings.resolution)
+    return Peak(number, float(f[k]), float(interpolated), float(p[k]), float(prominence))

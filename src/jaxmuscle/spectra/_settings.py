@@ -1,0 +1,171 @@
+"""How a spectrum is estimated, and the window that is analysed."""
+
+import dataclasses
+import difflib
+import math
+import numbers
+from collections.abc import Callable, Mapping
+from typing import Any, Literal, get_args
+
+import equinox as eqx
+import numpy as np
+import scipy.signal
+from jaxtyping import Float
+
+Window = Literal["hann", "hamming", "boxcar"]
+Detrend = Literal["constant", "linear", "none"]
+FilterDirection = Literal["forward", "both"]
+Sampling = Literal["instant", "average"]
+_CHOICES = {"window": Window, "detrend": Detrend, "filter_direction": FilterDirection, "sampling": Sampling}
+
+
+def _python(value: Any) -> Any:
+    return value.item() if isinstance(value, np.number) else value
+
+
+def require(holds: bool | np.bool, name: str, value: object, remedy: str) -> None:
+    """Raises the `ValueError` of a wrong argument: its name, its value, and what would be right."""
+    if not holds:
+        raise ValueError(f"{name}={value!r}: {remedy}")
+
+
+class SpectrumSettings(eqx.Module):
+    """How a spectrum is estimated; every choice the papers leave open is a field.
+
+    The defaults are the procedure of Slifkin & Newell (1999, J Exp Psychol HPP 25(3):837-851).
+
+    | field | meaning |
+    |---|---|
+    | `rate` | sampling rate [Hz] |
+    | `length` | samples per segment and transform; the resolution is `rate / length` |
+    | `first_bin`, `last_bin` | bins kept, both included; bin k lies at `k * rate / length` |
+    | `window`, `overlap` | taper (periodic, as in `scipy.signal`) and the fraction neighbours share |
+    | `detrend` | what is removed from each segment: its mean, its straight line, or nothing |
+    | `filter_order`, `filter_cutoff` | Butterworth low-pass; cut-off [Hz], or `None` for no filter |
+    | `filter_direction` | `"forward"` (from rest), or `"both"` (zero phase, for recordings) |
+    | `sampling` | `"instant"`, or the `"average"` over a sampling interval (an integrating sensor) |
+
+    **Raises:** `ValueError` naming the field, its value and the remedy.
+    """
+
+    rate: float = eqx.field(static=True, default=100.0, converter=_python)
+    length: int = eqx.field(static=True, default=256, converter=_python)
+    first_bin: int = eqx.field(static=True, default=1, converter=_python)
+    last_bin: int = eqx.field(static=True, default=30, converter=_python)
+    window: Window = eqx.field(static=True, default="hann")
+    overlap: float = eqx.field(static=True, default=0.5, converter=_python)
+    detrend: Detrend = eqx.field(static=True, default="constant")
+    filter_order: int = eqx.field(static=True, default=9, converter=_python)
+    filter_cutoff: float | None = eqx.field(static=True, default=30.0, converter=_python)
+    filter_direction: FilterDirection = eqx.field(static=True, default="forward")
+    sampling: Sampling = eqx.field(static=True, default="instant")
+
+    def __check_init__(self):
+        def check(name: str, kind: type, valid: Callable[[Any], bool], remedy: str) -> None:
+            value = getattr(self, name)
+            require(isinstance(value, kind) and valid(value), name, value, remedy)
+
+        half = self.length // 2 if isinstance(self.length, int) else 0
+        check("rate", numbers.Real, lambda f: 0 < f < math.inf, "give a sampling rate above 0 Hz")
+        check("length", int, lambda n: n >= 8, "give a whole number of samples, at least 8")
+        check("last_bin", int, lambda k: 1 <= k <= half, f"give a bin from 1 to length // 2 = {half}")
+        below = f"give a bin from 0 (the mean) to last_bin = {self.last_bin}"
+        check("first_bin", int, lambda k: 0 <= k <= self.last_bin, below)
+        check("overlap", numbers.Real, lambda x: 0 <= x < 1, "give a fraction of a segment, 0 to below 1")
+        check("filter_order", int, lambda n: n >= 1, "give a whole number of at least 1")
+        if self.filter_cutoff is not None:
+            inside = f"give a frequency from 0 to rate / 2 = {self.rate / 2:g} Hz, or None for no filter"
+            check("filter_cutoff", numbers.Real, lambda f: 0 < f < self.rate / 2, inside)
+        for name, choice in _CHOICES.items():
+            known = get_args(choice)
+            check(name, str, known.__contains__, f"choose one of {', '.join(known)}")
+
+    @classmethod
+    def pwelch(cls) -> "SpectrumSettings":
+        """MATLAB's `pwelch` defaults: Hamming window and no detrend, so the mean leaks into bin 1.
+
+        Two details stay as they are here: `length` (MATLAB would cut the signal into eight segments) and the
+        periodic form of the window (MATLAB's is symmetric).
+        """
+        return cls(window="hamming", detrend="none")
+
+    @property
+    def resolution(self) -> float:
+        """Distance of neighbouring bins, `rate / length` [Hz]."""
+        return self.rate / self.length
+
+    @property
+    def frequency(self) -> Float[np.ndarray, " bins"]:
+        """Frequencies of the selected bins [Hz]."""
+        return np.arange(self.first_bin, self.last_bin + 1) * self.resolution
+
+    @property
+    def step(self) -> int:
+        """Samples from the start of one segment to the start of the next."""
+        # 0.29 * 100 is 28.999..., and means 29 samples.
+        return max(self.length - math.floor(self.overlap * self.length + 1e-9), 1)
+
+    @property
+    def taper(self) -> Float[np.ndarray, " length"]:
+        """The window's values, one per sample of a segment."""
+        return np.asarray(scipy.signal.get_window(self.window, self.length))
+
+    @property
+    def sections(self) -> Float[np.ndarray, "sections 6"] | None:
+        """The low-pass as second-order sections of `scipy.signal.butter`; `None` without filter."""
+        if self.filter_cutoff is None:
+            return None
+        order, cutoff = self.filter_order, self.filter_cutoff
+        return np.asarray(scipy.signal.butter(order, cutoff, fs=self.rate, output="sos"))
+
+    def segments(self, samples: int) -> int:
+        """Number of whole Welch segments in a window of that many samples, 0 if it is too short for one."""
+        return max((samples - self.length) // self.step + 1, 0)
+
+    def degrees_of_freedom(self, segments: int) -> float:
+        """Equivalent degrees of freedom ν of a bin averaged over K segments: power ~ S χ²_ν / ν.
+
+        ν = 2K / (1 + 2 Σ_j (1 - j/K) ρ_j²), where ρ_j = Σ_m w_m w_{m + j step} / Σ_m w_m² correlates segments
+        j apart, for a density that is flat across a bin; half-overlapping Hann segments have ρ_1 = 1/6 only.
+        Independent trials add their ν.
+
+        **Raises:** `ValueError` unless K >= 1. **Source:** Welch 1967, doi:10.1109/TAU.1967.1161901.
+        """
+        require(segments >= 1, "segments", segments, "give the number of averaged segments, at least 1")
+        w, step = self.taper, self.step
+        lags = range(1, min(segments - 1, (self.length - 1) // step) + 1)
+        rho = [np.sum(w[: -j * step] * w[j * step :]) / np.sum(w**2) for j in lags]
+        excess = sum((1 - j / segments) * float(r) ** 2 for j, r in zip(lags, rho, strict=True))
+        return 2 * segments / (1 + 2 * excess)
+
+    def to_dict(self) -> dict[str, Any]:
+        """The fields as TOML and JSON hold them; no cut-off is `"none"`, since TOML has no null."""
+        values = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+        return values | ({"filter_cutoff": "none"} if self.filter_cutoff is None else {})
+
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any]) -> "SpectrumSettings":
+        """Settings from a table as `to_dict` writes it; what it does not name keeps its default.
+
+        **Raises:** `ValueError` for an unknown name, with the nearest known one, and for an invalid value.
+        """
+        known = [field.name for field in dataclasses.fields(cls)]
+        for name, value in values.items():
+            near = difflib.get_close_matches(name, known, n=1, cutoff=0.0)[0]
+            remedy = f"no such spectrum setting, did you mean {near!r}? Known are {', '.join(known)}"
+            require(name in known, name, value, remedy)
+        unfiltered = {"filter_cutoff": None} if values.get("filter_cutoff") == "none" else {}
+        return cls(**{**values, **unfiltered})
+
+    def replace(self, **changes: Any) -> "SpectrumSettings":
+        """A copy with some fields changed; raises as `from_dict` does."""
+        return self.from_dict(self.to_dict() | changes)
+
+
+WINDOW = (5.0, 15.0)
+LONGEST = 2**17  # samples of a recording; longer ones count as that long
+
+
+def samples_in(window: tuple[float, float], settings: SpectrumSettings) -> int:
+    """How many samples a window has."""
+    return round(window[1] * settings.rate) - round(window[0] * settings.rate)

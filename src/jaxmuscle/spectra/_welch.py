@@ -1,0 +1,194 @@
+"""Force spectra as in the experiments: low-pass, Welch, bins, proportional power."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.signal
+from jaxtyping import Array, Float, Real
+
+from ._settings import SpectrumSettings, require
+
+
+class Spectrum(eqx.Module):
+    """A one-sided power spectral density on bins.
+
+    `frequency` [Hz] has one value per bin; `power` [`unit`²/Hz] may have leading axes (seeds, trials). The
+    functions here take those themselves; `jax.vmap` would give `frequency` one as well.
+    """
+
+    frequency: Float[Array | np.ndarray, " bins"]
+    power: Float[Array | np.ndarray, "*batch bins"]
+    settings: SpectrumSettings = eqx.field(static=True)
+    unit: str = eqx.field(static=True, default="N")
+
+    @property
+    def proportional(self) -> Float[Array, "*batch bins"]:
+        """Power of each bin over the sum of all bins: p_k = P_k / Σ_j P_j, without unit."""
+        power = jnp.asarray(self.power)
+        return power / jnp.sum(power, axis=-1, keepdims=True)
+
+    def mean(self) -> "Spectrum":
+        """The average over all leading axes: of absolute power, to be normalised afterwards."""
+        power = jnp.asarray(self.power)
+        power = jnp.mean(power, axis=tuple(range(power.ndim - 1)))
+        return Spectrum(self.frequency, power, self.settings, self.unit)
+
+    def plot(self, ax: Any = None, *, log: bool = False, proportional: bool = True, label: str | None = None) -> Any:
+        """Draws power over frequency and returns the axes, see `jaxmuscle.plot.spectrum`."""
+        from jaxmuscle import plot
+
+        return plot.spectrum(self, ax, log=log, proportional=proportional, label=label)
+
+
+def floating(signal: Real[Array | np.ndarray, "*batch times"]) -> Float[Array, "*batch times"]:
+    """The signal as an array of its own floating dtype; whole numbers get the default one."""
+    signal = jnp.asarray(signal)
+    samples = signal.ndim >= 1 and signal.shape[-1] >= 1 and not jnp.iscomplexobj(signal)
+    require(samples, "signal", jax.typeof(signal), "give real samples along the last axis, at least one")
+    return signal if jnp.issubdtype(signal.dtype, jnp.floating) else signal.astype(jnp.result_type(float))
+
+
+def _impulse_response(sections: Float[np.ndarray, "sections 6"], samples: int) -> Float[np.ndarray, " times"]:
+    return np.asarray(scipy.signal.sosfilt(sections, np.eye(1, samples)[0]))
+
+
+def _convolve(signal: Float[Array, "*batch times"], response: Float[np.ndarray, " times"]) -> Float[Array, "*batch times"]:
+    """y_n = Σ_m h_m x_{n - m}, for as many samples as both have."""
+    samples = signal.shape[-1]
+    size = scipy.fft.next_fast_len(2 * samples - 1, real=True)
+    transform = jnp.fft.rfft(signal, size)
+    transfer = jnp.asarray(np.fft.rfft(response, size), transform.dtype)
+    return jnp.fft.irfft(transform * transfer, size)[..., :samples]
+
+
+def lowpass(signal: Real[Array | np.ndarray, "*batch times"], settings: SpectrumSettings) -> Float[Array, "*batch times"]:
+    """Butterworth low-pass along the last axis, differentiable and without a loop over time.
+
+    y_n = Σ_m h_m x_{n - m}, h the impulse response. `"forward"` starts from rest as `scipy.signal.sosfilt`,
+    `"both"` is `scipy.signal.sosfiltfilt` (odd extension, steady start, zero phase). One non-finite sample
+    makes the whole output non-finite.
+
+    **Arguments:** `signal` in any unit, time along the last axis, sampled at `settings.rate`; `settings`.
+
+    **Returns:** the filtered signal, same shape, dtype and unit; the signal itself for `filter_cutoff=None`.
+
+    **Raises:** `ValueError` if the signal is too short for the extension that `"both"` needs.
+    """
+    signal, sections = floating(signal), settings.sections
+    if sections is None:
+        return signal
+    if settings.filter_direction == "both":
+        return _forward_and_backward(signal, sections)
+    response = _impulse_response(sections, signal.shape[-1])
+    # Exact for every offset, which so needs no derivative; keeps single precision for the fluctuations.
+    offset = jax.lax.stop_gradient(jnp.mean(signal, axis=-1, keepdims=True))
+    return _convolve(signal - offset, response) + offset * jnp.asarray(np.cumsum(response), signal.dtype)
+
+
+def _forward_and_backward(
+    x: Float[Array, "*batch times"], sections: Float[np.ndarray, "sections 6"]
+) -> Float[Array, "*batch times"]:
+    first_order = min(np.sum(sections[:, 2] == 0), np.sum(sections[:, 5] == 0))
+    edge = 3 * (2 * len(sections) + 1 - int(first_order))
+    remedy = f"filter_direction='both' needs more than {edge} samples; use a longer signal or 'forward'"
+    require(x.shape[-1] > edge, "signal length", x.shape[-1], remedy)
+    left = 2 * x[..., :1] - x[..., edge:0:-1]
+    right = 2 * x[..., -1:] - x[..., -2 : -edge - 2 : -1]
+    extended = jnp.concatenate((left, x, right), axis=-1)
+    response = _impulse_response(sections, extended.shape[-1])
+
+    # The gain at zero frequency is one: a steady start passes the first value and filters what is left.
+    def steady(x: Float[Array, "*batch longer"]) -> Float[Array, "*batch longer"]:
+        return x[..., :1] + _convolve(x - x[..., :1], response)
+
+    return steady(steady(extended)[..., ::-1])[..., ::-1][..., edge:-edge]
+
+
+def _density(segments: Float[Array, "*batch length"], settings: SpectrumSettings) -> Float[Array, "*batch frequencies"]:
+    """One-sided density of every segment: |Σ_m w_m x_m e^{-2πikm/n}|² / (rate Σ w²), doubled inside."""
+    samples, dtype = segments.shape[-1], segments.dtype
+    if settings.detrend != "none":
+        segments = segments - jnp.mean(segments, axis=-1, keepdims=True)
+    if settings.detrend == "linear":
+        line = np.arange(samples) - (samples - 1) / 2
+        line = jnp.asarray(line / np.linalg.norm(line), dtype)
+        segments = segments - jnp.sum(segments * line, axis=-1, keepdims=True) * line
+    taper = scipy.signal.get_window(settings.window, samples)
+    taper = jnp.asarray(taper / np.sqrt(settings.rate * np.sum(taper**2)), dtype)
+    transform = jnp.fft.rfft(segments * taper)
+    sides = np.full(transform.shape[-1], 2.0)
+    sides[[0, -1] if samples % 2 == 0 else [0]] = 1.0
+    return (transform.real**2 + transform.imag**2) * jnp.asarray(sides, dtype)
+
+
+def welch(signal: Real[Array | np.ndarray, "*batch times"], settings: SpectrumSettings) -> Float[Array, "*batch bins"]:
+    """Welch estimate of the one-sided power spectral density in the selected bins, as `scipy.signal.welch`.
+
+    P_k = 2 / (K rate Σ w²) Σ_s |Σ_m w_m x_{s,m} e^{-2πikm/n}|², x_s being segment s of K after detrending; no
+    factor 2 in bin 0 and at half the rate. Nothing is filtered here.
+
+    **Arguments:** `signal` [unit], time along the last axis, sampled at `settings.rate`; `settings`.
+
+    **Returns:** density [unit²/Hz] at `settings.frequency`, bins along the last axis, dtype of the signal.
+
+    **Raises:** `ValueError` if the signal is shorter than one segment. **Source:** Welch 1967,
+    doi:10.1109/TAU.1967.1161901.
+    """
+    signal = floating(signal)
+    samples, length = signal.shape[-1], settings.length
+    remedy = f"one segment needs {length}; give a longer signal or window, or a shorter length"
+    require(samples >= length, "signal length", samples, remedy)
+    starts = settings.step * np.arange(settings.segments(samples))
+    segments = signal[..., starts[:, None] + np.arange(length)]
+    density = jnp.mean(_density(segments, settings), axis=-2)
+    return density[..., settings.first_bin : settings.last_bin + 1]
+
+
+def periodogram(
+    signal: Real[Array | np.ndarray, "*batch times"], settings: SpectrumSettings
+) -> tuple[Float[np.ndarray, " frequencies"], Float[Array, "*batch frequencies"]]:
+    """The spectrum of the whole signal as one segment ("FFT"), at all frequencies from 0 to half the rate.
+
+    As `scipy.signal.periodogram` with the window and detrend of `settings`; resolution `rate / samples`.
+
+    **Arguments:** as for `welch`. **Returns:** frequency [Hz] and density [unit²/Hz].
+    """
+    signal = floating(signal)
+    return np.fft.rfftfreq(signal.shape[-1], 1 / settings.rate), _density(signal, settings)
+
+
+@eqx.filter_jit
+def filtered_power(signal: Any, settings: SpectrumSettings, edges: tuple[int, int] | None) -> Float[Array, "*batch bins"]:
+    filtered = lowpass(signal, settings)
+    return welch(filtered if edges is None else filtered[..., edges[0] : edges[1]], settings)
+
+
+def spectrum_of(
+    signal: Real[Array | np.ndarray, "*batch times"],
+    settings: SpectrumSettings,
+    window: tuple[float, float] | None = None,
+    *,
+    unit: str = "N",
+) -> Spectrum:
+    """The procedure of the experiments: low-pass the whole signal, cut the analysed window, then Welch.
+
+    **Arguments:** `signal` [unit], time along the last axis, sampled at `settings.rate`; `settings`; the
+    analysed `window` (start, stop) in s from the start of the signal, or all of it; `unit` of the signal.
+
+    **Returns:** a `Spectrum` with the leading axes of the signal.
+
+    **Raises:** `ValueError` if the window lies outside the signal or is shorter than one segment. **Source:**
+    Slifkin & Newell 1999, J Exp Psychol HPP 25(3):837-851.
+    """
+    edges = None
+    if window is not None:
+        samples = np.shape(signal)[-1]
+        start, stop = (round(time * settings.rate) for time in window)
+        remedy = f"give 0 <= start < stop <= {samples / settings.rate:g} s, the duration of the signal"
+        require(0 <= start < stop <= samples, "window", window, remedy)
+        edges = (start, stop)
+    power = filtered_power(signal, settings, edges)
+    return Spectrum(jnp.asarray(settings.frequency, power.dtype), power, settings, unit)

@@ -1,0 +1,240 @@
+"""Measurements that could be made in addition to a fit's, and what they would tell of its parameters."""
+
+import dataclasses
+from typing import Any
+
+import equinox as eqx
+import jax
+import numpy as np
+from jaxtyping import Float
+
+from jaxmuscle.data._target import Target
+from jaxmuscle.model._tasks import AbstractTask, Isometric, PrescribedForce
+from jaxmuscle.objective._consequences import Seen, seen_at
+from jaxmuscle.objective._coordinates import Coordinates
+from jaxmuscle.objective._likelihood import Likelihood
+from jaxmuscle.objective._problem import Setup, target_variation
+from jaxmuscle.response._linearised import has_response
+from jaxmuscle.spectra._settings import SpectrumSettings
+
+AMPLITUDES = ("noise_K_w", "noise_K_z", "noise_C_w", "noise_C_z", "harmonic_amplitude")
+MEAN_ERROR = 0.02
+LEVELS = (2.0, 0.5)
+INPUTS = ("P_w", "F_ext", "x_z")
+LONGER = 10
+MOST_VARIATION = 1e3
+VAGUE = 1e-6  # prior precision of what is separate
+
+
+class Design(eqx.Module):
+    """A measurement that could be added to a fit's data.
+
+    It measures the person that was fitted: parameters of one name are shared. One whose value differs in the design's task
+    differs by a factor that is taken as known (for one of either sign: by a difference).
+
+    **Arguments:**
+
+    - `name`: a noun phrase, "a second force level at 10 N": reports make sentences of it.
+    - `task`: what is measured, at the values expected; the fitted task itself by default.
+    - `segments`: Welch segments of its spectrum, of one trial or of several; as many as the target's by default; 0 for
+      no new recording, only the numbers that follow.
+    - `settings`: how its spectrum is estimated; as the target's by default.
+    - `coefficient_of_variation`: whether that of its output is measured.
+    - `mean`: relative standard error with which the mean output is measured, 0.02 say; None if it is not.
+    - `separate`: names of free parameters that have another value in this measurement, of which nothing is known before.
+
+    **Raises:** `ValueError` for a measurement of nothing, segments below 0, a `mean` that is not positive.
+    """
+
+    name: str = eqx.field(static=True)
+    task: AbstractTask | None = None
+    segments: int | tuple[int, ...] | None = eqx.field(static=True, default=None)
+    settings: SpectrumSettings | None = eqx.field(static=True, default=None, kw_only=True)
+    coefficient_of_variation: bool = eqx.field(static=True, default=False, kw_only=True)
+    mean: float | None = eqx.field(static=True, default=None, kw_only=True)
+    separate: tuple[str, ...] = eqx.field(static=True, default=(), kw_only=True)
+
+    def __check_init__(self):
+        if any(k < 0 for k in self.counts):
+            raise ValueError(f"{self.name}: segments = {self.segments} must not be negative; 0 for no new spectrum")
+        if self.mean is not None and not self.mean > 0:
+            raise ValueError(f"{self.name}: mean = {self.mean} must be a positive relative standard error, 0.02 say")
+        if not self.spectral and not self.coefficient_of_variation and self.mean is None:
+            raise ValueError(f"{self.name}: measures nothing: give segments, coefficient_of_variation=True or mean=0.02")
+
+    @property
+    def counts(self) -> tuple[int, ...]:
+        """Segments of every trial; none if they are the target's."""
+        return () if self.segments is None else tuple(int(k) for k in np.atleast_1d(self.segments))
+
+    @property
+    def spectral(self) -> bool:
+        """Whether it gives a spectrum."""
+        return self.segments is None or sum(self.counts) > 0
+
+    def told(self, setup: Setup) -> tuple[str, str]:
+        """Task and data in words."""
+        data = []
+        if self.spectral:
+            data.append(_spectrum_in_words(self.counts or segments_of(setup.target)))
+        data += ["coefficient of variation"] if self.coefficient_of_variation else []
+        data += [] if self.mean is None else [f"mean to {100 * self.mean:.2g} %"]
+        return _task_in_words(setup.task if self.task is None else self.task), ", ".join(data)
+
+
+def told_data(setup: Setup) -> tuple[str, str]:
+    """Task and data of a fit in words."""
+    target, (variation, mean) = setup.target, setup.extra
+    data = [
+        f"{len(target.bins)} bins with a stated sigma" if target.segments is None else _spectrum_in_words(target.segments)
+    ]
+    data += ["coefficient of variation"] * (variation is not None) + ["mean"] * (mean is not None)
+    return _task_in_words(setup.task), ", ".join(data)
+
+
+def _task_in_words(task: AbstractTask) -> str:
+    inputs = [f"{n} = {float(task[n]):.3g} {'m' if n == 'x_z' else 'N'}" for n in INPUTS
+              if n in task.parameter_names and float(task[n]) != 0]  # fmt: skip
+    return ", ".join([type(task).__name__, *inputs])
+
+
+def _spectrum_in_words(counts: tuple[int, ...]) -> str:
+    alike = f"{len(counts)} x {max(counts)}"
+    listed = " + ".join(map(str, counts))
+    return f"spectrum of {alike if len(counts) > 2 and min(counts) == max(counts) else listed} segments"
+
+
+def segments_of(target: Target) -> tuple[int, ...]:
+    """A target's segments; where it states only a sigma, as many as scatter like its median bin."""
+    if target.segments is not None:
+        return target.segments
+    if target.sigma is None:
+        raise ValueError(f"{target.name}: states neither segments nor sigma, so nothing says how much it scatters: give "
+                         "segments, the number of Welch segments that were averaged")  # fmt: skip
+    relative = float(np.median(target.sigma / target.proportional_power))
+    one = target.settings.degrees_of_freedom(1000) / 1000
+    return (max(1, round(2 / relative**2 / one)),)
+
+
+def designs_for(setup: Setup, mean: float) -> tuple[Design, ...]:
+    """What else could be measured of the person whose fit has this setup, its task being the fitted one.
+
+    `mean` is the expected output. At another force level the amplitudes of noise and harmonic have values of their own
+    (people's variation is not proportional to force), all else of the muscle is as before. The displacement is that under
+    the load which the sensor had held, so that the operating point stays, and the perturbations with it.
+    """
+    task, own = setup.task, setup.extra
+    varying = own[0] is not None
+    designs = []
+    if not varying and abs(mean) > 0:
+        designs.append(Design("the coefficient of variation", segments=0, coefficient_of_variation=True))
+    if own[1] is None and abs(mean) > 0:
+        what = "displacement" if task.output_unit == "m" else "force"
+        designs.append(Design(f"the mean {what}, known to {100 * MEAN_ERROR:g} %", segments=0, mean=MEAN_ERROR))
+    if isinstance(task, Isometric):
+        held = task.as_task(PrescribedForce, P_w=task.P_w, F_ext=mean)
+        designs.append(Design(f"the displacement under a load of {mean:.3g} N", held))
+    if isinstance(task, PrescribedForce):
+        fixed = task.as_task(Isometric, P_w=task.P_w)
+        designs.append(Design("the force with the insertion held", fixed, coefficient_of_variation=True))
+    forces = {n: float(task[n]) for n in ("P_w", "F_ext") if n in task.parameter_names and float(task[n]) != 0}
+    if forces:
+        first, level = next(iter(forces.items()))
+        for factor in LEVELS:
+            name = f"a second force level at {first} = {factor * level:.3g} N"
+            moved = task.replace(**{n: factor * v for n, v in forces.items()})
+            amplitudes = tuple(n for n in AMPLITUDES if n in setup.coordinates.names)
+            designs.append(Design(name, moved, coefficient_of_variation=varying, separate=amplitudes))
+    more = tuple((LONGER - 1) * k for k in segments_of(setup.target))
+    longer = Design(f"a recording {LONGER} times as long", segments=more, coefficient_of_variation=varying)
+    return (*designs, longer)
+
+
+def seen_here(setup: Setup, theta: Float[np.ndarray, " free"]) -> Seen:
+    """The model's moments at θ and their slopes; without further residuals, so that designs of a task share a program."""
+    problem = dataclasses.replace(setup, extra=(None, None)).linear()
+    return jax.tree.map(lambda x: np.asarray(x)[0], seen_at(problem, theta[None]))
+
+
+def without_offset(information: Float[np.ndarray, "all all"]) -> Float[np.ndarray, "free free"]:
+    """Fisher information of θ where the offset, the last coordinate, is unknown: its Schur complement."""
+    inner, cross, own = information[:-1, :-1], information[:-1, -1], information[-1, -1]
+    return inner - np.outer(cross, cross) / own if own > 0 else inner
+
+
+def information_of(setup: Setup, seen: Seen) -> Float[np.ndarray, "free free"]:
+    """Fisher information of θ in a setup's data, at the θ where its model was seen."""
+    return without_offset(np.asarray(Likelihood.of(setup).information(seen)))
+
+
+def design_information(setup: Setup, theta: Float[np.ndarray, " free"], design: Design) -> Float[np.ndarray, "free free"]:
+    """Fisher information about a fit's θ in a design; what is separate in it is eliminated, without a prior of its own.
+
+    Raises `ValueError` for a task without linear response, unknown names in `separate`, and a coefficient of variation or
+    mean of an output that is zero.
+    """
+    names, given = setup.coordinates.names, setup.task if design.task is None else design.task
+    for name in design.separate:
+        if name not in names:
+            raise ValueError(f"{design.name}: separate: {name!r} is not free in the fit; free are {', '.join(names)}")
+    settings = setup.target.settings if design.settings is None else design.settings
+    task = given.with_parts(settings=settings)
+    has_response(task, required=True)
+    own, coordinates = _coordinates(setup, theta, task)
+    local = _local_setup(setup, own, coordinates, task, design)
+    seen = seen_here(local, theta[own])
+    local = _with_data(local, design, seen.moments)
+    found = _information(local, design, seen)
+    kept = np.array([names[i] not in design.separate for i in own])
+    whole = np.zeros((len(names), len(names)))
+    if not np.all(kept):
+        loose, tied = found[np.ix_(~kept, ~kept)] + VAGUE * np.eye(np.sum(~kept)), found[np.ix_(kept, ~kept)]
+        found = found[np.ix_(kept, kept)] - tied @ np.linalg.pinv(loose, hermitian=True) @ tied.T
+    whole[np.ix_(own[kept], own[kept])] = found
+    return whole
+
+
+def _coordinates(setup: Setup, theta: np.ndarray, task: Any) -> tuple[np.ndarray, Coordinates]:
+    """Which of the fit's coordinates the task has, and these: the same θ stands for the task's own values."""
+    c = setup.coordinates
+    own = np.array([i for i, n in enumerate(c.names)
+                    if n in task.parameter_names and (float(task[n]) > 0 or not c.positive[i])], dtype=int)  # fmt: skip
+    values, step = np.array([float(task[c.names[i]]) for i in own]), c.sd[own] * theta[own]
+    centre = np.where(c.positive[own], values * np.exp(-step), values - step)
+    unbounded = np.full(len(own), np.inf)
+    return own, Coordinates(tuple(c.names[i] for i in own), centre, c.sd[own], c.positive[own], -unbounded, unbounded)
+
+
+def _local_setup(setup: Setup, own: np.ndarray, coordinates: Coordinates, task: Any, design: Design) -> Setup:
+    present, settings = setup.target, task.settings
+    bins = present.bins if settings == present.settings else np.arange(settings.first_bin, settings.last_bin + 1)
+    counts = design.counts if design.counts and design.spectral else segments_of(present)
+    quantity = "displacement" if task.output_unit == "m" else "force"
+    target = Target(design.name, np.ones(len(bins)), bins=bins, quantity=quantity, segments=counts, settings=settings)
+    return dataclasses.replace(
+        setup, task=task, target=target, coordinates=coordinates, prior=setup.prior[own], extra=(None, None)
+    )
+
+
+def _with_data(setup: Setup, design: Design, moments: Any) -> Setup:
+    """The setup with the data that the design is expected to give."""
+    mean, sd = float(moments.mean), float(np.sqrt(moments.variance))
+    if (design.coefficient_of_variation or design.mean is not None) and not sd < MOST_VARIATION * abs(mean):
+        raise ValueError(f"{design.name}: the mean of its output is zero, so neither it nor a coefficient of variation "
+                         "can be stated relatively: leave both out")  # fmt: skip
+    old = setup.target
+    target = Target(
+        design.name, moments.proportional, bins=old.bins, quantity=old.quantity, segments=old.segments,
+        coefficient_of_variation=sd / abs(mean) if design.coefficient_of_variation else None, settings=old.settings,
+    )  # fmt: skip
+    further = target_variation(target, setup.task), None if design.mean is None else (mean, design.mean * abs(mean))
+    return dataclasses.replace(setup, target=target, extra=further)
+
+
+def _information(setup: Setup, design: Design, seen: Seen) -> Float[np.ndarray, "own own"]:
+    likelihood = Likelihood.of(setup)
+    bins = likelihood.bins
+    assert bins is not None
+    if not design.spectral:
+        bins = bins._replace(mask=np.zeros(len(setup.target.bins)))
+    return without_offset(np.asarray(likelihood.information(seen, bins)))

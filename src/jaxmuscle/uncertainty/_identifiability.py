@@ -1,0 +1,142 @@
+"""What the data of a fit determine, and which further measurement would determine the rest."""
+
+import dataclasses
+import itertools
+from collections.abc import Iterable
+from typing import NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Float
+
+from jaxmuscle._common.errors import OperatingPointError
+from jaxmuscle.data._target import Target
+from jaxmuscle.fits._reopened import taken_up
+from jaxmuscle.fits._report import REDUCED
+from jaxmuscle.fits._result import FitResult
+from jaxmuscle.objective._consequences import UNITS, Seen, quantities, unit_of
+from jaxmuscle.objective._covariance import DETERMINED, Identifiability, undetermined_directions
+from jaxmuscle.objective._problem import Setup, theta_of
+
+from ._designs import Design, design_information, designs_for, information_of, seen_here, told_data
+from ._identifiability_report import TOGETHER, IdentifiabilityReport, Known, Outlook
+
+LEAST_PRIOR = 1e-6
+
+
+def identifiability(
+    result: FitResult, target: Target | None = None, *, designs: Iterable[Design] | None = None
+) -> IdentifiabilityReport:
+    """Which parameters the data of a fit determine, and which further measurements would determine the rest.
+
+    By the Fisher information of the data at the fit, `F = Jᵀ C⁻¹ J`, with the covariance C of the bins' logarithms, the
+    unknown total of a proportional spectrum eliminated, the prior left out; a further measurement adds its own. A direction
+    of θ is determined if its singular value, the root of the eigenvalue of F, is at least 3; a quantity with gradient g if
+    `gᵀ (F + Λ)⁻¹ g <= 0.1 gᵀ Λ⁻¹ g`, Λ the prior's precision: the data leave at most a tenth of its prior variance.
+
+    **Arguments:** `result` of a fit whose task has a linear response; `target`, instead of the fit's own; `designs` to be
+    tried (default: `standard_designs(result)`).
+
+    **Returns:** an `IdentifiabilityReport`: print it, `plot()` it, `save(path)` it.
+
+    **Raises:** `ValueError` for a fit that failed, a target that states neither segments nor sigma, two designs of one name,
+    a design that names unknown parameters. A design without stable equilibrium is reported as impossible.
+    """
+    with jax.enable_x64(True):
+        setup, theta = _fitted(result, target)
+        seen = seen_here(setup, theta)
+        tried = designs_for(setup, float(seen.moments.mean)) if designs is None else tuple(designs)
+        names = [design.name for design in tried]
+        if len(set(names)) < len(names):
+            raise ValueError(f"designs: two are called {next(n for n in names if names.count(n) > 1)!r}: rename one")
+        here = _Here.of(setup, seen)
+        added = [_added(setup, theta, design) for design in tried]
+    present = here.outlook("the present data", here.information, *told_data(setup))
+    alone = tuple(
+        here.outlook(d.name, here.information + more, *d.told(setup), d.separate, failed, present)
+        for d, (more, failed) in zip(tried, added, strict=True)
+    )
+    possible = [(d.name, more) for d, (more, failed) in zip(tried, added, strict=True) if failed is None]
+    pairs = [here.outlook(a + TOGETHER + b, here.information + x + y, present=present)
+             for (a, x), (b, y) in itertools.combinations(possible, 2)]  # fmt: skip
+    pairs.sort(key=lambda pair: (-len(pair.gained), sum(np.log(k.left) for k in pair.quantities.values())))
+    notices = tuple(n for n in result.notices if n.startswith("harmonic_frequency is ambiguous"))
+    return IdentifiabilityReport(setup.target.name, setup.coordinates.names, present, alone, tuple(pairs), notices)
+
+
+def standard_designs(result: FitResult, target: Target | None = None) -> tuple[Design, ...]:
+    """The designs that `identifiability(result, target)` tries by default, to be extended or changed.
+
+    The coefficient of variation and the mean (to 2 %) of the same recording, if the fit does not have them; of an
+    `Isometric` fit the displacement under the load that the sensor had held (`PrescribedForce` at the same operating point,
+    perturbations included), of a `PrescribedForce` fit the force of `Isometric`; twice and half the force, where noise and
+    harmonic have other, unknown amplitudes and the muscle is as before; a recording ten times as long.
+    """
+    with jax.enable_x64(True):
+        setup, theta = _fitted(result, target)
+        return designs_for(setup, float(seen_here(setup, theta).moments.mean))
+
+
+def _fitted(result: FitResult, target: Target | None) -> tuple[Setup, Float[np.ndarray, " free"]]:
+    """The fit's setup with the fitted task in it, and θ."""
+    setup = taken_up(result, target)
+    return dataclasses.replace(setup, task=result.task), theta_of(setup, result.task)
+
+
+def _added(setup: Setup, theta: np.ndarray, design: Design) -> tuple[np.ndarray, str | None]:
+    """What a design tells, or why it is impossible."""
+    try:
+        return design_information(setup, theta, design), None
+    except OperatingPointError as error:
+        return np.zeros((len(theta), len(theta))), str(error)
+
+
+class _Here(NamedTuple):
+    """The fit: information of its data, its prior, values and gradients of what can be known."""
+
+    names: tuple[str, ...]
+    information: np.ndarray
+    prior: np.ndarray
+    values: dict[str, tuple[float, str]]
+    gradients: dict[str, np.ndarray]
+
+    @classmethod
+    def of(cls, setup: Setup, seen: Seen) -> "_Here":
+        c = setup.coordinates
+        natural = np.array([float(setup.task[name]) for name in c.names])
+        values = {n: (float(v), unit_of(n)) for n, v in zip(c.names, natural, strict=True)}
+        gradients = dict(zip(c.names, np.diag(c.slope(natural)), strict=True))
+        problem = dataclasses.replace(setup, extra=(None, None)).linear()
+        found, slopes = jax.tree.map(lambda x: np.asarray(x)[0],
+                                     quantities(problem, jax.tree.map(lambda x: np.asarray(x)[None], seen)))  # fmt: skip
+        for name, g in slopes.items():
+            if name not in values and np.all(np.isfinite(g)) and np.any(g != 0) and np.isfinite(found[name]):
+                unit = setup.task.output_unit if name == "mean" else UNITS.get(name, "1")
+                values[name], gradients[name] = (float(found[name]), unit), g
+        return cls(c.names, information_of(setup, seen), setup.prior, values, gradients)
+
+    def outlook(
+        self,
+        name: str,
+        information: np.ndarray,
+        task: str = "",
+        data: str = "",
+        separate: tuple[str, ...] = (),
+        failed: str | None = None,
+        present: Outlook | None = None,
+    ) -> Outlook:
+        """What is known with that information."""
+        eigenvalues, vectors = np.linalg.eigh(information)
+        size = np.sqrt(np.maximum(eigenvalues[::-1], 0.0))
+        found = Identifiability(size, vectors[:, ::-1].T, size >= DETERMINED)
+        after = np.linalg.pinv(information + np.diag(self.prior), hermitian=True)
+        before = np.diag(1 / np.maximum(self.prior, LEAST_PRIOR))
+        known = {}
+        for n, g in self.gradients.items():
+            left, had = g @ after @ g, g @ before @ g
+            known[n] = Known(*self.values[n], float(np.sqrt(left)), float(np.sqrt(had)), bool(left <= REDUCED * had))
+        gained = () if present is None else tuple(
+            n for n, k in known.items() if k.determined and not present.quantities[n].determined
+        )  # fmt: skip
+        open_now = undetermined_directions(self.names, found)
+        return Outlook(name, task, data, separate, size, int(found.determined.sum()), open_now, known, gained, failed)

@@ -1,0 +1,230 @@
+"""The identifiability report: what is known now, what it would be with further measurements, in words and tables."""
+
+import textwrap
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Float
+
+from jaxmuscle._common.files import write_json
+from jaxmuscle._common.text import WIDTH
+from jaxmuscle.objective._covariance import DETERMINED
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure, SubFigure
+
+
+COLUMNS = 6
+PAIRS_TOLD = 3
+TOGETHER = " together with "
+SAME = 1e-6
+BASE = {"k_w": "K_w0", "k_z": "K_z0", "c_w": "C_w0", "c_z": "C_z0"}
+
+
+class Known(eqx.Module):
+    """How well a quantity is known: `stderr` by data and prior, `prior_sd` by the prior alone, both to first order.
+
+    `determined` if the data leave at most a tenth of the prior's variance.
+    """
+
+    value: float
+    unit: str
+    stderr: float
+    prior_sd: float
+    determined: bool
+
+    @property
+    def left(self) -> float:
+        """Share of the prior's standard deviation that is left."""
+        return self.stderr / self.prior_sd
+
+    @property
+    def percent(self) -> str:
+        """The standard error in percent of the value, or in its unit where the value has either sign."""
+        if self.value > 0 and self.unit not in ("m", "rad"):
+            return f"{100 * self.stderr / self.value:.2g} %"
+        return f"{self.stderr:.2g} {self.unit}"
+
+
+class Outlook(eqx.Module):
+    """What is known with the data of a design, or of several, added to the present ones.
+
+    `task` and `data` in words; `separate`, the parameters that have other values there; `singular_values` in prior standard
+    deviations; `determined`, how many directions are (singular value at least 3); `undetermined`, the others in words;
+    `quantities` by name; `gained`, those that become determined; `failed`, why the design is impossible, all else being
+    as at present.
+    """
+
+    name: str
+    task: str
+    data: str
+    separate: tuple[str, ...]
+    singular_values: Float[np.ndarray, " free"]
+    determined: int
+    undetermined: tuple[str, ...]
+    quantities: dict[str, Known]
+    gained: tuple[str, ...]
+    failed: str | None
+
+    def __str__(self) -> str:
+        if self.failed is not None:
+            return f"{self.name} is impossible: {self.failed}"
+        names = sorted(set(self.gained) & set(told(self.quantities)), key=lambda n: self.quantities[n].left)
+        if not names:
+            return f"{self.name} would determine nothing that is open now"
+        parts = [f"{n} to {self.quantities[n].percent}" for n in names]
+        listed = parts[0] if len(parts) == 1 else f"{', '.join(parts[:-1])} and {parts[-1]}"
+        return f"{self.name} would determine {listed}"
+
+    def to_dict(self) -> dict[str, Any]:
+        """As nested tables of numbers and strings."""
+        return {
+            "name": self.name, "task": self.task, "data": self.data, "separate": list(self.separate),
+            "failed": self.failed, "singular_values": self.singular_values.tolist(), "determined": self.determined,
+            "undetermined": list(self.undetermined), "gained": list(self.gained),
+            "quantities": {n: {"value": k.value, "unit": k.unit, "stderr": k.stderr, "prior_sd": k.prior_sd,
+                               "left": k.left, "determined": k.determined} for n, k in self.quantities.items()},
+        }  # fmt: skip
+
+
+class IdentifiabilityReport(eqx.Module):
+    """What the data of a fit determine (`present`), and what they would with further `designs` or `pairs` of these.
+
+    `target` and `free` name the data and the fitted parameters; the pairs are sorted, best first; `notices` of the fit.
+    """
+
+    target: str
+    free: tuple[str, ...]
+    present: Outlook
+    designs: tuple[Outlook, ...]
+    pairs: tuple[Outlook, ...]
+    notices: tuple[str, ...]
+
+    @property
+    def telling_pairs(self) -> tuple[Outlook, ...]:
+        """Pairs that determine more quantities than each of their two designs does, or any other, best first."""
+        most = max((len(design.gained) for design in self.designs), default=0)
+        return tuple(pair for pair in self.pairs if len(pair.gained) > most)
+
+    together: ClassVar[str] = TOGETHER
+    threshold: ClassVar[float] = DETERMINED
+
+    @staticmethod
+    def letter(number: int) -> str:
+        """What tables and figures call the design of that number: A, B, …"""
+        return letter(number)
+
+    @property
+    def told(self) -> list[str]:
+        """Names of the quantities that tables and figures show."""
+        return told(self.present.quantities)
+
+    def to_dict(self) -> dict[str, Any]:
+        """As nested tables of numbers and strings."""
+        return {
+            "format": 1, "target": self.target, "free": list(self.free), "threshold": DETERMINED,
+            "present": self.present.to_dict(), "designs": [d.to_dict() for d in self.designs],
+            "pairs": [d.to_dict() for d in self.pairs], "notices": list(self.notices),
+        }  # fmt: skip
+
+    def save(self, path: str | Path) -> None:
+        """Write `to_dict` as JSON, atomically."""
+        write_json(path, self.to_dict())
+
+    def plot(self, ax: "Axes | None" = None) -> "Figure | SubFigure":
+        """Singular values, and the standard errors of all quantities, now and with every design."""
+        from jaxmuscle.plot._identifiability import figure
+
+        return figure(self, ax)
+
+    def __str__(self) -> str:
+        return "\n".join([*_present(self), *_designs(self), *_table(self), *_sentences(self)])
+
+
+def told(quantities: dict[str, Known]) -> list[str]:
+    """The quantities to be told of: K_j0 and C_j0 stand for the k_j and c_j to which they are proportional."""
+    twins = {k: base for k, base in BASE.items() if k in quantities and base in quantities}
+    doubled = {k for k, base in twins.items() if abs(quantities[k].left - quantities[base].left) < SAME}
+    return [name for name in quantities if name not in doubled]
+
+
+def letter(number: int) -> str:
+    """A, B, ... Z, A1, B1, ..."""
+    return chr(ord("A") + number % 26) + (str(number // 26) if number >= 26 else "")
+
+
+def _wrapped(text: str, indent: int, first: str | None = None) -> list[str]:
+    start = " " * indent if first is None else first
+    return textwrap.wrap(text, WIDTH, initial_indent=start, subsequent_indent=" " * max(indent, len(start)),
+                         break_long_words=False, break_on_hyphens=False)  # fmt: skip
+
+
+def _present(report: IdentifiabilityReport) -> list[str]:
+    now = report.present
+    lines = _wrapped(f"what the data of {report.target} determine", 2, "")
+    lines += _wrapped(f"{now.task}; {now.data}", 2)
+    for notice in report.notices:
+        lines += _wrapped(notice, 4, "  note: ")
+    lines += [
+        f"  {now.determined} of {len(report.free)} directions of the parameters (singular values from {DETERMINED:g} on):"
+    ]
+    values = [f"{v:.3g}" for v in now.singular_values]
+    lines += _wrapped("  ".join([*values[: now.determined], "|", *values[now.determined :]]), 4)
+    if now.undetermined:
+        lines += ["  left open:"]
+        for sentence in now.undetermined:
+            lines += _wrapped(sentence, 6, "    - ")
+    return lines
+
+
+def _designs(report: IdentifiabilityReport) -> list[str]:
+    if not report.designs:
+        return []
+    lines = ["  further measurements, and how many directions they would leave determined:"]
+    for number, design in enumerate(report.designs):
+        count = "impossible" if design.failed else f"{design.determined} of {len(report.free)}"
+        lines += _wrapped(f"{design.name}: {count}", 8, f"    {letter(number):<2}  ")
+        own = f"; {', '.join(design.separate)} of its own" if design.separate else ""
+        lines += _wrapped(f"{design.task}; {design.data}{own}", 8)
+    return lines
+
+
+def _table(report: IdentifiabilityReport) -> list[str]:
+    """Standard errors of every quantity by the prior, now, and with each design; those of open quantities in brackets."""
+    names = told(report.present.quantities)
+    possible = [(letter(i), d) for i, d in enumerate(report.designs) if d.failed is None]
+    lines = ["  standard error by data and prior, in percent; in brackets: not determined"]
+    for start in range(0, max(len(possible), 1), COLUMNS):
+        block = possible[start : start + COLUMNS]
+        heads = ["value", "prior", "now", *(label for label, _ in block)]
+        lines.append(f"  {'':<24}{heads[0]:>9}" + "".join(f"{head:>6}" for head in heads[1:]))
+        for name in names:
+            now = report.present.quantities[name]
+            cells = [f"({_cell(now, now.prior_sd)})", *(_shown(o.quantities[name]) for o in
+                                                        (report.present, *(d for _, d in block)))]  # fmt: skip
+            lines.append(f"  {name:<24}{now.value:>9.3g}" + "".join(f"{cell:>6}" for cell in cells))
+    return lines
+
+
+def _shown(known: Known) -> str:
+    cell = _cell(known, known.stderr)
+    return cell if known.determined else f"({cell})"
+
+
+def _cell(known: Known, error: float) -> str:
+    share = 100 * error / abs(known.value) if known.value else np.inf
+    return f"{share:.2g}" if share < 99.5 else f"{share:.0f}" if share < 999 else ">>"
+
+
+def _sentences(report: IdentifiabilityReport) -> list[str]:
+    lines = []
+    for outlook in (*report.designs, *report.telling_pairs[:PAIRS_TOLD]):
+        lines += _wrapped(str(outlook), 4, "  - ")
+    best = min((*report.designs, *report.pairs), key=lambda o: (len(o.undetermined), -len(o.gained)), default=None)
+    if best is not None and best.failed is None:
+        rest = f"this stays open: {'; '.join(best.undetermined)}" if best.undetermined else "nothing stays open"
+        lines += _wrapped(f"with the most telling, {best.name}, {rest}", 4, "  - ")
+    return lines
