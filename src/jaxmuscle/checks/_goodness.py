@@ -8,6 +8,7 @@ import numpy as np
 from jax import Array
 from jaxtyping import Float
 
+from jaxmuscle import plot
 from jaxmuscle._common.environment import versions
 from jaxmuscle._common.text import folded
 from jaxmuscle.data._target import Target
@@ -120,9 +121,7 @@ class Goodness(eqx.Module):
 
     def plot(self, ax: "Axes | None" = None) -> "Figure | SubFigure":
         """Residuals with what is usual in each bin, and the three checks with their reference distributions."""
-        from jaxmuscle.plot._checks import goodness_figure
-
-        return goodness_figure(self, ax)
+        return plot.goodness(self, ax)
 
 
 def goodness(result: FitResult, target: Target | None = None, *, replicates: int = 999, key: Array | int = 0) -> Goodness:

@@ -10,6 +10,7 @@ import numpy as np
 import scipy.stats
 from jaxtyping import Float
 
+from jaxmuscle import plot
 from jaxmuscle._common.environment import versions
 from jaxmuscle._common.files import write_text
 from jaxmuscle._common.text import folded
@@ -197,9 +198,7 @@ class Bootstrap(eqx.Module):
 
     def plot(self, ax: "Axes | None" = None) -> "Figure | SubFigure":
         """The refits of every quantity, with the true value and the interval that the fit states."""
-        from jaxmuscle.plot._checks import bootstrap_figure
-
-        return bootstrap_figure(self, ax)
+        return plot.bootstrap(self, ax)
 
 
 def _number(value: Any) -> Any:

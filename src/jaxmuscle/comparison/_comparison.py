@@ -9,6 +9,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
+from jaxmuscle import plot
 from jaxmuscle._common.environment import versions
 from jaxmuscle._common.files import write_text
 from jaxmuscle._common.text import folded
@@ -269,9 +270,7 @@ class Comparison(eqx.Module):
 
     def plot(self, ax: "Axes | None" = None) -> "Figure | SubFigure":
         """The target with the best fit of each noise, AIC and held-out score of every model."""
-        from jaxmuscle.plot._comparison import figure
-
-        return figure(self, ax)
+        return plot.comparison(self, ax)
 
     def __str__(self) -> str:
         kind = type(next(iter(self.tasks.values()))).__name__

@@ -11,6 +11,7 @@ import numpy as np
 import scipy.signal
 from jaxtyping import Float
 
+from jaxmuscle import plot
 from jaxmuscle._common.text import choices, folded
 from jaxmuscle.spectra._measures import approximate_entropy, peaks, sample_entropy
 from jaxmuscle.spectra._settings import SpectrumSettings, require
@@ -295,9 +296,7 @@ class Recording(eqx.Module):
 
     def plot(self, settings: SpectrumSettings | None = None, ax: Any = None) -> Any:
         """Draw the trace with its window, and the spectra (Welch, FFT), linear and logarithmic; returns the figure."""
-        from jaxmuscle.plot._recording import figure
-
-        return figure(self, settings, ax)
+        return plot.recording(self, settings, ax)
 
     def __str__(self) -> str:
         what = "recording" if self.quantity is None else self.quantity

@@ -11,8 +11,10 @@ import numpy as np
 import tomli_w
 from jaxtyping import Float, Int
 
+from jaxmuscle import plot
 from jaxmuscle._common.errors import TargetError
 from jaxmuscle._common.text import folded
+from jaxmuscle.spectra._bin_law import bin_statistics
 from jaxmuscle.spectra._settings import SpectrumSettings
 
 from . import _target_fields as check
@@ -124,8 +126,6 @@ class Target(eqx.Module):
 
         `None` if nothing is known about the sampling error.
         """
-        from jaxmuscle.spectra._bin_law import bin_statistics
-
         statistics = bin_statistics(self)
         if not statistics.known:
             return None
@@ -150,8 +150,6 @@ class Target(eqx.Module):
 
     def plot(self, ax: Any = None, *, log: bool = False) -> Any:
         """Draw the spectrum, see `jaxmuscle.plot.target`; `log`: both axes logarithmic. Returns the axes."""
-        from jaxmuscle import plot
-
         return plot.target(self, ax, log=log)
 
     def __str__(self) -> str:

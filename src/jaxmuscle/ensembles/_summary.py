@@ -8,6 +8,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float, Int
 
+from jaxmuscle import plot
 from jaxmuscle._common.text import folded, listed
 from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.spectra._mean import SpectrumEstimate, from_moments
@@ -77,9 +78,7 @@ class EnsembleSummary(eqx.Module):
 
     def plot(self, ax: "Axes | None" = None, point: int = 0) -> "Axes":
         """Median (or mean) and the band between the outermost quantiles against time. Returns the axes."""
-        from jaxmuscle.plot._wrappers import moments
-
-        return moments(self, ax, point)
+        return plot.moments(self, ax, point)
 
     def to_xarray(self) -> "xarray.Dataset":
         """A Dataset with dimensions (point,) time, quantile, frequency; units, parameters and settings as attributes."""

@@ -10,6 +10,7 @@ import jax
 import numpy as np
 import scipy.stats
 
+from jaxmuscle import plot
 from jaxmuscle._common.arrays import as_numbers
 from jaxmuscle._common.environment import versions
 from jaxmuscle._common.progress import teller
@@ -123,9 +124,7 @@ class CohortResult(eqx.Module):
 
     def plot(self, by: str = "person", ax: "Axes | None" = None) -> "Figure | SubFigure":
         """Determined quantities with their standard errors, by "person", "group" or "level" (fraction of MVC)."""
-        from jaxmuscle.plot._cohort import figure
-
-        return figure(self, by, ax)
+        return plot.cohort(self, by, ax)
 
 
 def _or_nan(value: float | None) -> float:

@@ -7,6 +7,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
+from jaxmuscle import plot
 from jaxmuscle._common.files import write_json
 from jaxmuscle._common.text import folded
 from jaxmuscle.data._target import Target
@@ -85,9 +86,7 @@ class JointResult(eqx.Module):
 
     def plot(self, ax: "Axes | None" = None) -> "Figure | SubFigure":
         """One row per target: its spectrum with the fit, and the residuals; below, what was found."""
-        from jaxmuscle.plot._joint import figure
-
-        return figure(self, ax)
+        return plot.joint(self, ax)
 
     def save(self, path: str | Path) -> None:
         """Write JSON atomically; `load_joint_result` reads it back equal."""

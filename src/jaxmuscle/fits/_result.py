@@ -9,6 +9,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
+from jaxmuscle import plot
 from jaxmuscle._common.errors import ResultError
 from jaxmuscle._common.files import write_json
 from jaxmuscle._common.text import choices, folded
@@ -116,8 +117,6 @@ class FitResult(eqx.Module):
 
     def plot(self, ax: "Axes | None" = None) -> "Figure | SubFigure":
         """The figure of the fit."""
-        from jaxmuscle import plot
-
         return plot.fit(self, ax)
 
     def save(self, path: str | Path) -> None:

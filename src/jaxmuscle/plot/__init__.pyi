@@ -1,8 +1,24 @@
 """All figures."""
 
+from ._characteristics import static as static
+from ._checks import bootstrap as bootstrap
+from ._checks import goodness as goodness
+from ._cohort import cohort as cohort
+from ._comparison import comparison as comparison
+from ._fit import fit as fit
+from ._identifiability import identifiability as identifiability
+from ._joint import joint as joint
+from ._moments import moments as moments
+from ._posterior import chains as chains
+from ._posterior import posterior as posterior
+from ._posterior import predictive as predictive
+from ._profile import profile as profile
+from ._recording import recording as recording
+from ._sensitivity import sensitivity as sensitivity
 from ._simulation import simulation as simulation
 from ._simulation import trajectory as trajectory
 from ._spectra import QUANTILES as QUANTILES
+from ._spectra import estimate as estimate
 from ._spectra import spectrum as spectrum
 from ._spectra import target as target
 from ._style import BLUE as BLUE
@@ -14,19 +30,3 @@ from ._style import SKY as SKY
 from ._style import STYLE as STYLE
 from ._style import VERMILLION as VERMILLION
 from ._style import styled as styled
-from ._wrappers import bootstrap as bootstrap
-from ._wrappers import chains as chains
-from ._wrappers import cohort as cohort
-from ._wrappers import comparison as comparison
-from ._wrappers import estimate as estimate
-from ._wrappers import fit as fit
-from ._wrappers import goodness as goodness
-from ._wrappers import identifiability as identifiability
-from ._wrappers import joint as joint
-from ._wrappers import moments as moments
-from ._wrappers import posterior as posterior
-from ._wrappers import predictive as predictive
-from ._wrappers import profile as profile
-from ._wrappers import recording as recording
-from ._wrappers import sensitivity as sensitivity
-from ._wrappers import static as static

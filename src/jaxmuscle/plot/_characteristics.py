@@ -1,33 +1,29 @@
 """The figure of static characteristics."""
 
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.axes import Axes
 
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
-
-def _draw(curves: Any, ax: "Sequence[Axes] | None") -> "tuple[Axes, Axes, Axes]":
-    import matplotlib.pyplot as plt
-
-    from ._style import styled
-
-    def panels() -> "tuple[Axes, Axes, Axes]":
-        axes: Any = plt.subplots(1, 3, figsize=(9.0, 3.0), layout="constrained")[1] if ax is None else ax
-        if len(axes) != 3:
-            raise ValueError(f"ax has {len(axes)} axes: give three, for K(x), C(v) and force against displacement")
-        _coefficients(curves, axes[0], axes[1])
-        _forces(curves, axes[2])
-        return tuple(axes)
-
-    return styled(panels)()
+from ._style import BLUE, GREEN, GREY, VERMILLION, styled
 
 
-def _coefficients(curves: Any, stiffness: "Axes", damping: "Axes") -> None:
-    from ._style import BLUE, VERMILLION
+@styled
+def static(curves: Any, ax: Any = None) -> tuple[Axes, Axes, Axes]:
+    """Draws K(x), C(v) and force against displacement, in three axes (`ax`: three of yours). Returns the axes.
 
+    **Raises:** `ValueError` unless `ax` has three.
+    """
+    axes: Any = plt.subplots(1, 3, figsize=(9.0, 3.0), layout="constrained")[1] if ax is None else ax
+    if len(axes) != 3:
+        raise ValueError(f"ax has {len(axes)} axes: give three, for K(x), C(v) and force against displacement")
+    _coefficients(curves, axes[0], axes[1])
+    _forces(curves, axes[2])
+    return tuple(axes)
+
+
+def _coefficients(curves: Any, stiffness: Axes, damping: Axes) -> None:
     x = 1e3 * curves.displacement
     for j, colour, tissue, width in (("w", BLUE, "active tissue", 3.0), ("z", VERMILLION, "passive tissue", 1.5)):
         slope = rf"d$F_\mathrm{{{j}}}$/d$x$ of its spring"
@@ -43,9 +39,7 @@ def _coefficients(curves: Any, stiffness: "Axes", damping: "Axes") -> None:
     _finish(damping, "Velocity (m/s)", "Damping (N s/m)", room=0.35)
 
 
-def _forces(curves: Any, ax: "Axes") -> None:
-    from ._style import BLUE, GREEN, GREY, VERMILLION
-
+def _forces(curves: Any, ax: Axes) -> None:
     x = 1e3 * curves.displacement
     ax.plot(x, curves.F_w, color=BLUE, lw=3.0, label="spring of the active tissue")
     ax.plot(x, curves.F_z, color=VERMILLION, label="spring of the passive tissue")
@@ -56,7 +50,7 @@ def _forces(curves: Any, ax: "Axes") -> None:
     _finish(ax, "Displacement (mm)", "Force (N)", room=0.6)
 
 
-def _finish(ax: "Axes", across: str, up: str, *, room: float) -> None:
+def _finish(ax: Axes, across: str, up: str, *, room: float) -> None:
     """Labels, and a legend above the curves in `room` times their height."""
     low, high = ax.get_ylim()
     low = min(low, 0.0)

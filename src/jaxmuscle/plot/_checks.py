@@ -17,8 +17,8 @@ PALE = "0.80"
 
 
 @styled
-def goodness_figure(found: Any, ax: Axes | None = None) -> Figure | SubFigure:
-    """Residuals of every bin over what 95 % of the replicates have there; below, the three checks."""
+def goodness(found: Any, ax: Axes | None = None) -> Figure | SubFigure:
+    """Draws residuals with what is usual in each bin, and the three checks with their reference distributions."""
     fig = canvas(ax, (7.2, 4.6))
     grid = fig.add_gridspec(2, 3, height_ratios=(1.15, 1.0))
     _residuals(fig.add_subplot(grid[0, :]), found)
@@ -77,8 +77,11 @@ def _reference(ax: Axes, found: Any, name: str) -> None:
 
 
 @styled
-def bootstrap_figure(found: Any, ax: Axes | None = None) -> Figure | SubFigure:
-    """One panel per quantity: refits, the value they were made from, and the interval that the fit states about it."""
+def bootstrap(found: Any, ax: Axes | None = None) -> Figure | SubFigure:
+    """Draws the refits of every quantity, the value they were made from and the interval that the fit states.
+
+    **Raises:** `ValueError` if fewer than two refits succeeded.
+    """
     names = list(found.quantities)
     if not names:
         raise ValueError(f"{found.target.name}: fewer than two refits succeeded, so there is nothing to draw")

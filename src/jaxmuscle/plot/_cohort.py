@@ -15,8 +15,11 @@ SHARE = 0.5  # of the targets that must determine a quantity for it to be drawn
 
 
 @styled
-def figure(cohort: Any, by: str = "person", ax: Axes | None = None) -> Figure | SubFigure:
-    """One panel per quantity that at least half of the targets determine: value and standard error."""
+def cohort(cohort: Any, by: str = "person", ax: Axes | None = None) -> Figure | SubFigure:
+    """Draws what at least half of the targets determine, `by` "person", "group" or "level" (fraction of MVC).
+
+    **Raises:** `ValueError` for another `by`, and if there is nothing to draw.
+    """
     if by not in WAYS:
         raise ValueError(f"by = {by!r}: choose one of {', '.join(WAYS)}")
     rows = [row for row in cohort.table() if row["stderr"] is not None]

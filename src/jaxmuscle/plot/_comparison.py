@@ -18,8 +18,8 @@ DASHES: tuple[Any, ...] = ("-", (0, (5, 1.5)), (0, (2, 1)), (0, (5, 1, 1, 1)))
 
 
 @styled
-def figure(comparison: Any, ax: Axes | None = None) -> Figure | SubFigure:
-    """The target with the best fit of each noise; AIC and held-out score of every model; the verdict below."""
+def comparison(comparison: Any, ax: Axes | None = None) -> Figure | SubFigure:
+    """Draws the best fit of each noise, AIC and held-out score of every model, and says whether they can be told apart."""
     lines = _lines(comparison)
     low = LINE * (len(lines) + 0.5)
     fig = canvas(ax, (WIDTH, HEIGHT + low + 0.3))

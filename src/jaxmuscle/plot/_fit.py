@@ -24,8 +24,15 @@ _Line = tuple[str, dict[str, Any]]
 
 
 @styled
-def figure(result: Any, ax: Axes | None = None) -> Figure | SubFigure:
-    """Header, spectra, residuals and output, tables, notes; each as high as what it has to hold."""
+def fit(result: Any, ax: Axes | None = None) -> Figure | SubFigure:
+    """Draws what a fit found: spectra linear and logarithmic, residuals, simulated output and parameters.
+
+    The band around the target is that of `target`. Residuals are in standard deviations of the log power, positive
+    where the target is above the fit. Parameters that were not fitted are left out of the table, and those that the
+    data do not determine are marked.
+
+    **Arguments:** `result`, what `jaxmuscle.fit` returns; `ax`, its place. **Returns:** the figure.
+    """
     header, notes = _header(result), _notes(result)
     free = {name: estimate for name, estimate in result.parameters.items() if estimate.free}
     rows = 1 + max(len(free), len(result.derived), 1)

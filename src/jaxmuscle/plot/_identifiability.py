@@ -17,8 +17,8 @@ PAIRS = 3
 
 
 @styled
-def figure(report: Any, ax: Axes | None = None) -> Figure | SubFigure:
-    """Above, singular values of the present data and with each design; below, the error of every quantity."""
+def identifiability(report: Any, ax: Axes | None = None) -> Figure | SubFigure:
+    """Draws singular values and standard errors, now and with each further measurement."""
     letters = {d.name: report.letter(i) for i, d in enumerate(report.designs)}
     shown = [report.present, *(d for d in report.designs if d.failed is None), *report.telling_pairs[:PAIRS]]
     marks = ["now", *(" + ".join(letters[name] for name in o.name.split(report.together)) for o in shown[1:])]

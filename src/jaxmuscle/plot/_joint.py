@@ -17,8 +17,8 @@ PLACES = (0.58, 0.60, 0.85)
 
 
 @styled
-def figure(result: Any, ax: Axes | None = None) -> Figure | SubFigure:
-    """Header; for each target its spectrum, linear and logarithmic, and residuals; parameters and derived quantities."""
+def joint(result: Any, ax: Axes | None = None) -> Figure | SubFigure:
+    """Draws a joint fit: spectrum, fit and residuals of each target, and what they determine together."""
     header = _header(result)
     free = {name: p for name, p in result.parameters.items() if p.free}
     rows = max(len(free), len(result.derived), 1) + 1

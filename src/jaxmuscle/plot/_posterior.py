@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.figure import Figure, SubFigure
 
 from jaxmuscle._common.errors import NotMixedError
 
@@ -24,8 +25,11 @@ def chosen(found: Any) -> list[str]:
 
 
 @styled
-def corner(found: Any, ax: Axes | None = None) -> Any:
-    """Densities of the determined quantities and of each pair (50, 80 and 95 % regions)."""
+def posterior(found: Any, ax: Axes | None = None) -> Figure | SubFigure:
+    """Draws the posterior `found` of what the data determine: densities, and 50, 80 and 95 % regions of pairs.
+
+    **Raises:** `NotMixedError` if the chains did not mix; `ValueError` if the data determine nothing.
+    """
     if not found.success:
         raise NotMixedError(f"{found.target.name}: {found.message}")
     names = chosen(found)
@@ -93,7 +97,7 @@ def _pair(ax: Axes, x: np.ndarray, y: np.ndarray, wide: np.ndarray, high: np.nda
 
 @styled
 def predictive(found: Any, ax: Axes | None = None) -> Axes:
-    """The target among spectra that the posterior predicts: 50 and 95 % of them, and of the model itself."""
+    """Draws the target among spectra that the posterior `found` predicts. **Raises:** `NotMixedError`."""
     if not found.success:
         raise NotMixedError(f"{found.target.name}: {found.message}")
     ax = axes_or_new(ax)
@@ -113,8 +117,8 @@ def predictive(found: Any, ax: Axes | None = None) -> Axes:
 
 
 @styled
-def traces(found: Any, ax: Axes | None = None) -> Any:
-    """Every chain's draws of what the data determine; also of chains that did not mix."""
+def chains(found: Any, ax: Axes | None = None) -> Figure | SubFigure:
+    """Draws every chain of the posterior `found` over its draws, also of chains that did not mix."""
     names = chosen(found) or list(found.samples)[:MOST]
     fig = canvas(ax, (6.5, 1.1 * len(names) + 0.5))
     axes = fig.subplots(len(names), 1, sharex=True, squeeze=False)

@@ -11,8 +11,8 @@ SHOWN = 3.0  # times the threshold
 
 
 @styled
-def draw(found: Any, ax: Axes | None = None) -> Axes:
-    """Rise of -2 ln L, the bound of the interval, the interval, and the parabola by the curvature."""
+def profile(found: Any, ax: Axes | None = None) -> Axes:
+    """Draws a profile likelihood with its interval and the parabola of the curvature. Returns the axes (`ax` or new)."""
     ax = axes_or_new(ax)
     ax.plot(found.values, found.rise, color=BLUE, marker="o", ms=2.5, lw=1.2, label="profile")
     ax.axhline(found.threshold, color=GREY, lw=0.8, ls=(0, (4, 2)), label=f"{100 * found.level:g} %")

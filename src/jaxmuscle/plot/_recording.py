@@ -11,8 +11,8 @@ from ._style import BLACK, BLUE, GREY, ORANGE, SKY, canvas, legend, styled
 
 
 @styled
-def figure(recording: Any, settings: Any = None, ax: Axes | None = None) -> Figure | SubFigure:
-    """Trace with the window, the window enlarged, and power (Welch with its error, FFT), linear and logarithmic."""
+def recording(recording: Any, settings: Any = None, ax: Axes | None = None) -> Figure | SubFigure:
+    """Draws a recording: the trace with its window, and its spectra (Welch, FFT), linear and logarithmic."""
     fig = canvas(ax, (9.0, 5.6))
     axes = fig.subplots(2, 2)
     _trace(axes[0, 0], recording)

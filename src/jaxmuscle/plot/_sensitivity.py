@@ -11,8 +11,11 @@ from ._style import styled
 
 
 @styled
-def draw(sensitivity: Any, ax: Axes | None = None) -> Axes:
-    """A heat map of the parameters that do something."""
+def sensitivity(sensitivity: Any, ax: Axes | None = None) -> Axes:
+    """Draws how proportional power answers to the parameters as a heat map, parameters that do nothing left out.
+
+    **Arguments:** `sensitivity`; `ax`, or a new figure high enough for the parameters. **Returns:** the axes.
+    """
     table = np.asarray(sensitivity.proportional)
     shown = np.flatnonzero(np.max(np.abs(table), axis=1) > 1e-6)
     if ax is None:

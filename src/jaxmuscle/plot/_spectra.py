@@ -10,8 +10,11 @@ from ._style import BLACK, BLUE, GREY, PALETTE, PROPORTIONAL, axes_or_new, densi
 
 
 @styled
-def draw(estimate: Any, ax: Axes | None, log: bool) -> Axes:
-    """Mean with control variate over the mean without, each ± 2 SE."""
+def estimate(estimate: Any, ax: Axes | None = None, *, log: bool = False) -> Axes:
+    """Draws the proportional power of a `SpectrumEstimate`, with two standard errors either way, and without control.
+
+    **Arguments:** `estimate`; `ax`, or a new figure; `log`, both axes logarithmic. **Returns:** the axes.
+    """
     ax = axes_or_new(ax)
     frequency, whole = np.asarray(estimate.frequency), float(np.sum(estimate.power))
     shown = slice(None) if not log else frequency > 0

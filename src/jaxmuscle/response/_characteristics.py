@@ -9,12 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxmuscle import plot
 from jaxmuscle._common.arrays import as_arrays, require
 from jaxmuscle._common.types import Scalar
 from jaxmuscle.model._muscle import AbstractMuscle
 from jaxmuscle.model._signals import AbstractSignal, Constant
 from jaxmuscle.model._tasks import AbstractTask, Isometric, PrescribedMotion
-from jaxmuscle.plot._characteristics import _draw
 
 from ._equilibrium import HOLD, equilibrium
 
@@ -62,7 +62,7 @@ class StaticCharacteristics(eqx.Module):
 
     def plot(self, ax: "Sequence[Axes] | None" = None) -> "tuple[Axes, Axes, Axes]":
         """K(x), C(v) and force against displacement, in three axes (`ax`: three of yours). Returns the axes."""
-        return _draw(self, ax)
+        return plot.static(self, ax)
 
 
 def static_characteristics(

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from jaxmuscle import plot
 from jaxmuscle._common.arrays import as_arrays
 from jaxmuscle._common.text import choices
 from jaxmuscle.model._parameters import PARAMETERS, set_parameters
@@ -52,8 +53,6 @@ class Sensitivity(eqx.Module):
 
     def plot(self, ax: Any = None) -> Any:
         """A heat map. Returns the axes."""
-        from jaxmuscle import plot
-
         return plot.sensitivity(self, ax)
 
 

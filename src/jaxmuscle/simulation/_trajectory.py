@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxmuscle import plot
 from jaxmuscle._common.arrays import as_numbers, is_concrete
 from jaxmuscle._common.environment import versions
 from jaxmuscle.model._parameters import PARAMETERS
@@ -136,9 +137,7 @@ class Trajectory(eqx.Module):
 
     def plot(self, ax: Any = None, *, window: tuple[float, float] | None = None) -> Any:
         """Output against time, or in a window [s]: one line, or mean and quantile band over seeds. Returns the axes."""
-        from jaxmuscle.plot._simulation import trajectory
-
-        return trajectory(self, ax, window=window)
+        return plot.trajectory(self, ax, window=window)
 
     def to_xarray(self) -> "xarray.Dataset":
         """A Dataset with dimensions (seed,) time; units, parameters, settings and versions as attributes."""

@@ -6,6 +6,8 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
+from jaxmuscle import plot
+
 from ._settings import SpectrumSettings
 from ._welch import Spectrum
 
@@ -54,8 +56,6 @@ class SpectrumEstimate(eqx.Module):
 
     def plot(self, ax: Any = None, *, log: bool = False) -> Any:
         """Proportional power with its error band; `log`: both axes logarithmic. Returns the axes."""
-        from jaxmuscle import plot
-
         return plot.estimate(self, ax, log=log)
 
 

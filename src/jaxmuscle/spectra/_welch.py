@@ -9,6 +9,8 @@ import numpy as np
 import scipy.signal
 from jaxtyping import Array, Float, Real
 
+from jaxmuscle import plot
+
 from ._settings import SpectrumSettings, require
 
 
@@ -38,8 +40,6 @@ class Spectrum(eqx.Module):
 
     def plot(self, ax: Any = None, *, log: bool = False, proportional: bool = True, label: str | None = None) -> Any:
         """Draws power over frequency and returns the axes, see `jaxmuscle.plot.spectrum`."""
-        from jaxmuscle import plot
-
         return plot.spectrum(self, ax, log=log, proportional=proportional, label=label)
 
 

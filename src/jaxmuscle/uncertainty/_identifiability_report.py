@@ -8,6 +8,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
+from jaxmuscle import plot
 from jaxmuscle._common.files import write_json
 from jaxmuscle._common.text import WIDTH
 from jaxmuscle.objective._covariance import DETERMINED
@@ -136,9 +137,7 @@ class IdentifiabilityReport(eqx.Module):
 
     def plot(self, ax: "Axes | None" = None) -> "Figure | SubFigure":
         """Singular values, and the standard errors of all quantities, now and with every design."""
-        from jaxmuscle.plot._identifiability import figure
-
-        return figure(self, ax)
+        return plot.identifiability(self, ax)
 
     def __str__(self) -> str:
         return "\n".join([*_present(self), *_designs(self), *_table(self), *_sentences(self)])

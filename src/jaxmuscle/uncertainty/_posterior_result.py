@@ -8,6 +8,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
+from jaxmuscle import plot
 from jaxmuscle._common.errors import NotMixedError
 from jaxmuscle._common.files import write_json
 from jaxmuscle._common.text import folded
@@ -96,21 +97,15 @@ class Posterior(eqx.Module):
 
     def plot(self, ax: "Axes | None" = None) -> "Figure | SubFigure":
         """Corner figure of what the data determine. Raises `NotMixedError` if the chains did not mix."""
-        from jaxmuscle.plot._posterior import corner
-
-        return corner(self, ax)
+        return plot.posterior(self, ax)
 
     def plot_chains(self, ax: "Axes | None" = None) -> "Figure | SubFigure":
         """Traces of the chains, also of those that did not mix."""
-        from jaxmuscle.plot._posterior import traces
-
-        return traces(self, ax)
+        return plot.chains(self, ax)
 
     def plot_predictive(self, ax: "Axes | None" = None) -> "Axes":
         """The target among the spectra that the posterior predicts. Returns the axes."""
-        from jaxmuscle.plot._posterior import predictive
-
-        return predictive(self, ax)
+        return plot.predictive(self, ax)
 
     def __str__(self) -> str:
         count, draws = self.chains.log_density.shape

@@ -9,6 +9,7 @@ import numpy as np
 import scipy.stats
 from jaxtyping import Float
 
+from jaxmuscle import plot
 from jaxmuscle._common.text import choices, folded
 from jaxmuscle.data._target import Target
 from jaxmuscle.fits._reopened import taken_up
@@ -67,9 +68,7 @@ class Profile(eqx.Module):
 
     def plot(self, ax: "Axes | None" = None) -> "Axes":
         """The profile with its interval and the parabola of the curvature. Returns the axes."""
-        from jaxmuscle.plot._profile import draw
-
-        return draw(self, ax)
+        return plot.profile(self, ax)
 
     def __str__(self) -> str:
         unit = "" if self.unit == "1" else f" {self.unit}"
