@@ -10,6 +10,7 @@ PIP = $(BIN)/python -m pip --quiet --disable-pip-version-check install
 help:
 	@echo "make fit        fit a bundled measured target; writes report and figure to out/fit"
 	@echo "make test       ruff, basedpyright and the whole test suite"
+	@echo "make test WING=spectra  the tests of one wing and of what stands above it"
 	@echo "make test-fast  the tests that are not marked slow"
 	@echo "make mutants    random faults in the package: which of them a test notices; out/mutants.json"
 	@echo "make bench      measure speed; writes out/bench.json"
@@ -21,11 +22,12 @@ fit: .venv/.stamp-run
 	$(BIN)/jaxmuscle fit vastus-lateralis-26mvc --out out/fit
 
 test: .venv/.stamp-test
+	@$(BIN)/python tests/wings.py $(WING) >/dev/null
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
 	$(BIN)/basedpyright
 	$(BIN)/lint-imports
-	$(PYTEST)
+	$(PYTEST) `$(BIN)/python tests/wings.py $(WING)`
 
 test-fast: .venv/.stamp-test
 	$(PYTEST) -m "not slow"

@@ -28,28 +28,81 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 ROOT = Path(__file__).resolve().parents[1]
+SOURCE = ROOT / "src" / "jaxmuscle"
 SUBJECTS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
-    "muscle": (("_muscle", "_law"), ("muscle", "task", "hill", "closed_forms", "simulate", "expected")),
-    "tasks": (("_task", "_signal", "_harmonic"), ("task", "signal", "muscle", "closed_forms", "simulate", "expected")),
-    "noise": (("_noise", "_pink"), ("noise", "pink", "closed_forms", "orders", "expected", "control")),
-    "path": (("_path", "_lanes", "_simulate"), ("simulate", "orders", "closed_forms", "gradients", "control", "ensemble")),
+    "muscle": (("model/_muscle",), ("muscle", "task", "hill", "closed_forms", "simulate", "expected")),
+    "tasks": (("model/_tasks", "model/_signals"), ("task", "signal", "muscle", "closed_forms", "simulate", "expected")),
+    "noise": (("model/_noise", "model/_pink_noise"), ("noise", "pink", "closed_forms", "orders", "expected", "control")),
+    "path": (
+        ("simulation/_integrator", "simulation/_batch", "simulation/_simulate"),
+        ("simulate", "orders", "closed_forms", "gradients", "control", "ensemble"),
+    ),
     "linear response": (
-        ("_operating", "_linear", "_line", "_expected", "_sensitivity", "_static", "_scaling"),
+        (
+            "response/_equilibrium",
+            "response/_linearised",
+            "response/_harmonic_line",
+            "response/_expected",
+            "response/_sensitivity",
+            "response/_characteristics",
+            "response/_scaling",
+        ),
         ("expected", "sensitivity", "static", "scaling", "control", "fit"),
     ),
-    "spectra": (("_spectrum", "_metrics", "_estimate"), ("spectrum", "metrics", "uncertainty", "control", "simulate")),
-    "likelihood": (("_likelihood", "_climb", "_marginal", "_profile"), ("likelihood", "identify", "posterior", "goodness")),
+    "spectra": (
+        ("spectra/_welch", "spectra/_settings", "spectra/_measures", "spectra/_mean"),
+        ("spectrum", "metrics", "uncertainty", "control", "simulate"),
+    ),
+    "likelihood": (
+        (
+            "objective/_likelihood",
+            "spectra/_bin_law",
+            "objective/_scoring",
+            "uncertainty/_posterior_density",
+            "uncertainty/_profile",
+        ),
+        ("likelihood", "identify", "posterior", "goodness"),
+    ),
     "objective": (
-        ("_objective", "_problem", "_derived", "_descend", "_starts", "_search", "_uncertainty", "_check", "_harmonic_test"),
+        (
+            "objective/_moment_models",
+            "objective/_coordinates",
+            "objective/_problem",
+            "objective/_consequences",
+            "objective/_least_squares",
+            "objective/_starts",
+            "fits/_search",
+            "objective/_covariance",
+            "fits/_checks",
+            "fits/_harmonic_evidence",
+        ),
         ("uncertainty", "fit", "identify", "joint", "fitting", "goodness"),
     ),
-    "targets": (("_target", "_target_file", "_target_check", "_target_csv", "_digitised"), ("target", "digitised", "cli")),
+    "targets": (
+        ("data/_target", "data/_target_files", "data/_target_fields", "data/_target_csv", "data/_digitised"),
+        ("target", "digitised", "cli"),
+    ),
     "recordings": (
-        ("_recording", "_recording_check", "_recording_csv", "_recording_file", "_recording_formats", "_recording_table"),
+        (
+            "data/_recording",
+            "data/_recording_quality",
+            "data/_recording_csv",
+            "data/_recording_files",
+            "data/_recording_formats",
+            "data/_recording_table",
+        ),
         ("recording", "recording_file", "reproduce"),
     ),
     "ensemble store": (
-        ("_ensemble", "_ensemble_plan", "_ensemble_run", "_ensemble_store", "_ensemble_summary", "_tally", "_sweep"),
+        (
+            "ensembles/_ensemble",
+            "ensembles/_layout",
+            "ensembles/_run",
+            "ensembles/_store",
+            "ensembles/_summary",
+            "ensembles/_running_moments",
+            "ensembles/_sweep",
+        ),
         ("ensemble",),
     ),
 }
@@ -128,7 +181,16 @@ def of_file(subject: str, path: Path) -> list[Mutant]:
         for other in changed(node):
             before, after = ast.get_source_segment(text, node), ast.unparse(ast.fix_missing_locations(other))
             if before and "\n" not in before:
-                found.append(Mutant(subject, path.stem, node.lineno, node.col_offset, before, f"({after})"))
+                found.append(
+                    Mutant(
+                        subject,
+                        path.relative_to(SOURCE).with_suffix("").as_posix(),
+                        node.lineno,
+                        node.col_offset,
+                        before,
+                        f"({after})",
+                    )
+                )
     return found
 
 
@@ -136,7 +198,7 @@ def sampled(count: int, seed: int) -> list[Mutant]:
     """So many of every subject, each on a line of its own."""
     chosen = []
     for subject, (files, _) in SUBJECTS.items():
-        sites = [m for file in files for m in of_file(subject, ROOT / "src" / "jaxmuscle" / f"{file}.py")]
+        sites = [m for file in files for m in of_file(subject, SOURCE / f"{file}.py")]
         random.Random(f"{seed} {subject}").shuffle(sites)
         one_a_line = {(m.file, m.line): m for m in reversed(sites)}
         chosen += [m for m in sites if one_a_line[m.file, m.line] is m][:count]
@@ -155,9 +217,11 @@ def applied(mutant: Mutant, text: str) -> str:
 def judged(mutant: Mutant, folder: Path, seconds: float) -> dict[str, Any]:
     """Runs its tests in a copy of the project for so long; what failed first, or None."""
     path = folder / "src" / "jaxmuscle" / f"{mutant.file}.py"
-    original = (ROOT / "src" / "jaxmuscle" / f"{mutant.file}.py").read_text(encoding="utf-8")
+    original = (SOURCE / f"{mutant.file}.py").read_text(encoding="utf-8")
     path.write_text(applied(mutant, original), encoding="utf-8")
-    files = [name for test in SUBJECTS[mutant.subject][1] if (folder / (name := f"tests/test_{test}.py")).exists()]
+    files = [
+        str(file) for test in SUBJECTS[mutant.subject][1] for file in sorted((folder / "tests").rglob(f"test_{test}.py"))
+    ]
     begun, killer, ended = time.monotonic(), None, True
     try:
         for mark in ("not slow", "slow"):

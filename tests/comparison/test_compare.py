@@ -420,7 +420,7 @@ def test_a_users_mistake_is_one_line(arguments, message, tmp_path, keep_cache):
 @pytest.mark.slow
 def test_a_recording_of_each_colour_in_the_calibration(monkeypatch):
     """The program of benchmarks/colours.py, whose 900 recordings docs/noise-colour.md counts, on three of 60 s."""
-    monkeypatch.syspath_prepend(str(Path(__file__).parents[1] / "benchmarks"))
+    monkeypatch.syspath_prepend(str(Path(__file__).parents[2] / "benchmarks"))
     import colours
 
     monkeypatch.setattr(colours, "GROUPS", GROUPS)

@@ -286,7 +286,7 @@ def test_command(tmp_path):
 
 
 def benchmark():
-    path = Path(__file__).parents[1] / "benchmarks" / "calibration.py"
+    path = Path(__file__).parents[2] / "benchmarks" / "calibration.py"
     spec = importlib.util.spec_from_file_location("calibration", path)
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)

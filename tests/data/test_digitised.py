@@ -19,7 +19,7 @@ from jaxmuscle.data._digitised import read_project
 from jaxmuscle.data._target import load_target
 
 GRID = 0.390625 * np.arange(1, 31)
-DOCS = Path(__file__).parents[1] / "docs" / "digitise.md"
+DOCS = Path(__file__).parents[2] / "docs" / "digitise.md"
 # Half a pixel for the click and half for each of the two calibration points of an axis.
 PIXELS = 1.5
 

@@ -16,7 +16,7 @@ import pytest
 
 import jaxmuscle as jm
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 TARGET = "vastus-lateralis-26mvc"
 
 pytestmark = pytest.mark.slow

@@ -18,7 +18,7 @@ from jaxmuscle.commands.main import app
 from jaxmuscle.uncertainty import _posterior_checks as _mixing
 
 TRUTH = jm.Isometric().replace(harmonic_frequency=6.0, harmonic_amplitude=0.012)
-ELSEWHERE = {"docs/digitise.md": "test_digitised.py", "docs/own-muscle.md": "test_hill.py"}
+ELSEWHERE = {"docs/digitise.md": "data/test_digitised.py", "docs/own-muscle.md": "whole/test_hill.py"}
 BELOW = {"docs/gallery.md"}  # its program is read instead
 RUN_HERE = {
     "README.md", "docs/coming-from-diffrax.md", "docs/coming-from-matlab.md", "docs/ensembles.md", "docs/fit-a-csv.md",
@@ -65,7 +65,7 @@ def test_every_page_with_python_is_run():
     with_python = {pages.name_of(page) for page in pages.PAGES if pages.blocks(page)}
     assert with_python == RUN_HERE | BELOW | set(ELSEWHERE)
     for page, test in ELSEWHERE.items():
-        assert f'pages.run("{page}"' in (Path(__file__).with_name(test)).read_text(encoding="utf-8")
+        assert f'pages.run("{page}"' in (pages.ROOT / "tests" / test).read_text(encoding="utf-8")
 
 
 @pytest.fixture(scope="module", autouse=True)

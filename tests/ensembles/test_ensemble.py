@@ -435,7 +435,7 @@ def test_a_folder_that_cannot_be_written(read_only):
 
 
 def environment():
-    return os.environ | {"PYTHONPATH": str(Path(__file__).parents[1] / "src")}
+    return os.environ | {"PYTHONPATH": str(Path(__file__).parents[2] / "src")}
 
 
 @pytest.mark.slow

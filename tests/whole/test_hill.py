@@ -13,7 +13,7 @@ import scipy.optimize
 
 import jaxmuscle as jm
 
-DOCS = Path(__file__).parents[1] / "docs"
+DOCS = Path(__file__).parents[2] / "docs"
 KEY = jax.random.key(7)
 STILL = np.zeros(4)
 

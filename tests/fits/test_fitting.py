@@ -11,7 +11,7 @@ import pytest
 
 import jaxmuscle as jm
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 FITTING = ROOT / "fitting"
 EXPECTED = sorted(FITTING.glob("expected/*.json"))
 FRESH_SEED = 6  # not among those that made the expected values
