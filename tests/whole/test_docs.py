@@ -115,3 +115,16 @@ def test_the_citation_names_the_current_version():
 def test_parameter_page_is_current():
     generate = module(ROOT / "docs" / "generate.py")
     assert generate.PAGE.read_text(encoding="utf-8") == generate.page(), "run `python docs/generate.py`"
+
+
+def test_the_picture_of_the_layers_is_current():
+    architecture = module(ROOT / "docs" / "architecture.py")
+    assert architecture.PICTURE.read_text(encoding="utf-8") == architecture.picture(), "run `python docs/architecture.py`"
+    assert set(architecture.HOLDS) == {wing for row in architecture.layers() for wing in row}
+
+
+def test_files_named_on_the_page_of_the_layers_exist():
+    text = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
+    named = set(re.findall(r"`([\w/]+\.pyi?)`", text))
+    assert len(named) > 25
+    assert not [name for name in named if not ((PACKAGE / name).exists() or (ROOT / name).exists())]

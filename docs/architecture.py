@@ -1,0 +1,87 @@
+"""The picture of the layers, from the imports in the code: `python docs/architecture.py` writes docs/architecture.svg.
+
+A line from one wing down to another says that the upper one imports the lower one; it is left out where a longer way leads
+there, too. `_common` and `plot`, which all wings may use, stand at the bottom without lines.
+"""
+
+import ast
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.append(str(ROOT / "tests"))
+from wings import layers  # noqa: E402
+
+PACKAGE, PICTURE = ROOT / "src" / "jaxmuscle", Path(__file__).with_name("architecture.svg")
+UNDRAWN = ("plot", "_common")
+HOLDS = {
+    "commands": "the command line", "paper": "the paper reproduced", "uncertainty": "profile, posterior, what is known",
+    "checks": "goodness of fit, bootstrap", "comparison": "colours of noise compared", "fits": "one target, several, cohorts",
+    "objective": "residuals, likelihood, descent", "ensembles": "many seeds, stores, sweeps",
+    "simulation": "solutions of the SDE", "response": "equilibrium, linear response", "data": "targets and recordings",
+    "model": "muscle, noises, tasks", "spectra": "Welch, its law, measures", "plot": "all figures",
+    "_common": "errors, files, text, progress",
+}  # fmt: skip
+WIDTH, HEIGHT, GAP, ROW, MARGIN = 190, 54, 26, 98, 24  # pixels
+
+
+def imports() -> set[tuple[str, str]]:
+    """Which wing imports which."""
+    wings = [wing for row in layers() for wing in row]
+    found = set()
+    for wing in wings:
+        for module in (PACKAGE / wing).glob("*.py"):
+            for node in ast.walk(ast.parse(module.read_text(encoding="utf-8"))):
+                if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] == "jaxmuscle":
+                    names = [f"{node.module}.{alias.name}".split(".")[1] for alias in node.names]
+                    found |= {(wing, name) for name in names if name in wings and name != wing}
+    return found
+
+
+def nearest() -> list[tuple[str, str]]:
+    """Which wing imports which, without those that it also reaches through another."""
+    direct = {(upper, lower) for upper, lower in imports() if lower not in UNDRAWN}
+    reached = set(direct)
+    while more := {(a, d) for a, b in reached for c, d in direct if b == c} - reached:
+        reached |= more
+    between = {(a, d) for a, b in reached for c, d in reached if b == c}
+    return sorted(direct - between)
+
+
+def picture() -> str:
+    """The SVG."""
+    rows = layers()
+    wide = max(map(len, rows)) * (WIDTH + GAP) - GAP + 2 * MARGIN + 120
+    place = {}
+    for number, row in enumerate(rows):
+        left = (wide - len(row) * (WIDTH + GAP) + GAP) / 2
+        for i, wing in enumerate(row):
+            place[wing] = left + i * (WIDTH + GAP), MARGIN + number * ROW
+    lines, boxes = [], []
+    for upper, lower in nearest():
+        (x1, y1), (x2, y2) = place[upper], place[lower]
+        a, b, middle = x1 + WIDTH / 2, x2 + WIDTH / 2, HEIGHT / 2
+        if round((y2 - y1) / ROW) > 2 and a != b:  # from side to side, around what stands between
+            edge, side = (wide - 12, WIDTH) if b > a else (12, 0)
+            way = f"M{x1 + side:.0f} {y1 + middle:.0f} C{edge} {y1 + middle:.0f} {edge} {y2 + middle:.0f}"
+            lines.append(f'<path d="{way} {x2 + side:.0f} {y2 + middle:.0f}"/>')
+        else:
+            lines.append(f'<path d="M{a:.0f} {y1 + HEIGHT:.0f} L{b:.0f} {y2:.0f}"/>')
+    for wing, (x, y) in place.items():
+        boxes.append(f'<rect x="{x:.0f}" y="{y:.0f}" width="{WIDTH}" height="{HEIGHT}" rx="6"/>'
+                     f'<text x="{x + WIDTH / 2:.0f}" y="{y + 24:.0f}" class="name">{wing}</text>'
+                     f'<text x="{x + WIDTH / 2:.0f}" y="{y + 42:.0f}" class="holds">{HOLDS[wing]}</text>')  # fmt: skip
+    high = MARGIN * 2 + (len(rows) - 1) * ROW + HEIGHT
+    style = (
+        "rect{fill:#e8f0f8;stroke:#0072b2;stroke-width:1.2}path{fill:none;stroke:#777;stroke-width:1.5}"
+        "text{font-family:sans-serif;text-anchor:middle;fill:#222}.name{font-size:15px;font-weight:bold}.holds{font-size:11px}"
+    )
+    parts = [f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {wide} {high}" width="{wide}" height="{high}">',
+             f"<style>{style}</style>", '<rect width="100%" height="100%" style="fill:white;stroke:none"/>',
+             *lines, *boxes, "</svg>"]  # fmt: skip
+    return "\n".join(parts) + "\n"
+
+
+if __name__ == "__main__":
+    PICTURE.write_text(picture(), encoding="utf-8")
+    print(f"Written: {PICTURE.relative_to(ROOT)}")
