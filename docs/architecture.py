@@ -16,7 +16,7 @@ PACKAGE, PICTURE = ROOT / "src" / "jaxmuscle", Path(__file__).with_name("archite
 UNDRAWN = ("plot", "_common")
 HOLDS = {
     "commands": "the command line", "paper": "the paper reproduced", "uncertainty": "profile, posterior, what is known",
-    "checks": "goodness of fit, bootstrap", "comparison": "colours of noise compared", "fits": "one target, several, cohorts",
+    "checks": "goodness of fit, bootstrap", "comparison": "which colour of noise", "fits": "one target, several, cohorts",
     "objective": "residuals, likelihood, descent", "ensembles": "many seeds, stores, sweeps",
     "simulation": "solutions of the SDE", "response": "equilibrium, linear response", "data": "targets and recordings",
     "model": "muscle, noises, tasks", "spectra": "Welch, its law, measures", "plot": "all figures",
