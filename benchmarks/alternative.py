@@ -150,7 +150,7 @@ def fit(target: jm.Target, noise: Float[np.ndarray, "seeds points channels"]) ->
     return Fitted(values(found.x), bool(found.success), simulations)
 
 
-def check(task: jm.AbstractTask, noise: Float[np.ndarray, "seeds points channels"]) -> None:
+def check(task: jm.model.AbstractTask, noise: Float[np.ndarray, "seeds points channels"]) -> None:
     """The loop must equal jaxmuscle's simulation on the same noise, and its spectrum the expected one within its error."""
     forces = simulate({}, noise)
     grid, start = Grid(DT, STEPS, EVERY, reverse=False), round(WINDOW[0] * RATE)
@@ -168,7 +168,7 @@ def check(task: jm.AbstractTask, noise: Float[np.ndarray, "seeds points channels
         raise Unequal(f"spectrum of the numba loop: {away:.1f} standard errors from the expected one, more than {bound:.1f}")
 
 
-def _chi2(task: jm.AbstractTask, target: jm.Target) -> float:
+def _chi2(task: jm.model.AbstractTask, target: jm.Target) -> float:
     """chi² per bin of a task's expected spectrum, whichever fit found it."""
     moments = expected_moments(as_arrays(task), target.settings, WINDOW)[0]
     power, line = np.asarray(moments.power), np.asarray(moments.line)

@@ -36,12 +36,12 @@ HELD = 0.8  # share of its bin above which the harmonic's frequency is judged
 SHOWN = ("corner_frequency", "harmonic_share", "harmonic_frequency", "high_frequency_floor", "coefficient_of_variation")
 
 
-def base() -> jm.AbstractTask:
+def base() -> jm.model.AbstractTask:
     """The task whose values are the prior's centre."""
     return jm.Isometric().replace(**{name: PARAMETERS[name].default / SOFTER for name in PERTURBED})
 
 
-def truth(number: int) -> jm.AbstractTask:
+def truth(number: int) -> jm.model.AbstractTask:
     """Muscle number `number`, drawn from the prior."""
     task, rng = base(), np.random.default_rng([2026, number])
     values = {name: float(task[name]) * np.exp(rng.normal()) for name in DEFAULT_FREE}
@@ -51,7 +51,7 @@ def truth(number: int) -> jm.AbstractTask:
     return task.replace(**values)
 
 
-def recorded(task: jm.AbstractTask, number: int, seconds: float) -> jm.Target:
+def recorded(task: jm.model.AbstractTask, number: int, seconds: float) -> jm.Target:
     """One recording of it, by the nonlinear simulator, as a target."""
     key = jax.random.fold_in(jax.random.key(41), number)
     runs = jm.ensemble(jm.settled(task), key, seeds=1, duration=START + seconds, control=False)
@@ -63,7 +63,7 @@ def recorded(task: jm.AbstractTask, number: int, seconds: float) -> jm.Target:
     return jm.Target(f"truth-{number}", power, segments=segments, coefficient_of_variation=variation)
 
 
-def true_values(task: jm.AbstractTask, target: jm.Target) -> tuple[dict[str, float], float]:
+def true_values(task: jm.model.AbstractTask, target: jm.Target) -> tuple[dict[str, float], float]:
     """Derived quantities of the truth by its linear response, and the share of its bin that the harmonic holds."""
     setup = planned(base(), target).setup
     seen = seen_at(setup.linear(), theta_of(setup, task)[None])
@@ -74,7 +74,7 @@ def true_values(task: jm.AbstractTask, target: jm.Target) -> tuple[dict[str, flo
     return values | {name: float(task[name]) for name in setup.coordinates.names}, float(share[nearest]) if inside else 0.0
 
 
-def judged(number: int, target: jm.Target, result: jm.FitResult, length: tuple[int, int]) -> dict:
+def judged(number: int, target: jm.Target, result: jm.fits.FitResult, length: tuple[int, int]) -> dict:
     """What fit and posterior say of one recording, against the truth."""
     task = truth(number)
     true, share = true_values(task, target)
@@ -105,7 +105,7 @@ def run(numbers: list[int], seconds: float, out: Path, length: tuple[int, int] =
         for number in left[start : start + BATCH]:
             try:
                 targets[number] = recorded(truth(number), number, seconds)
-            except (jm.SimulationError, jm.OperatingPointError) as error:
+            except (jm.errors.SimulationError, jm.errors.OperatingPointError) as error:
                 table["failed"][str(number)] = str(error)
         with jax.enable_x64(True):
             plans = [planned(base(), target, counts=(32, None, None)) for target in targets.values()]

@@ -34,7 +34,7 @@ class Recording(NamedTuple):
 
     colour: str
     harmonic: bool
-    truth: jm.AbstractTask
+    truth: jm.model.AbstractTask
     target: jm.Target
 
 
@@ -90,7 +90,7 @@ def examined(recordings: list[Recording], colour: str, *, muscle_free: bool) -> 
     return found
 
 
-def _muscle(setup: Setup, truth: jm.AbstractTask) -> np.ndarray:
+def _muscle(setup: Setup, truth: jm.model.AbstractTask) -> np.ndarray:
     """Coordinates of the material factors at their true values."""
     task = setup.task.replace(**{name: float(truth[name]) for name in MUSCLE})
     return theta_of(setup, task)[[n in MUSCLE for n in setup.coordinates.names]]

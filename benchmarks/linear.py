@@ -65,7 +65,7 @@ def expected(repetitions: int) -> list[Row]:
     ]  # fmt: skip
 
 
-def _plain(task: jm.AbstractTask, repetitions: int) -> tuple[float, float]:
+def _plain(task: jm.model.AbstractTask, repetitions: int) -> tuple[float, float]:
     """Seeds and time [s] that a plain mean needs for a standard error of `ERROR` in the median bin, from `SEEDS` seeds."""
 
     def program():
@@ -82,7 +82,7 @@ def control(repetitions: int) -> list[Row]:
     """How much variance the linearised task on the same noise paths takes away, and what carrying it costs."""
     found: list[Row] = []
     isometric, force = jm.Isometric(), jm.PrescribedForce()
-    cases: tuple[tuple[str, jm.AbstractTask, float | None], ...] = (
+    cases: tuple[tuple[str, jm.model.AbstractTask, float | None], ...] = (
         ("preset zagrodny-slifkin", jm.load_preset("zagrodny-slifkin"), 10_000.0),
         ("Isometric, paper's noise", isometric.replace(**PAPER), None),
         ("PrescribedForce, paper's noise", force.replace(**PAPER), None),

@@ -49,7 +49,7 @@ def gradients(repetitions: int) -> list[Row]:
             scaled = {n: task[n] * jnp.exp(theta[i]) for i, n in enumerate(DEFAULT_FREE)}
             moved = task.replace(**scaled)
             path = jax.vmap(lambda z: respond(moved, moved.noise.realise(z, DT), grid, "instant")[1])(normals)
-            power = jm.spectrum_of(path, task.settings, (5.0, 15.0)).power.mean(0)
+            power = jm.spectra.spectrum_of(path, task.settings, (5.0, 15.0)).power.mean(0)
             return power / power.sum()
 
         functions = {"spectrum": spectrum, "jacfwd": jax.jacfwd(spectrum), "jacrev": jax.jacrev(spectrum)}

@@ -39,7 +39,7 @@ ratio: noise and harmonic amplitudes are fractions of the coefficient at rest.
 
 The table by name, a dictionary of `Parameter`.
 
-::: jaxmuscle.Parameter
+::: jaxmuscle.model.Parameter
 """
 POWERS = str.maketrans("23", "²³")
 

@@ -78,7 +78,7 @@ def tendon_strain(force):
     return TOE * jnp.log1p(carried)
 
 
-class HillMuscle(jm.AbstractMuscle):
+class HillMuscle(jm.model.AbstractMuscle):
     """Contractile and parallel elastic element (the active tissue) in series with a tendon (the passive tissue).
 
         active_force  = P_0 - [a F_max f_L(λ) f_V(ν) + F_max f_P(λ)] cos α + ΔK_w x_w + ΔC_w x_w'
@@ -198,7 +198,7 @@ def figure(seeds=64):
     """The muscle's three curves, and the spectrum of its isometric force: simulated and in linear response."""
     fig, axes = plt.subplots(2, 2, figsize=(8.0, 5.8), layout="constrained")
     task = held_task()
-    x_w = float(jm.equilibrium(task)[0])
+    x_w = float(jm.response.equilibrium(task)[0])
     _draw_length(axes[0, 0], task.muscle, x_w)
     _draw_velocity(axes[0, 1])
     _draw_tendon(axes[1, 0], task.muscle, x_w - task.x_z)

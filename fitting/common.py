@@ -31,7 +31,7 @@ def load(name: str, options: argparse.Namespace) -> jm.Target:
     return jm.load_target(name)
 
 
-def report(result: jm.FitResult, name: str, out: Path | None) -> None:
+def report(result: jm.fits.FitResult, name: str, out: Path | None) -> None:
     """Print the result and write `fit.json` and `fit.png`."""
     folder = out or Path("out/fitting") / name
     folder.mkdir(parents=True, exist_ok=True)
@@ -41,12 +41,12 @@ def report(result: jm.FitResult, name: str, out: Path | None) -> None:
     print(f"written: {folder}/fit.json, fit.png")
 
 
-def rounded(task: jm.AbstractTask, names: Iterable[str]) -> jm.AbstractTask:
+def rounded(task: jm.model.AbstractTask, names: Iterable[str]) -> jm.model.AbstractTask:
     """The named values to four significant digits."""
     return task.replace(**{name: float(f"{float(task[name]):.4g}") for name in names})
 
 
-def distance(task: jm.AbstractTask, target: jm.Target) -> float:
+def distance(task: jm.model.AbstractTask, target: jm.Target) -> float:
     """Root mean square of the log ratio between the mean spectrum of 200 seeds and a target."""
     power = jm.ensemble(task, jax.random.key(1), seeds=200).spectrum().mean().proportional
     return float(np.std(np.log(np.asarray(power)) - np.log(target.proportional_power)))

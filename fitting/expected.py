@@ -21,7 +21,7 @@ SEEDS = (1, 2, 3, 4, 5)
 WHY = "3 times the largest deviation among fresh seeds 1 to 5, at least 2 % of the median (see fitting/README.md)"
 
 
-def values(result: jm.FitResult) -> dict[str, float]:
+def values(result: jm.fits.FitResult) -> dict[str, float]:
     """Free parameters, derived quantities and chi2 per bin of a fit."""
     found = {name: p.value for name, p in result.parameters.items() if p.free}
     found |= {f"derived.{name}": p.value for name, p in result.derived.items() if p.free}

@@ -6,7 +6,7 @@ from common import arguments, load, report
 NAME = "fdi-abduction-45mvc"
 
 
-def fit(target: jm.Target, seed: int = 0) -> jm.FitResult:
+def fit(target: jm.Target, seed: int = 0) -> jm.fits.FitResult:
     """All default parameters free, band-limited noise."""
     return jm.fit(jm.task_for(target), target, key=seed)
 

@@ -17,7 +17,7 @@ START = {"m_w": 0.1, "k_w": 1.25e6, "k_z": 1.25e6, "c_w": 2.0, "c_z": 130.0, "F_
 PAPER_NOISE = {"K_w": 0.0016, "K_z": 0.0016, "C_w": 1e-4, "C_z": 1e-4}
 
 
-def fit(target: jm.Target, seed: int = 0) -> jm.FitResult:
+def fit(target: jm.Target, seed: int = 0) -> jm.fits.FitResult:
     """Stiffness, damping and harmonic amplitude free."""
     task = jm.PrescribedMotion(noise=jm.BandLimitedNoise(PAPER_NOISE), settings=target.settings).replace(**START)
     return jm.fit(task, target, free=FREE, key=seed)

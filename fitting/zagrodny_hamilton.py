@@ -16,10 +16,10 @@ BESIDE = "zagrodny-slifkin"
 FREE = ("k_w", "c_w", "c_z", "harmonic_amplitude")
 BOUNDS = {"c_z": (10.0, 100.0), "harmonic_amplitude": (1e-5, 5e-4)}
 START = {"x_ref_w": 0.005, "k_w": 2e6, "c_z": 80.0, "harmonic_amplitude": 4e-4}
-ENVELOPE = jm.Decay(level=1.0, final=0.3, start=5.0, time_constant=3.0)
+ENVELOPE = jm.model.Decay(level=1.0, final=0.3, start=5.0, time_constant=3.0)
 
 
-def fit(target: jm.Target, seed: int = 0) -> jm.FitResult:
+def fit(target: jm.Target, seed: int = 0) -> jm.fits.FitResult:
     """Active stiffness, damping and harmonic amplitude free; masses, noise and load those of `zagrodny-slifkin`."""
     task = jm.load_preset(BESIDE).with_parts(harmonic=jm.Harmonic(frequency=0.391, envelope=ENVELOPE))
     return jm.fit(task.replace(**START), target, free=FREE, bounds=BOUNDS, key=seed)

@@ -293,7 +293,7 @@ def test_several_targets_have_a_folder_each(tmp_path, monkeypatch):
     def fake(targets, *, task, noise, **options):
         seen.append((task, noise))
         a, b = targets
-        return jm.CohortResult({a.name: made_result(target=a), b.name: failed_result()}, {}, {})
+        return jm.fits.CohortResult({a.name: made_result(target=a), b.name: failed_result()}, {}, {})
 
     monkeypatch.setattr(_cohort, "fit_cohort", fake)
     paths = [csv_file(tmp_path, name=f"{name}.csv") for name in "ab"]
@@ -342,7 +342,7 @@ def test_a_failing_simulation_is_not_a_users_mistake(tmp_path, monkeypatch):
     from jaxmuscle.ensembles import _ensemble as _ensemble
 
     def explode(*_, **__):
-        raise jm.SimulationError("3 seed(s) did not stay finite [0, 1, 2]")
+        raise jm.errors.SimulationError("3 seed(s) did not stay finite [0, 1, 2]")
 
     monkeypatch.setattr(_ensemble, "ensemble", explode)
     made_result().save(tmp_path / "fit.json")
@@ -355,7 +355,7 @@ def test_a_failing_simulation_is_not_a_users_mistake(tmp_path, monkeypatch):
 
 def test_an_interrupted_fit_writes_what_had_been_reached(tmp_path, monkeypatch):
     def interrupted(*_, **__):
-        raise jm.FitInterrupted(made_result(success=False, message="interrupted after 3 steps"))
+        raise jm.fits.FitInterrupted(made_result(success=False, message="interrupted after 3 steps"))
 
     monkeypatch.setattr(_fit, "fit", interrupted)
     outcome = run("fit", csv_file(tmp_path), "--out", tmp_path / "out")

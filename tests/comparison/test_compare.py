@@ -238,7 +238,7 @@ def made(*, disagree=False, sigma=False, success=True):
     rows = _compare._rows(found)
     tasks = {(row.noise, row.harmonic): true_task(row.noise) for row in rows}
     fitted = {model: target.proportional_power for model in tasks}
-    return jm.Comparison(target, rows, {"white": "WhiteNoise on K_z cannot"}, tasks, fitted, 12.8, GROUPS, 0)
+    return jm.comparison.Comparison(target, rows, {"white": "WhiteNoise on K_z cannot"}, tasks, fitted, 12.8, GROUPS, 0)
 
 
 def test_differences_and_weights():

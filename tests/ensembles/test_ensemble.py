@@ -143,7 +143,7 @@ def test_what_breaks_is_left_out_and_named():
     runs = jm.ensemble(BRITTLE, KEY, seeds=40, reduce=True, **SHORT)
     assert 3 < len(runs.failed) < 37  # else the test shows nothing
     broken = runs.failed[:, 1]
-    with pytest.raises(jm.SimulationError, match=f"{len(broken)} seed.*{broken[0]}, {broken[1]}"):
+    with pytest.raises(jm.errors.SimulationError, match=f"{len(broken)} seed.*{broken[0]}, {broken[1]}"):
         jm.ensemble(BRITTLE, KEY, seeds=40, **SHORT)
     kept = np.setdiff1d(np.arange(40), broken)
     whole = jm.ensemble(BRITTLE, KEY, seeds=kept, **SHORT)
@@ -154,7 +154,7 @@ def test_what_breaks_is_left_out_and_named():
 def test_where_nothing_is_left_nothing_is_said():
     limit = {"amplitude": 50.0, "relative": False}
     broken = Brittle(noise=jm.BandLimitedNoise(**limit), harmonic=jm.Harmonic(0.0))
-    with pytest.raises(jm.SimulationError, match="none of the first seeds of point 0 stayed finite"):
+    with pytest.raises(jm.errors.SimulationError, match="none of the first seeds of point 0 stayed finite"):
         jm.ensemble(broken, KEY, seeds=40, reduce=True, **SHORT)
     whole = jm.ensemble(broken, KEY, seeds=8, reduce=True, **SHORT)
     assert len(whole.failed) == 8 and np.isnan(whole.mean).all() and np.isnan(whole.quantile).all()
@@ -334,7 +334,7 @@ def test_an_interrupted_store_is_resumed(tmp_path, monkeypatch, reduce):
         ({"duration": 1.1}, "duration = 1.0 there, 1.1 here"),
         ({"chunk": 16}, "chunk = 8 there, 16 here"),
         ({"reduce": True}, 'kind = "trajectories" there, "reduced" here'),
-        ({"task": TASK.with_parts(P_w=jm.RampHold(5.0, 0.1, 0.2, 0.1))}, "inputs and everything else"),
+        ({"task": TASK.with_parts(P_w=jm.model.RampHold(5.0, 0.1, 0.2, 0.1))}, "inputs and everything else"),
     ],
     ids=lambda value: "" if isinstance(value, str) else next(iter(value)),
 )

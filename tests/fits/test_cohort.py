@@ -124,7 +124,7 @@ def test_the_figure(by):
 
 def made_cohort(**groups):
     result = made_result()
-    return jm.CohortResult({name: result for name in groups}, {name: g for name, g in groups.items() if g}, {})
+    return jm.fits.CohortResult({name: result for name in groups}, {name: g for name, g in groups.items() if g}, {})
 
 
 def test_tables_hold_every_quantity_of_every_target():
@@ -175,10 +175,10 @@ def test_bad_arguments(targets, options, message):
 
 
 def test_the_printed_table_fits_80_columns_and_shortens_no_number(monkeypatch):
-    small = jm.Estimate(1.99e-4, "1", 6e-5, False, True)
+    small = jm.fits.Estimate(1.99e-4, "1", 6e-5, False, True)
     result = made_result(derived={name: small for name in _cli_cohort.SHOWN})
     names = {"vastus-lateralis-26mvc": "knee", "fdi-abduction-45mvc": "finger"}
-    cohort = jm.CohortResult(dict.fromkeys(names, result), names, {})
+    cohort = jm.fits.CohortResult(dict.fromkeys(names, result), names, {})
     console = Console(width=80, file=io.StringIO(), color_system=None)
     monkeypatch.setattr(_cli_cohort, "out", console)
     _cli_cohort._show(cohort, Path("out"))

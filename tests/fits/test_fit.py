@@ -77,7 +77,7 @@ def test_welch_operator_is_the_spectrum(x64, changes):
     operator = welch_operator(settings, samples, window)
     bins = settings.last_bin - settings.first_bin + 1
     power = np.sum((x @ operator.T).reshape(2, -1, bins) ** 2, axis=1)
-    expected = np.asarray(jm.spectrum_of(x, settings, window).power)
+    expected = np.asarray(jm.spectra.spectrum_of(x, settings, window).power)
     # Rounding relative to the largest power: small bins are differences of large numbers.
     np.testing.assert_allclose(power, expected, rtol=1e-9, atol=1e-13 * expected.max())
 
@@ -111,7 +111,7 @@ def test_moments_are_those_of_a_plain_ensemble(x64, task, colour_free):
     moments = eqx.filter_jit(model.moments)(as_arrays(task))
 
     def powers(signal):
-        return np.asarray(jm.spectrum_of(signal, task.settings, WINDOW).power)[..., chosen]
+        return np.asarray(jm.spectra.spectrum_of(signal, task.settings, WINDOW).power)[..., chosen]
 
     output = np.asarray(runs.output)
     line, random = powers(quiet), powers(output - quiet)
@@ -355,7 +355,7 @@ def test_linear_and_cumulative_residuals_are_in_standard_deviations(x64):
     n = 256 + 11 * 128
     density = np.interp(np.fft.rfftfreq(8 * n, 0.01), target.frequency, target.proportional_power)
     x = np.fft.irfft(np.fft.rfft(rng.standard_normal((500, 8 * n))) * np.sqrt(density))[:, :n]
-    power = np.asarray(jm.spectrum_of(x, target.settings.replace(filter_cutoff="none")).power)
+    power = np.asarray(jm.spectra.spectrum_of(x, target.settings.replace(filter_cutoff="none")).power)
     p = power / power.sum(axis=1, keepdims=True)
     for kind, value in (("linear", p), ("cumulative", np.cumsum(p, axis=1))):
         ratio = value.std(axis=0) / residual_sigma(kind, target, statistics)
@@ -575,7 +575,7 @@ def literal():
 
 @pytest.mark.slow
 def test_without_linear_response_only_monte_carlo_fits():
-    with pytest.raises(jm.OperatingPointError, match="undamped: eigenvalues"):
+    with pytest.raises(jm.errors.OperatingPointError, match="undamped: eigenvalues"):
         jm.fit(literal(), simple_target(), free=("k_w", "noise_K_w"), **QUICK)
     found = jm.fit(literal(), simple_target(), free=("k_w", "noise_K_w"), method="montecarlo", **QUICK)
     assert np.all(np.isfinite(found.fitted)) and len(found.starts) == 2
@@ -638,7 +638,7 @@ def test_an_interrupted_fit_holds_what_had_been_reached(stage):
             count = 3
             raise KeyboardInterrupt
 
-    with pytest.raises(jm.FitInterrupted) as caught:
+    with pytest.raises(jm.fits.FitInterrupted) as caught:
         jm.fit(jm.Isometric(), simple_target(), free=FEW, progress=interrupt, **QUICK)
     result = caught.value.result
     assert not result.success and "interrupted after 2 steps" in result.message
@@ -652,7 +652,7 @@ def test_an_interruption_before_the_first_step_has_no_result():
 
     with pytest.raises(KeyboardInterrupt) as caught:
         jm.fit(jm.Isometric(), simple_target(), free=FEW, progress=interrupt, **QUICK)
-    assert not isinstance(caught.value, jm.FitInterrupted)
+    assert not isinstance(caught.value, jm.fits.FitInterrupted)
 
 
 def test_a_start_in_the_stiff_region_survives(x64):

@@ -87,7 +87,7 @@ def test_the_preset_has_the_papers_amplitudes():
 
 @pytest.mark.slow
 def test_the_preset_shows_the_papers_two_maxima(paper_force):
-    found = jm.peaks(paper_force.mean())
+    found = jm.spectra.peaks(paper_force.mean())
     assert found.maximum.bin == 1
     assert [peak.bin for peak in found.local_maxima] == [11]
 

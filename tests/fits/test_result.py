@@ -14,6 +14,7 @@ import tomli_w
 import jaxmuscle as jm
 from jaxmuscle._common.errors import PresetError, ResultError
 from jaxmuscle._common.files import replacing, write_json, write_text
+from jaxmuscle.fits import Estimate
 from jaxmuscle.fits._result import FORMAT, Start
 from jaxmuscle.model._presets import task_from_table, task_to_table
 
@@ -21,11 +22,11 @@ POWER = 1 / (1 + np.arange(1, 31) ** 2)
 TARGET = jm.Target("made", POWER, segments=[6, 7], coefficient_of_variation=0.02, notices=["a notice"])
 
 
-def made_result(**changes: Any) -> jm.FitResult:
+def made_result(**changes: Any) -> jm.fits.FitResult:
     """A result with a value in every field, as a fit would give; nothing is simulated."""
     task = jm.Isometric().replace(c_w=50.0 / 3, harmonic_phase=-0.1)
     parameters = {
-        name: jm.Estimate(float(value), "N", 0.1 / 3 if name == "c_w" else None, name in ("c_w", "k_w"), name != "k_w")
+        name: Estimate(float(value), "N", 0.1 / 3 if name == "c_w" else None, name in ("c_w", "k_w"), name != "k_w")
         for name, value in task.parameters.items()
     }
     rng = np.random.default_rng(0)
@@ -36,7 +37,10 @@ def made_result(**changes: Any) -> jm.FitResult:
         "target": TARGET,
         "method": "montecarlo",
         "parameters": parameters,
-        "derived": {"corner_frequency": jm.Estimate(1 / 3, "Hz", 0.01), "K_w0": jm.Estimate(200.0, "N/m", None, False)},
+        "derived": {
+            "corner_frequency": Estimate(1 / 3, "Hz", 0.01),
+            "K_w0": Estimate(200.0, "N/m", None, False),
+        },
         "correlation": {"parameters": ["k_w", "c_w"], "matrix": [[1.0, -0.5], [-0.5, 1.0]]},
         "undetermined": ("k_w by itself",),
         "singular_values": np.array([12.0, 1 / 3]),
@@ -56,14 +60,14 @@ def made_result(**changes: Any) -> jm.FitResult:
         "settings": {"free": ["k_w", "c_w"], "starts": 2, "bounds": {"k_w": [1.0, 2e6]}, "mean_force": None},
         "versions": {"jaxmuscle": "0.1", "jax": "0.8"},
     } | changes
-    return jm.FitResult(**fields)
+    return jm.fits.FitResult(**fields)
 
 
 def failed_result():
     """What a fit gives whose every start explodes."""
     nothing = np.full(30, np.nan)
     return made_result(
-        success=False, message="no start has a finite spectrum", derived={"mean": jm.Estimate(np.nan, "N")},
+        success=False, message="no start has a finite spectrum", derived={"mean": Estimate(np.nan, "N")},
         correlation={}, undetermined=(), singular_values=np.full(2, np.nan), chi2_per_bin=None, rms_log_error=None,
         fitted=nothing, harmonic_share=nothing, residual=nothing, deviation=None,
         stretch=(np.zeros(0), np.zeros(0)), profile=None, harmonic_p_value=None, check={}, seed=None,
@@ -250,11 +254,11 @@ NOISES = {
     "ornstein-uhlenbeck": jm.OrnsteinUhlenbeckNoise([1.0, 2.0, 0.0, 0.0], 0.07, relative=False),
 }
 ENVELOPES = {
-    "constant": jm.Constant(1.0),
-    "step": jm.SmoothStep(0.5, start=6.0, initial=1.0),
-    "ramp": jm.RampHold(0.5, 6.0, 4.0, 0.5, 1.0),
-    "decay": jm.Decay(1.0, 0.2, 7.0, 2.0),
-    "sampled": jm.Sampled.through(np.linspace(0, 15, 7), np.array([1.0, 2, 1, 2, 1, 2, 1])),
+    "constant": jm.model.Constant(1.0),
+    "step": jm.model.SmoothStep(0.5, start=6.0, initial=1.0),
+    "ramp": jm.model.RampHold(0.5, 6.0, 4.0, 0.5, 1.0),
+    "decay": jm.model.Decay(1.0, 0.2, 7.0, 2.0),
+    "sampled": jm.model.Sampled.through(np.linspace(0, 15, 7), np.array([1.0, 2, 1, 2, 1, 2, 1])),
 }
 
 
@@ -279,8 +283,8 @@ def test_every_task_survives_saving(kind, noise, envelope, tmp_path):
 
 def test_laws_initial_state_and_inputs_survive_saving(tmp_path):
     task = jm.PrescribedForce(
-        P_w=jm.RampHold(4.0),
-        F_ext=jm.Sampled.through(np.linspace(0, 15, 7), np.arange(7.0)),
+        P_w=jm.model.RampHold(4.0),
+        F_ext=jm.model.Sampled.through(np.linspace(0, 15, 7), np.arange(7.0)),
         initial=(1 / 3, 0.0, 0.0, -0.1),
         muscle=jm.Muscle(argument="elongation"),
     )
@@ -304,7 +308,7 @@ def test_a_preset_holds_description_and_fit(tmp_path):
     assert table["description"] == "what" and table["fit"] == {"target": "t", "seed": 1}
 
 
-class Own(jm.AbstractLaw):
+class Own(jm.model.AbstractLaw):
     k: float = 1.0
     smoothness = 9
 

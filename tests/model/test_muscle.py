@@ -17,7 +17,7 @@ TASKS = (jm.PrescribedMotion, jm.PrescribedForce, jm.Isometric)
 STILL = np.zeros(4)
 
 
-class Tendon(jm.AbstractLaw):
+class Tendon(jm.model.AbstractLaw):
     """Exponential toe region: `K(x) = stiff exp(toe x)`."""
 
     stiff: Scalar = 200.0
@@ -35,7 +35,7 @@ def random_states(count=20):
 
 @pytest.mark.parametrize("argument", ["literal", "elongation"])
 def test_equations_1_and_2(x64, argument):
-    task = jm.PrescribedForce(jm.Constant(3.0), jm.Constant(-0.7), muscle=jm.Muscle(argument=argument))
+    task = jm.PrescribedForce(jm.model.Constant(3.0), jm.model.Constant(-0.7), muscle=jm.Muscle(argument=argument))
     for y, u in random_states():
         a_w, a_z = references.accelerations(MUSCLE, y, 3.0, -0.7, u, argument)
         field = task.vector_field(0.3, jnp.asarray(y), jnp.asarray(u))
@@ -53,7 +53,7 @@ def test_the_arguments_differ(x64):
 
 def test_isometric_is_the_same_muscle_with_its_insertion_held(x64):
     held = 0.004
-    task = jm.Isometric(jm.Constant(3.0), held)
+    task = jm.Isometric(jm.model.Constant(3.0), held)
     for y, u in random_states():
         state = np.array([y[0], y[1], held, 0.0])
         # Held means x_z'' = 0, so that (1b) gives the force at the sensor.
@@ -67,7 +67,7 @@ def test_isometric_is_the_same_muscle_with_its_insertion_held(x64):
 @pytest.mark.parametrize("argument", ["literal", "elongation"])
 @pytest.mark.parametrize("c_z, v_ref_z", [(5.0, 1.0), (500.0, 0.1)])
 def test_contraction_velocity_inverts_passive_force(x64, argument, c_z, v_ref_z):
-    damping = jm.QuadraticDamping(c_z, v_ref_z)
+    damping = jm.model.QuadraticDamping(c_z, v_ref_z)
     muscle = jm.Muscle(damping_z=damping, argument=argument)
     for y, u in random_states():
         x_w, _, x_z, v_z = map(jnp.asarray, y)
@@ -96,7 +96,7 @@ def test_a_custom_law_is_a_parameter_in_replace_and_simulate(x64):
 
 
 def test_a_custom_law_may_reuse_a_table_name():
-    class Toe(jm.AbstractLaw):
+    class Toe(jm.model.AbstractLaw):
         k: Scalar = default("k_z")
 
         def __call__(self, q):
@@ -109,7 +109,7 @@ def test_a_custom_law_may_reuse_a_table_name():
 
 @pytest.mark.slow
 def test_a_whole_own_muscle_runs_in_every_task():
-    class Linear(jm.AbstractMuscle):
+    class Linear(jm.model.AbstractMuscle):
         m_w: Scalar = 0.5
         m_z: Scalar = 0.4
         stiff: Scalar = 150.0
@@ -143,7 +143,7 @@ def test_a_mass_must_be_positive(field, value):
 
 
 def test_factors_must_not_be_negative():
-    for law, name in ((jm.QuadraticStiffness, "k = -1"), (jm.QuadraticDamping, "c = -1")):
+    for law, name in ((jm.model.QuadraticStiffness, "k = -1"), (jm.model.QuadraticDamping, "c = -1")):
         with pytest.raises(ValueError, match=name):
             law(-1.0)
         with pytest.raises(ValueError, match="_ref = -2"):
@@ -234,7 +234,7 @@ def test_with_parts_and_as_task_keep_what_they_do_not_name():
     other = task.with_parts(harmonic=jm.Harmonic(0.02, 5.0))
     assert other["harmonic_frequency"] == 5.0 and other["F_ext"] == 7.0 and other["noise_K_w"] == 0.02
     assert task["harmonic_frequency"] == 6.0
-    turned = task.as_task(jm.PrescribedForce, P_w=jm.Constant(2.0))
+    turned = task.as_task(jm.PrescribedForce, P_w=jm.model.Constant(2.0))
     assert isinstance(turned, jm.PrescribedForce)
     assert turned["P_w"] == 2.0 and turned["F_ext"] == PARAMETERS["F_ext"].default
     assert eqx.tree_equal(turned.muscle, task.muscle) and eqx.tree_equal(turned.noise, task.noise)

@@ -9,15 +9,16 @@ import references
 import scipy.interpolate
 
 import jaxmuscle as jm
+from jaxmuscle.model import Constant, Decay, RampHold, Sampled, SmoothStep
 from jaxmuscle.model._signals import Tabulated, derivatives
 
 TIMES = np.linspace(0.0, 6.0, 25)
 CASES = {
-    "constant": (jm.Constant(2.0), 6, []),
-    "step": (jm.SmoothStep(2.0, 0.7, 1.3, -1.0), 3, [0.7, 2.0]),
-    "ramp": (jm.RampHold(2.0, 0.5, 2.0, 0.3, -1.0), 3, [0.5, 0.8, 2.2, 2.5]),
-    "decay": (jm.Decay(2.0, 0.5, 1.0, 0.8), 1, [1.0]),
-    "sampled": (jm.Sampled.through(TIMES, np.sin(3 * TIMES)), 4, list(TIMES[3:-3:4])),
+    "constant": (Constant(2.0), 6, []),
+    "step": (SmoothStep(2.0, 0.7, 1.3, -1.0), 3, [0.7, 2.0]),
+    "ramp": (RampHold(2.0, 0.5, 2.0, 0.3, -1.0), 3, [0.5, 0.8, 2.2, 2.5]),
+    "decay": (Decay(2.0, 0.5, 1.0, 0.8), 1, [1.0]),
+    "sampled": (Sampled.through(TIMES, np.sin(3 * TIMES)), 4, list(TIMES[3:-3:4])),
 }
 
 
@@ -40,7 +41,7 @@ def test_as_many_derivatives_are_continuous_as_claimed_and_no_more(x64, name):
 
 
 @pytest.mark.parametrize("precision", ["float32", "float64"])
-@pytest.mark.parametrize("signal", [jm.RampHold(1.0), jm.RampHold(2.0, 0.3, 1.7, 0.3), jm.SmoothStep(), jm.Decay()])
+@pytest.mark.parametrize("signal", [RampHold(1.0), RampHold(2.0, 0.3, 1.7, 0.3), SmoothStep(), Decay()])
 def test_the_slope_is_not_lost_at_a_joint(signal, precision):
     """On a grid that hits the joints, compiled, as in a simulation; there, pieces were once counted twice or not."""
     with jax.enable_x64(precision == "float64"):
@@ -71,7 +72,7 @@ def test_derivatives_are_those_of_finite_differences(x64, name):
 
 def test_a_step_is_the_incomplete_beta_function(x64):
     t = np.linspace(0, 3, 50)
-    signal = jm.SmoothStep(2.5, 0.5, 1.0)
+    signal = SmoothStep(2.5, 0.5, 1.0)
     np.testing.assert_allclose(signal(t), references.smooth_step(t, 2.5), atol=1e-12)
 
 
@@ -79,7 +80,7 @@ def test_ends_are_reached_and_held_exactly():
     for dtype in (np.float32, np.float64):
         with jax.enable_x64(dtype == np.float64):
             eps = float(np.finfo(dtype).eps)
-            for signal in (jm.SmoothStep(0.01, 0.5, 1.0, 0.002), jm.RampHold(0.01, 0.5, 2.0, 0.2, 0.002)):
+            for signal in (SmoothStep(0.01, 0.5, 1.0, 0.002), RampHold(0.01, 0.5, 2.0, 0.2, 0.002)):
                 before, after = (np.asarray(signal(jnp.asarray(t))) for t in ([0.0, 0.25, 0.5], [2.5, 3.0, 15.0]))
                 np.testing.assert_array_equal(before, np.asarray(0.002, dtype))
                 # Rounding of the times, 15 s at most, over a ramp of 1.8 s.
@@ -87,14 +88,14 @@ def test_ends_are_reached_and_held_exactly():
 
 
 def test_the_ramp_is_straight_between_its_corners(x64):
-    signal = jm.RampHold(3.0, 0.5, 2.0, 0.2, 1.0)
+    signal = RampHold(3.0, 0.5, 2.0, 0.2, 1.0)
     t = np.linspace(0.71, 2.29, 20)
     # The rounded ramp runs through the middle (1.5 s, 2.0) with slope (level - initial) / (ramp - corner).
     np.testing.assert_allclose(signal(t), 2.0 + (t - 1.5) * 2.0 / 1.8, rtol=1e-12)
 
 
 def test_decay_is_its_formula(x64):
-    signal = jm.Decay(2.0, 0.5, 1.0, 0.8)
+    signal = Decay(2.0, 0.5, 1.0, 0.8)
     p = 1.7 / 0.8
     np.testing.assert_allclose(signal(2.7), 0.5 + 1.5 * (2 * np.exp(-p) - np.exp(-2 * p)), rtol=1e-13)
     np.testing.assert_allclose([signal(0.3), signal(1.0), signal(100.0)], [2.0, 2.0, 0.5], rtol=1e-13)
@@ -105,7 +106,7 @@ def test_samples_give_scipys_spline(x64):
     rng = np.random.default_rng(0)
     times = np.cumsum(rng.uniform(0.05, 0.2, 30))
     values = rng.normal(size=30)
-    signal = jm.Sampled.through(times, values)
+    signal = Sampled.through(times, values)
     spline = scipy.interpolate.make_interp_spline(times, values, k=5)
     t = rng.uniform(times[0], times[-1], 200)
     np.testing.assert_allclose(signal(t[0]), spline(t[0]), rtol=1e-9)
@@ -123,14 +124,14 @@ def test_a_spline_follows_a_smooth_function_to_sixth_order(x64):
     errors = []
     for points in (31, 61):
         times = np.linspace(0.0, 3.0, points)
-        signal = jm.Sampled.through(times, np.exp(np.sin(3 * times)))
+        signal = Sampled.through(times, np.exp(np.sin(3 * times)))
         errors.append(np.abs(jax.jit(jax.vmap(signal))(middle) - np.exp(np.sin(3 * middle))).max())
     # Degree five: order 6; between 5.5 and 7 since two grids fit a slope with an accidental part.
     assert 5.5 < np.log2(errors[0] / errors[1]) < 7.0
 
 
 def test_level_scales_a_sampled_signal():
-    task = jm.PrescribedForce(jm.Sampled.through(TIMES, np.sin(TIMES)))
+    task = jm.PrescribedForce(Sampled.through(TIMES, np.sin(TIMES)))
     doubled = task.replace(P_w=2.0)
     assert isinstance(doubled, jm.PrescribedForce)
     np.testing.assert_allclose(doubled.P_w(1.0), 2 * np.sin(1.0), rtol=1e-3)
@@ -146,13 +147,13 @@ def user_view():
 
 def test_impossible_signals_are_refused(user_view):
     with pytest.raises(ValueError, match=r"rise = 0.0 s: a step without rise time .* give rise > 0"):
-        jm.SmoothStep(rise=0.0)
+        SmoothStep(rise=0.0)
     with pytest.raises(ValueError, match=r"corner = 0.0 s must be positive"):
-        jm.RampHold(corner=0.0)
+        RampHold(corner=0.0)
     with pytest.raises(ValueError, match=r"corner = 1.1 s must be at most half the ramp 2.0 s"):
-        jm.RampHold(ramp=2.0, corner=1.1)
+        RampHold(ramp=2.0, corner=1.1)
     with pytest.raises(ValueError, match=r"time_constant = 0.0 s must be positive"):
-        jm.Decay(time_constant=0.0)
+        Decay(time_constant=0.0)
     for times, values in (
         (np.arange(5.0), np.arange(5.0)),
         (np.arange(8.0), np.arange(7.0)),
@@ -160,7 +161,7 @@ def test_impossible_signals_are_refused(user_view):
         (np.arange(7.0), np.array([0, 1, np.nan, 0, 0, 0, 0])),
     ):
         with pytest.raises(ValueError, match="times"):
-            jm.Sampled.through(times, values)
+            Sampled.through(times, values)
 
 
 @pytest.mark.parametrize("precision", ["float32", "float64"])
@@ -176,5 +177,5 @@ def test_a_table_gives_its_signal_and_two_derivatives_at_every_grid_point(name, 
         ):
             np.testing.assert_array_equal(seen, exact)
         # and with respect to what the signal itself depends on
-        slope = jax.grad(lambda level: Tabulated.of(jm.SmoothStep(level), interval, 9000)(2.0))(3.0)
+        slope = jax.grad(lambda level: Tabulated.of(SmoothStep(level), interval, 9000)(2.0))(3.0)
         np.testing.assert_allclose(slope, 1.0, rtol=1e-6)

@@ -8,6 +8,7 @@ import references
 
 import jaxmuscle as jm
 from jaxmuscle._common.errors import OperatingPointError
+from jaxmuscle.model import Constant, Decay, RampHold, SmoothStep
 from jaxmuscle.response._equilibrium import operating_point
 
 KEY = jax.random.key(3)
@@ -54,14 +55,14 @@ def test_motion_needs_damping_of_the_passive_tissue():
 
 def test_motion_needs_smooth_inputs():
     with pytest.raises(ValueError, match="x_z is a Decay with 1 continuous derivatives; PrescribedMotion needs 3"):
-        jm.PrescribedMotion(jm.Decay(0.01))
-    jm.PrescribedMotion(jm.RampHold(0.01), jm.Decay(5.0))
+        jm.PrescribedMotion(Decay(0.01))
+    jm.PrescribedMotion(RampHold(0.01), Decay(5.0))
 
 
 @pytest.mark.parametrize("t", [0.2, 0.8, 1.2, 5.0])
 def test_the_output_of_motion_is_equation_1a(x64, t):
     """P_w = m_w x_w'' + C_w x_w' + K_w x_w + m_z x_z'' + F_ext, x_w'' by differences of a NumPy x_w'(t, x_w, u)."""
-    task = jm.PrescribedMotion(jm.SmoothStep(0.01), jm.SmoothStep(6.0, 0.3, 1.2)).replace(c_z=8.0, m_z=0.7, k_z=4e5)
+    task = jm.PrescribedMotion(SmoothStep(0.01), SmoothStep(6.0, 0.3, 1.2)).replace(c_z=8.0, m_z=0.7, k_z=4e5)
     p = {name: float(value) for name, value in task.parameters.items()}
     rng = np.random.default_rng(5)
 
@@ -125,7 +126,7 @@ def test_without_noise_everything_settles_at_the_roots_of_the_statics(x64, task,
     # The slowest mode decays as e^{-3 t} or faster: over 13 s by 1e-17.
     np.testing.assert_allclose(run.states[-1], states, rtol=1e-6, atol=1e-12)
     np.testing.assert_allclose(run.output[-1], output, rtol=1e-6)
-    np.testing.assert_allclose(jm.equilibrium(task), states, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(jm.response.equilibrium(task), states, rtol=1e-9, atol=1e-12)
 
 
 def test_without_external_force_both_tissues_move_together(x64):
@@ -142,7 +143,7 @@ def test_an_operating_point_that_does_not_exist_is_an_error():
 
 
 def test_eigenvalues_at_rest_are_those_of_the_linear_chain(x64):
-    task = jm.PrescribedForce(jm.Constant(0.0))
+    task = jm.PrescribedForce(Constant(0.0))
     p = {name: float(value) for name, value in task.parameters.items()}
     K, C = 200.0, np.array([60.0, 5.0])
     stiffness, damping = np.array([[2 * K, -K], [-K, K]]), np.array([[C[0] + C[1], -C[1]], [-C[1], C[1]]])

@@ -10,6 +10,7 @@ import references
 import scipy.integrate
 
 import jaxmuscle as jm
+from jaxmuscle.model import QuadraticDamping, QuadraticStiffness
 from jaxmuscle.model._noise import Realisation
 from jaxmuscle.simulation._integrator import Grid, observe, solve
 
@@ -19,14 +20,17 @@ HUGE = 1e4  # reference displacement and velocity that make the laws constant to
 
 
 def linear_muscle(stiffness=K, c_w=C_W, c_z=C_Z):
-    stiff, damp = jm.QuadraticStiffness(stiffness / HUGE**2, HUGE), functools.partial(jm.QuadraticDamping, v_ref=HUGE)
+    stiff, damp = (
+        QuadraticStiffness(stiffness / HUGE**2, HUGE),
+        functools.partial(QuadraticDamping, v_ref=HUGE),
+    )
     return jm.Muscle(MASS, MASS, stiff, stiff, damp(c_w / HUGE**2), damp(c_z / HUGE**2))
 
 
 def oscillator(noise):
     rest = FORCE / (2 * K)
     still = jm.Harmonic(0.0)
-    return jm.Isometric(jm.Constant(FORCE), muscle=linear_muscle(), noise=noise, harmonic=still, initial=(rest, 0.0))
+    return jm.Isometric(jm.model.Constant(FORCE), muscle=linear_muscle(), noise=noise, harmonic=still, initial=(rest, 0.0))
 
 
 def response(f, noise):
@@ -80,7 +84,7 @@ def test_spectrum_of_a_linear_oscillator(x64, noise):
         fine = task.noise.realise(task.noise.draw(key, 30_000), 5e-4)
         pairs = (fine, Grid(5e-4, 30_000, 20)), (halved(fine), Grid(1e-3, 15_000, 10))
         outputs = [observe(task, path, grid, solve(task, path, grid)) for path, grid in pairs]
-        return [jm.spectrum_of(output, task.settings, (5.0, 15.0)).power for output in outputs]
+        return [jm.spectra.spectrum_of(output, task.settings, (5.0, 15.0)).power for output in outputs]
 
     fine, coarse = jax.vmap(spectra)(jax.random.split(KEY, 128))
     bias = 4 / 3 * np.abs(np.mean(coarse - fine, axis=0))
@@ -95,7 +99,7 @@ def sliding(noise_of, mean):
     amplitude = np.sqrt(DIFFUSION) / RATE  # of C_w0, per √Hz
     noise = noise_of({"C_w": amplitude * 10.0}, rate=100.0)
     muscle = linear_muscle(0.0, c_w=RATE * MASS, c_z=0.0)
-    pull = jm.Constant(RATE * MASS)
+    pull = jm.model.Constant(RATE * MASS)
     return jm.PrescribedForce(pull, noise=noise, muscle=muscle, harmonic=jm.Harmonic(0.0), initial=(0, mean, 0, 0))
 
 

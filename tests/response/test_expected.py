@@ -14,6 +14,7 @@ import scipy.signal
 
 import jaxmuscle as jm
 from jaxmuscle._common.arrays import as_arrays
+from jaxmuscle.model import Constant, Decay, RampHold
 from jaxmuscle.objective._problem import target_variation
 from jaxmuscle.response._expected import _Autocovariance, covariance_operator, expected_moments
 from jaxmuscle.response._linearised import has_response
@@ -247,9 +248,13 @@ def test_phase_of_a_slow_harmonic(x64, phase):
 
 
 ENVELOPES = {
-    "isometric": (jm.Isometric, jm.Harmonic(1e-5, 4.25, 0.7, jm.Decay(1.0, 0.2, 5.0, 3.0)), {}),
-    "force": (jm.PrescribedForce, jm.Harmonic(1e-5, 4.25, 0.7, jm.RampHold(1.0, 6.0, 4.0, 0.5, 0.1)), {}),
-    "motion": (jm.PrescribedMotion, jm.Harmonic(1e-5, 4.25, 0.7, jm.Decay(1.0, 0.2, 5.0, 3.0)), {"sampling": "average"}),
+    "isometric": (jm.Isometric, jm.Harmonic(1e-5, 4.25, 0.7, Decay(1.0, 0.2, 5.0, 3.0)), {}),
+    "force": (jm.PrescribedForce, jm.Harmonic(1e-5, 4.25, 0.7, RampHold(1.0, 6.0, 4.0, 0.5, 0.1)), {}),
+    "motion": (
+        jm.PrescribedMotion,
+        jm.Harmonic(1e-5, 4.25, 0.7, Decay(1.0, 0.2, 5.0, 3.0)),
+        {"sampling": "average"},
+    ),
     "slow": (jm.Isometric, jm.Harmonic(1e-5, 0.5, 1.2), {}),
 }
 # An average over the interval before a sample lags by half of it: Δ a' / 2 a of the amplitude, a' / a = 0.2/s at most.
@@ -270,8 +275,8 @@ def test_line_is_the_spectrum_of_a_noise_free_simulation(x64, name):
 
 def test_an_envelope_that_does_not_change_is_a_constant_one(x64):
     task = references.quiet(jm.Isometric(5.0, 0.003))
-    still = task.with_parts(harmonic=jm.Harmonic(0.003, 4.25, 0.7, jm.Constant(0.5)))
-    decayed = task.with_parts(harmonic=jm.Harmonic(0.003, 4.25, 0.7, jm.Decay(0.5, 0.5)))
+    still = task.with_parts(harmonic=jm.Harmonic(0.003, 4.25, 0.7, Constant(0.5)))
+    decayed = task.with_parts(harmonic=jm.Harmonic(0.003, 4.25, 0.7, Decay(0.5, 0.5)))
     # The low-pass starts at t = 0 in one and long before in the other: by 5 s that is forgotten, to rounding.
     a, b = (jm.expected_spectrum(t).power for t in (still, decayed))
     np.testing.assert_allclose(a, b, rtol=1e-8, atol=1e-13 * np.max(a))
@@ -419,9 +424,9 @@ def test_lags_and_the_variance_of_a_mean_are_plain_sums(x64, samples):
 def test_heavy_forces_on_soft_tissue_have_an_equilibrium_in_single_precision(name):
     """Accelerations of 1e3 m/s² are rounded by more than displacements of 1e-2 m are large."""
     task = jm.load_preset(name).as_task(jm.PrescribedForce)
-    single = np.asarray(jm.equilibrium(task))
+    single = np.asarray(jm.response.equilibrium(task))
     with jax.enable_x64(True):
-        np.testing.assert_allclose(single, jm.equilibrium(task), rtol=1e-6, atol=1e-8)
+        np.testing.assert_allclose(single, jm.response.equilibrium(task), rtol=1e-6, atol=1e-8)
 
 
 def test_a_task_from_outside_a_compiled_function():
@@ -430,7 +435,7 @@ def test_a_task_from_outside_a_compiled_function():
     np.testing.assert_allclose(scaled, 2 * np.asarray(jm.expected_spectrum(task).power), rtol=1e-5)
 
 
-class Crossbridge(jm.AbstractMuscle):
+class Crossbridge(jm.model.AbstractMuscle):
     """A user's own muscle: a cubic active and a linear passive tissue. Counts how often it is traced."""
 
     m_w: float = 0.4
@@ -470,8 +475,8 @@ def test_one_trace_per_structure(x64):
 @pytest.mark.slow
 def test_a_users_own_muscle_in_closed_form(x64, kind):
     """The same muscle out of jaxmuscle's parts: k (x_ref² + x²) with k x_ref² the stiffness and x_ref = 0.03."""
-    inner, outer = jm.QuadraticStiffness(300.0 / 0.03**2, 0.03), jm.QuadraticStiffness(200.0 / 1e8, 1e4)
-    made = jm.Muscle(0.4, 0.6, inner, outer, jm.QuadraticDamping(40.0, 1.0), jm.QuadraticDamping(5.0 / 1e8, 1e4))
+    inner, outer = jm.model.QuadraticStiffness(300.0 / 0.03**2, 0.03), jm.model.QuadraticStiffness(200.0 / 1e8, 1e4)
+    made = jm.Muscle(0.4, 0.6, inner, outer, jm.model.QuadraticDamping(40.0, 1.0), jm.model.QuadraticDamping(5.0 / 1e8, 1e4))
     theirs, ours = (jm.expected_spectrum(kind(*INPUTS[kind], muscle=m)) for m in (Crossbridge(), made))
     # x_ref = 1e4 m makes a law constant to 1e-12.
     np.testing.assert_allclose(theirs.power, ours.power, rtol=1e-8)
@@ -551,7 +556,7 @@ REFUSED = {
 @pytest.mark.slow
 def test_what_has_no_linear_response(x64, name):
     task, message = REFUSED[name]
-    with pytest.raises(jm.OperatingPointError, match=message):
+    with pytest.raises(jm.errors.OperatingPointError, match=message):
         jm.expected_spectrum(task)
     with pytest.raises(ValueError, match=message):
         has_response(task, required=True)

@@ -17,7 +17,7 @@ TASKS = {
     "isometric": jm.Isometric(),
     "ornstein-uhlenbeck": jm.Isometric(noise=jm.OrnsteinUhlenbeckNoise(), P_w=8.0),
     "absolute noise": jm.Isometric(noise=jm.BandLimitedNoise([20.0, 1.0, 0.1, 0.1], relative=False)),
-    "prescribed-force": jm.PrescribedForce(F_ext=jm.Constant(1.0)),
+    "prescribed-force": jm.PrescribedForce(F_ext=jm.model.Constant(1.0)),
     "prescribed-motion": jm.load_preset("zagrodny-slifkin"),
 }
 EXACT = 1e-10  # float64, through a root search to 1e-12
@@ -99,7 +99,7 @@ def test_the_reference_is_the_task_itself_and_steps_add_up(x64, task):
 @pytest.mark.slow
 def test_without_resting_stiffness_forces_follow_the_level_and_nothing_moves(x64, task):
     high = at_level(task, 0.9)
-    np.testing.assert_allclose(jm.equilibrium(high), jm.equilibrium(task), rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(jm.response.equilibrium(high), jm.response.equilibrium(task), rtol=1e-9, atol=1e-12)
     ratio = float(moments(high).mean / moments(task).mean)
     assert ratio == pytest.approx(3.0 if task.output_unit == "N" else 1.0, rel=1e-9)
 
@@ -121,7 +121,7 @@ def test_damping_keeps_the_corner_or_the_damping_ratio(x64):
 
 
 def test_every_size_of_an_input_follows_and_its_times_stay():
-    task = jm.Isometric(P_w=jm.RampHold(4.0, start=1.0, ramp=3.0, initial=2.0))
+    task = jm.Isometric(P_w=jm.model.RampHold(4.0, start=1.0, ramp=3.0, initial=2.0))
     moved = at_level(task, 0.6).P_w
     assert (moved.level, moved.initial) == (8.0, 4.0)
     assert (moved.start, moved.ramp, moved.corner) == (1.0, 3.0, 0.2)
@@ -144,7 +144,7 @@ def test_variation_falls_with_strength(x64, task):
 def test_similar_muscles_have_similar_equilibria_and_rates(x64, exponent):
     task = jm.PrescribedForce(F_ext=1.0)
     large = scaled(task, 2.0, time_exponent=exponent)
-    np.testing.assert_allclose(jm.equilibrium(large), 2 * jm.equilibrium(task), rtol=1e-9, atol=1e-15)
+    np.testing.assert_allclose(jm.response.equilibrium(large), 2 * jm.response.equilibrium(task), rtol=1e-9, atol=1e-15)
     base = np.asarray(large.muscle.base() / task.muscle.base())
     np.testing.assert_allclose(base, [2.0, 2.0, 2.0 ** (1 + exponent), 2.0 ** (1 + exponent)])
     if exponent == 1.0:
@@ -159,7 +159,7 @@ def test_dynamic_similarity_is_exact_far_from_linear(x64):
     """Twice the size, times stretched by two: x ∝ s, force ∝ s², along the whole nonlinear run."""
     size = 2.0
     still = {f"noise_{c}": 0.0 for c in ("K_w", "K_z", "C_w", "C_z")} | {"harmonic_amplitude": 0.0}
-    small = jm.PrescribedForce(P_w=jm.SmoothStep(40.0, rise=0.05), F_ext=2.0, initial=(0.002, 0.1, 0.0, -0.1)).replace(
+    small = jm.PrescribedForce(P_w=jm.model.SmoothStep(40.0, rise=0.05), F_ext=2.0, initial=(0.002, 0.1, 0.0, -0.1)).replace(
         **still
     )
     large = scaled(small, size)
@@ -210,7 +210,7 @@ def test_single_precision_gives_the_same_numbers():
     assert_same(single, double, rtol=1e-12)
 
 
-class Toe(jm.AbstractLaw):
+class Toe(jm.model.AbstractLaw):
     k: float = 100.0
 
     def __call__(self, q):
@@ -253,13 +253,13 @@ def test_the_preset_has_the_papers_noise_and_a_smaller_changing_harmonic(hamilto
     assert [hamilton[f"noise_{c}"] for c in ("K_w", "K_z", "C_w", "C_z")] == [0.0016, 0.0016, 1e-4, 1e-4]
     assert hamilton["harmonic_amplitude"] <= 0.7 * beside["harmonic_amplitude"]
     envelope = hamilton.harmonic.envelope
-    assert isinstance(envelope, jm.Decay)
+    assert isinstance(envelope, jm.model.Decay)
     assert float(envelope(15.0)) < 0.5 * float(envelope(5.0))
 
 
 @pytest.mark.slow
 def test_the_only_maximum_of_the_expected_force_is_bin_1(x64, hamilton):
-    found = jm.peaks(jm.expected_spectrum(hamilton), min_prominence=0.0)
+    found = jm.spectra.peaks(jm.expected_spectrum(hamilton), min_prominence=0.0)
     assert found.maximum.bin == 1 and found.maximum.frequency == 0.390625
     assert not found.local_maxima
 
@@ -267,7 +267,7 @@ def test_the_only_maximum_of_the_expected_force_is_bin_1(x64, hamilton):
 @pytest.mark.slow
 def test_the_only_maximum_of_100_simulated_seeds_is_bin_1(hamilton, capsys):
     runs = jm.ensemble(hamilton, jax.random.key(12), seeds=100)
-    found = jm.peaks(runs.spectrum().mean())
+    found = jm.spectra.peaks(runs.spectrum().mean())
     assert found.maximum.bin == 1 and not found.local_maxima
     each = np.asarray(runs.spectrum().proportional).argmax(axis=1) == 0
     with capsys.disabled():

@@ -12,7 +12,7 @@ from jaxmuscle.response._characteristics import static_characteristics
 EXACT = {"rtol": 1e-12, "atol": 1e-12}
 
 
-class Tendon(jm.AbstractMuscle):
+class Tendon(jm.model.AbstractMuscle):
     """A user's muscle: linear active spring with an offset, exponential passive one, linear dampers."""
 
     m_w: float = 0.5
@@ -70,7 +70,7 @@ def test_the_operating_point_is_the_tasks(kind):
     seen = static_characteristics(task)
     middle = np.interp(seen.x_z, seen.displacement, seen.F_ext_active)
     load = {"Isometric": middle, "PrescribedForce": 0.0, "PrescribedMotion": 10.0}[kind.__name__]
-    assert seen.x_w == pytest.approx(float(jm.equilibrium(task)[0]), rel=1e-4)  # that one in single precision
+    assert seen.x_w == pytest.approx(float(jm.response.equilibrium(task)[0]), rel=1e-4)  # that one in single precision
     # Straight lines between 201 points of a curve that bends by 1e5 N/m² over steps of 2e-4 m.
     assert middle == pytest.approx(load, abs=2e-3)
 

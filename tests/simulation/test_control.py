@@ -126,7 +126,7 @@ def test_the_controlled_estimate_has_no_linear_time_step_error(x64, kind):
     def spectra(path):
         steps = len(path.values) - 1
         outputs = (respond(part, path, Grid(15.0 / steps, steps, steps // 1500), "instant")[1] for part in (task, linear))
-        return [jm.spectrum_of(output, task.settings, WINDOW).power for output in outputs]
+        return [jm.spectra.spectrum_of(output, task.settings, WINDOW).power for output in outputs]
 
     @eqx.filter_jit
     def both(key):
@@ -237,7 +237,7 @@ def test_without_what_a_controlled_mean_needs(x64):
 def test_under_a_transformation(x64):
     def linear(k_w):
         options = {"seeds": 2, "duration": 0.5, "dt": 5e-3, "control": True}
-        return jm.ensemble(jm.Isometric(jm.Constant(5.0)).replace(k_w=k_w), KEY, **options).linear
+        return jm.ensemble(jm.Isometric(jm.model.Constant(5.0)).replace(k_w=k_w), KEY, **options).linear
 
     output = np.asarray(jax.jit(linear)(5e5))
     assert output.shape == (2, 51) and np.all(np.isfinite(output)) and output.std() > 0

@@ -41,7 +41,7 @@ def strong_errors(task, factors):
 
 def moving(noise):
     """An isometric muscle set free at 2 cm with 1 m/s, so that velocities matter, without its harmonic."""
-    task = jm.Isometric(jm.Constant(2.0), noise=noise, harmonic=jm.Harmonic(0.0), initial=(0.02, 1.0))
+    task = jm.Isometric(jm.model.Constant(2.0), noise=noise, harmonic=jm.Harmonic(0.0), initial=(0.02, 1.0))
     return task.replace(c_w=8.0, c_z=1.0)
 
 
@@ -88,7 +88,7 @@ def test_strong_order(x64, noise, order):
 def test_what_task_1_asks_for_moves_task_2_the_same_way(x64, amplitude, lowest, bound):
     noise = jm.BandLimitedNoise(amplitude, cutoff=10.0)
     forward = jm.PrescribedMotion(
-        jm.RampHold(0.005), jm.SmoothStep(2.0, 0.3, 1.0), noise=noise, harmonic=jm.Harmonic(0.02, 4.25, 0.4)
+        jm.model.RampHold(0.005), jm.model.SmoothStep(2.0, 0.3, 1.0), noise=noise, harmonic=jm.Harmonic(0.02, 4.25, 0.4)
     )
     seconds, fine = 2.0, 8000
     path = noise.realise(noise.draw(KEY, int(seconds * fine)), 1 / fine)
@@ -98,7 +98,7 @@ def test_what_task_1_asks_for_moves_task_2_the_same_way(x64, amplitude, lowest, 
         grid, here = Grid(dt, steps, 1), coarsened(path, factor)
         force = np.asarray(eqx.filter_jit(lambda p, g=grid: observe(forward, p, g, solve(forward, p, g)))(here))
         time = dt * np.arange(steps + 1)
-        pulled = jm.Sampled.through(time, force)
+        pulled = jm.model.Sampled.through(time, force)
         back = forward.as_task(jm.PrescribedForce, P_w=pulled, F_ext=forward.F_ext)
         x_z = np.asarray(eqx.filter_jit(lambda p, b=back, g=grid: solve(b, p, g)[:, 2])(here))
         expected = np.asarray(jax.vmap(forward.x_z)(time))

@@ -12,6 +12,7 @@ import references
 import jaxmuscle as jm
 from jaxmuscle._common.arrays import is_concrete
 from jaxmuscle._common.types import Scalar
+from jaxmuscle.model import Decay, RampHold, Sampled, SmoothStep
 from jaxmuscle.model._noise import Realisation
 from jaxmuscle.simulation._batch import draw
 from jaxmuscle.simulation._integrator import Grid, solve
@@ -98,7 +99,7 @@ def test_a_stiff_task_gets_sub_steps_and_the_right_answer(x64):
     # Heun with |λ| h = 0.25 follows what is slower than λ (the harmonic: ω = 27/s) to (ω h)² = 3e-6.
     np.testing.assert_allclose(run.states[:, 0], states[:, 0], atol=1e-5 * np.abs(states[:, 0]).max())
     np.testing.assert_allclose(run.output, output, atol=1e-5 * np.abs(output).max())
-    with pytest.raises(jm.SimulationError, match="did not stay finite"):
+    with pytest.raises(jm.errors.SimulationError, match="did not stay finite"):
         jm.simulate(task, KEY, duration=3.0, substeps=1)
 
 
@@ -107,7 +108,7 @@ def test_an_eigenvalue_beyond_all_sub_steps_is_an_error():
         jm.simulate(jm.Isometric().replace(c_w=1e6), KEY)
 
 
-class Integral(jm.AbstractTask):
+class Integral(jm.model.AbstractTask):
     """`y' = ΔK_w`: what the integrator makes of a noise path is its trapezoidal sum."""
 
     state_names = ("y",)
@@ -152,11 +153,11 @@ def test_every_step_gets_its_own_noise(steps, every, substeps, precision):
 @pytest.mark.slow
 def test_tables_of_inputs_and_harmonic_change_nothing(x64, task):
     """A traced call, which may be differentiated in reverse, evaluates them in the loop; a plain one looks them up."""
-    rhythm = jm.Harmonic(0.02, 3.0, 0.4, jm.Decay(1.0, 0.2, 0.3, 0.2))
+    rhythm = jm.Harmonic(0.02, 3.0, 0.4, Decay(1.0, 0.2, 0.3, 0.2))
     task = {
-        "motion": jm.PrescribedMotion(jm.RampHold(0.005, 0.1, 0.3, 0.1), 5.0, harmonic=rhythm),
-        "force": jm.PrescribedForce(jm.SmoothStep(5.0, 0.1, 0.3), jm.Decay(1.0, 0.0, 0.2, 0.3), harmonic=rhythm),
-        "isometric": jm.Isometric(jm.Sampled.through(np.linspace(0, 1, 9), np.sin(np.arange(9.0)) + 3), harmonic=rhythm),
+        "motion": jm.PrescribedMotion(RampHold(0.005, 0.1, 0.3, 0.1), 5.0, harmonic=rhythm),
+        "force": jm.PrescribedForce(SmoothStep(5.0, 0.1, 0.3), Decay(1.0, 0.0, 0.2, 0.3), harmonic=rhythm),
+        "isometric": jm.Isometric(Sampled.through(np.linspace(0, 1, 9), np.sin(np.arange(9.0)) + 3), harmonic=rhythm),
     }[task]
     options = {"duration": 0.8, "rate": 500.0, "substeps": 3}
     plain = jm.simulate(task, KEY, **options)
@@ -218,11 +219,11 @@ def test_seed_i_folds_i_into_the_key():
 @pytest.mark.slow
 def test_what_does_not_stay_finite_is_named(x64):
     task = jm.Isometric(noise=jm.OrnsteinUhlenbeckNoise({"C_w": 30.0}))
-    with pytest.raises(jm.SimulationError) as error:
+    with pytest.raises(jm.errors.SimulationError) as error:
         jm.ensemble(task, KEY, seeds=3, duration=3.0)
     for part in ("3 seed(s)", "(0, 1, 2)", "Isometric", "dt = 0.001 s", "noise_C_w = 30", "k_w = 500000"):
         assert part in str(error.value), part
-    with pytest.raises(jm.SimulationError, match=r"1 seed\(s\) did not stay finite \(7\)"):
+    with pytest.raises(jm.errors.SimulationError, match=r"1 seed\(s\) did not stay finite \(7\)"):
         jm.simulate(task, KEY, seed=7, duration=3.0)
     traced = jax.jit(lambda a: jm.simulate(task.replace(noise_C_w=a), KEY, duration=3.0).output)
     assert not np.isfinite(traced(30.0)).all()
@@ -279,7 +280,7 @@ def test_sampling_and_window():
     with pytest.raises(ValueError, match="state 'x_z': Isometric has"):
         run.state("x_z")
     halved = run.spectrum(window=(0.0, 3.0))
-    expected = jm.spectrum_of(run.output[::2], jm.SpectrumSettings(), (0.0, 3.0))
+    expected = jm.spectra.spectrum_of(run.output[::2], jm.SpectrumSettings(), (0.0, 3.0))
     np.testing.assert_array_equal(halved.power, expected.power)
     with pytest.raises(ValueError, match=r"a multiple of that rate, this has 200.0 Hz"):
         run.spectrum(jm.SpectrumSettings(rate=150.0), window=(0.0, 3.0))
@@ -304,7 +305,7 @@ def test_ensembles_under_vmap_and_jit(x64):
 def test_other_values_do_not_compile_again():
     traces = []
 
-    class Counted(jm.AbstractLaw):
+    class Counted(jm.model.AbstractLaw):
         k: Scalar = 5e5
 
         def __call__(self, q):

@@ -41,7 +41,7 @@ STEP, DIGITS = 2e-5, 1e-5
 DOUBTFUL = 1e-3  # chance of a test to fail by scatter alone, over all it compares
 
 
-def fitted(task=TRUTH, free=DEFAULT_FREE, settings: dict[str, Any] | None = None, **target: Any) -> jm.FitResult:
+def fitted(task=TRUTH, free=DEFAULT_FREE, settings: dict[str, Any] | None = None, **target: Any) -> jm.fits.FitResult:
     """What a fit would give that found `task`, its target being the expected spectrum; nothing is fitted."""
     power = np.asarray(jm.expected_spectrum(task).proportional)
     quantity = "displacement" if task.output_unit == "m" else "force"
@@ -301,7 +301,7 @@ def test_the_usual_designs(result, names):
 
 
 @functools.cache
-def report() -> jm.IdentifiabilityReport:
+def report() -> jm.uncertainty.IdentifiabilityReport:
     return jm.identifiability(fitted(coefficient_of_variation=0.016))
 
 

@@ -160,9 +160,9 @@ def test_the_same_key_gives_the_same_draws():
 def test_chains_without_a_summary():
     short = jm.posterior(well_known()[1], key=5, chains=2, draws=100, warmup=50)
     assert not short.success  # a hundred draws have no effective size of two hundred
-    with pytest.raises(jm.NotMixedError, match="longer chains"):
+    with pytest.raises(jm.errors.NotMixedError, match="longer chains"):
         short.summary()
-    with pytest.raises(jm.NotMixedError):
+    with pytest.raises(jm.errors.NotMixedError):
         short.plot()
     assert str(short).startswith("NO POSTERIOR")
 

@@ -12,6 +12,7 @@ import references
 import scipy.optimize
 
 import jaxmuscle as jm
+from jaxmuscle.model import SmoothStep
 
 DOCS = Path(__file__).parents[2] / "docs"
 KEY = jax.random.key(7)
@@ -156,7 +157,7 @@ def test_at_rest_nothing_pulls_and_shortening_lowers_the_force(muscle):
 def test_the_base_coefficients_are_those_of_small_motions(muscle):
     task = hill.at_activation(jm.Isometric(muscle=muscle), muscle.activation)
     K_w, K_z, C_w, C_z = np.asarray(muscle.base())
-    x = float(jm.equilibrium(task)[0])
+    x = float(jm.response.equilibrium(task)[0])
     assert float(muscle.shortening()) == pytest.approx(x, rel=1e-10)
     A = np.asarray(jax.jacfwd(lambda y: task.vector_field(15.0, y, jnp.zeros(4)))(jnp.array([x, 0.0])))
     np.testing.assert_allclose(A[1] * muscle.m_w, [-(K_w + K_z), -(C_w + C_z)], rtol=1e-9)
@@ -177,7 +178,7 @@ def test_held_the_belly_and_the_tendon_balance(muscle, x_z):
     p = numpy_values(muscle)
     root = scipy.optimize.root(lambda x: numpy_tendon(p, x - x_z) - numpy_belly(p, x, 0.0), x_z + 1e-3, tol=1e-10)
     assert root.success and abs(root.fun[0]) < 1e-9 * p["force_max"]
-    y = jm.equilibrium(task)
+    y = jm.response.equilibrium(task)
     np.testing.assert_allclose(y, [root.x[0], 0.0], rtol=1e-8, atol=1e-12)
     force = task.output(15.0, y, jnp.zeros(4), jnp.zeros(4))
     np.testing.assert_allclose(force, numpy_tendon(p, root.x[0] - x_z), rtol=1e-8)
@@ -192,7 +193,7 @@ def test_under_a_load_the_belly_finds_the_length_that_carries_it(muscle, share):
     balance = lambda x: numpy_belly(p, x, 0.0) - share * held  # noqa: E731
     x_w = scipy.optimize.brentq(balance, 0.0, 0.6 * p["optimal_length"], xtol=1e-14)
     stretch = scipy.optimize.brentq(lambda e: numpy_tendon(p, e) - share * held, 0.0, 0.1, xtol=1e-15)
-    np.testing.assert_allclose(jm.equilibrium(task), [x_w, 0.0, x_w - stretch, 0.0], rtol=1e-7, atol=1e-11)
+    np.testing.assert_allclose(jm.response.equilibrium(task), [x_w, 0.0, x_w - stretch, 0.0], rtol=1e-7, atol=1e-11)
 
 
 def test_a_muscle_that_cannot_be_is_refused():
@@ -247,9 +248,9 @@ def rhythm(task, t):
 
 
 TASKS = {
-    "isometric": lambda **parts: jm.Isometric(jm.SmoothStep(5.0, 0.2, 0.5), 0.002, **parts),
-    "force": lambda **parts: jm.PrescribedForce(jm.SmoothStep(5.0, 0.2, 0.5), jm.SmoothStep(4.5, 0.2, 0.5), **parts),
-    "motion": lambda **parts: jm.PrescribedMotion(jm.SmoothStep(-0.002, 0.2, 0.5), jm.SmoothStep(4.5, 0.2, 0.5), **parts),
+    "isometric": lambda **parts: jm.Isometric(SmoothStep(5.0, 0.2, 0.5), 0.002, **parts),
+    "force": lambda **parts: jm.PrescribedForce(SmoothStep(5.0, 0.2, 0.5), SmoothStep(4.5, 0.2, 0.5), **parts),
+    "motion": lambda **parts: jm.PrescribedMotion(SmoothStep(-0.002, 0.2, 0.5), SmoothStep(4.5, 0.2, 0.5), **parts),
 }
 
 
@@ -397,7 +398,7 @@ def test_the_spectrum_goes_by_its_rules(x64):
     np.testing.assert_allclose(jm.expected_spectrum(damping).power, power, rtol=1e-9)
     # A stiff tendon and a light, fast belly: the force is -ΔK_w x_w. In the density of the samples, both sides of f = 0.
     alone = task.replace(noise_K_z=0.0, harmonic_amplitude=0.0, tendon_strain=0.004, velocity_max=100.0, m_w=0.01)
-    x_w, K_w = float(jm.equilibrium(alone)[0]), float(alone.muscle.base()[0])
+    x_w, K_w = float(jm.response.equilibrium(alone)[0]), float(alone.muscle.base()[0])
     f = np.asarray(jm.expected_spectrum(alone).frequency)[1:12]
     density = references.aliased(lambda f: 1 / (100 * (1 + (f / 50) ** 4)), 100.0, f)
     # Left out: K_w / (K_w + K_z) below 0.1 %, the resonance near 670 Hz, the bend of the density across a bin.

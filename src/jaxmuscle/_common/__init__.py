@@ -2,3 +2,7 @@
 
 It knows nothing of muscles, spectra or fits, and imports no other wing.
 """
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
