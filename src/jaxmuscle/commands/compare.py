@@ -7,8 +7,8 @@ import typer
 
 from jaxmuscle._common.progress import progress
 
-from .console import CONVERGED, NOT_CONVERGED, csv_text, err, out, plain, reporting, save_figure, writable
-from .options import Output, Seed, TaskName, fixed_values
+from .console import CONVERGED, NOT_CONVERGED, aim_of, csv_text, out, plain, reporting, save_figure, writable
+from .options import Fix, Free, Output, Quantity, Seed, Segments, TargetTask, fixed_values, names_in
 
 if TYPE_CHECKING:
     from jaxmuscle.comparison._comparison import Comparison
@@ -18,14 +18,12 @@ def compare(
     target: Annotated[
         str, typer.Argument(help="Bundled target (see `jaxmuscle targets`) or path of a .toml, .csv, .json, .tar.")
     ],
-    task: Annotated[TaskName | None, typer.Option(help="Default: follows from what the target measured.")] = None,
-    free: Annotated[str | None, typer.Option(metavar="NAMES", help="Comma-separated; replaces the default set.")] = None,
-    fix: Annotated[
-        list[str] | None, typer.Option(metavar="NAME=VALUE", help="Set a parameter and keep it; repeatable.")
-    ] = None,
+    task: TargetTask = None,
+    free: Free = None,
+    fix: Fix = None,
     seed: Seed = 0,
-    segments: Annotated[int | None, typer.Option(min=1, help="Welch segments behind the target.")] = None,
-    quantity: Annotated[str | None, typer.Option(help="force, torque or displacement.")] = None,
+    segments: Segments = None,
+    quantity: Quantity = None,
     output: Output = Path("out"),
 ) -> None:
     """Compare the colours of noise, each with and without a harmonic, on one target.
@@ -44,18 +42,12 @@ def compare(
     with reporting():
         from jaxmuscle._common.environment import keep_compiled_programs
         from jaxmuscle.comparison._compare import compare_noise
-        from jaxmuscle.data._target import load_target
-        from jaxmuscle.model._tasks import TASKS
-        from jaxmuscle.objective._arguments import task_for
 
         keep_compiled_programs()
-        fixed = fixed_values(fix or [])
-        names = None if free is None else [name.strip() for name in free.split(",") if name.strip()]
-        aim = load_target(target, quantity=quantity, segments=segments)
-        model = task_for(aim) if task is None else TASKS[task](settings=aim.settings)
+        fixed = fixed_values(fix)
+        names = names_in(free)
+        aim, model = aim_of(target, task, {"quantity": quantity, "segments": segments})
         writable(output)
-        for notice in aim.notices:
-            err.print(f"[yellow]notice:[/] {plain(notice)}", highlight=False)
         with progress(f"comparing noises on {aim.name}") as tell:
             found = compare_noise(model, aim, free=names, fix=fixed, key=seed, progress=tell)
         _write(found, output)

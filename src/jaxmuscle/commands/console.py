@@ -44,6 +44,17 @@ def task_of(preset: str, task: TaskName | None) -> Any:
     return model if task is None or type(model) is TASKS[task] else model.as_task(TASKS[task])
 
 
+def aim_of(name: str, task: TaskName | None, read: dict[str, Any]) -> tuple[Any, Any]:
+    """The target of that name or file, its notices said, and the task to fit to it: by default what the target measured."""
+    import jaxmuscle as jm
+    from jaxmuscle.model._tasks import TASKS
+
+    target = jm.load_target(name, **read)
+    for notice in target.notices:
+        err.print(f"[yellow]notice:[/] {plain(notice)}", highlight=False)
+    return target, jm.task_for(target) if task is None else TASKS[task](settings=target.settings)
+
+
 @contextlib.contextmanager
 def reporting() -> Iterator[None]:
     """Turn a user's mistake into one line and exit code 2, a numerical failure into 1, an interruption into 130."""

@@ -14,7 +14,7 @@ import typer
 from jaxmuscle._common.progress import progress
 
 from .console import NOT_CONVERGED, err, out, reporting, task_of
-from .options import Preset, Seed, TaskName
+from .options import OtherTask, Preset, Seed
 
 if TYPE_CHECKING:
     from jaxmuscle.ensembles._layout import Pace
@@ -34,7 +34,7 @@ def ensemble(
     preset: Preset,
     seeds: Annotated[int, typer.Option(help="Noise paths.")],
     output: Annotated[Path, typer.Option("--out", metavar="FILE.zarr", help="The store.")],
-    task: Annotated[TaskName | None, typer.Option(help="Put the same muscle into another task.")] = None,
+    task: OtherTask = None,
     seed: Seed = 0,
     vary: Annotated[
         list[str] | None, typer.Option(metavar="NAME=VALUES", help="Sweep: k_w=4e5,5e5; several make a grid.")

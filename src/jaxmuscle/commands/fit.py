@@ -8,8 +8,23 @@ from rich.table import Table
 
 from jaxmuscle._common.progress import progress
 
-from .console import CONVERGED, INTERRUPTED, NOT_CONVERGED, err, out, plain, reporting, writable, write_fit
-from .options import AxisName, MethodName, NoiseName, Output, ResidualName, Seed, TaskName, fixed_values
+from .console import CONVERGED, INTERRUPTED, NOT_CONVERGED, aim_of, err, out, plain, reporting, writable, write_fit
+from .options import (
+    AxisName,
+    Fix,
+    Free,
+    MethodName,
+    Noise,
+    NoiseName,
+    Output,
+    Quantity,
+    ResidualName,
+    Seed,
+    Segments,
+    TargetTask,
+    fixed_values,
+    names_in,
+)
 
 if TYPE_CHECKING:
     from jaxmuscle.fits._result import FitResult
@@ -19,16 +34,14 @@ def fit(
     target: Annotated[
         list[str], typer.Argument(help="Bundled target (see `jaxmuscle targets`) or path of a .toml, .csv, .json, .tar.")
     ],
-    task: Annotated[TaskName | None, typer.Option(help="Default: follows from what the target measured.")] = None,
+    task: TargetTask = None,
     method: Annotated[
         MethodName, typer.Option(help="Spectrum in linear response, then corrected; or simulated.")
     ] = MethodName.linear,
-    noise: Annotated[NoiseName, typer.Option(help="Colour of the noise.")] = NoiseName.band_limited,
+    noise: Noise = NoiseName.band_limited,
     residual: Annotated[ResidualName, typer.Option(help="What is compared.")] = ResidualName.log,
-    free: Annotated[str | None, typer.Option(metavar="NAMES", help="Comma-separated; replaces the default set.")] = None,
-    fix: Annotated[
-        list[str] | None, typer.Option(metavar="NAME=VALUE", help="Set a parameter and keep it; repeatable.")
-    ] = None,
+    free: Free = None,
+    fix: Fix = None,
     starts: Annotated[
         int | None, typer.Option(min=1, help="Starting points; 100, or 8 where there is no linear response.")
     ] = None,
@@ -36,8 +49,8 @@ def fit(
         int | None, typer.Option(min=1, help="Noise paths; 32, or 48 where there is no linear response.")
     ] = None,
     seed: Seed = 0,
-    segments: Annotated[int | None, typer.Option(min=1, help="Welch segments behind the target.")] = None,
-    quantity: Annotated[str | None, typer.Option(help="force, torque or displacement.")] = None,
+    segments: Segments = None,
+    quantity: Quantity = None,
     dataset: Annotated[str | None, typer.Option(metavar="NAME", help="Which dataset of a digitised figure.")] = None,
     axis: Annotated[
         AxisName, typer.Option(help="log-log: a digitised figure's points are log10 of Hz and of power.")
@@ -66,11 +79,10 @@ def fit(
     """
     with reporting():
         from jaxmuscle._common.environment import keep_compiled_programs
-        from jaxmuscle.data._target import load_target
 
         keep_compiled_programs()
-        fixed = fixed_values(fix or [])
-        names = None if free is None else [name.strip() for name in free.split(",") if name.strip()]
+        fixed = fixed_values(fix)
+        names = names_in(free)
         read = {"quantity": quantity, "segments": segments, "dataset": dataset, "axis": str(axis)}
         options = {
             "free": names,
@@ -90,20 +102,15 @@ def fit(
         if groups is not None:
             raise ValueError("--groups needs several targets")
         options |= {"method": str(method), "seeds": seeds}
-        converged = _fit_one(load_target(target[0], **read), task, output, options)  # pyright: ignore[reportArgumentType]
+        converged = _fit_one(*aim_of(target[0], task, read), output, options)
     raise typer.Exit(CONVERGED if converged else NOT_CONVERGED)
 
 
-def _fit_one(target: Any, task: TaskName | None, folder: Path, options: dict[str, Any]) -> bool:
+def _fit_one(target: Any, model: Any, folder: Path, options: dict[str, Any]) -> bool:
     from jaxmuscle.fits._fit import fit as fit_task
     from jaxmuscle.fits._search import FitInterrupted
-    from jaxmuscle.model._tasks import TASKS
-    from jaxmuscle.objective._arguments import task_for
 
-    model = task_for(target) if task is None else TASKS[task](settings=target.settings)
     writable(folder)
-    for notice in target.notices:
-        err.print(f"[yellow]notice:[/] {plain(notice)}", highlight=False)
     try:
         with progress(f"fitting {target.name}") as tell:
             result = fit_task(model, target, progress=tell, **options)

@@ -9,8 +9,20 @@ from rich.table import Table
 
 from jaxmuscle._common.progress import progress
 
-from .console import CONVERGED, NOT_CONVERGED, err, out, plain, reporting, save_figure, writable
-from .options import NoiseName, Output, Seed, TaskName, fixed_values
+from .console import CONVERGED, NOT_CONVERGED, aim_of, err, out, plain, reporting, save_figure, writable
+from .options import (
+    Fix,
+    Free,
+    Noise,
+    NoiseName,
+    Output,
+    Quantity,
+    Seed,
+    Segments,
+    TargetTask,
+    fixed_values,
+    names_in,
+)
 
 if TYPE_CHECKING:
     from jaxmuscle.fits._result import FitResult
@@ -19,14 +31,12 @@ if TYPE_CHECKING:
 
 def posterior(
     target: Annotated[str, typer.Argument(help="Bundled target, path of a target file, or a fit.json that is taken up.")],
-    task: Annotated[TaskName | None, typer.Option(help="Default: follows from what the target measured.")] = None,
-    noise: Annotated[NoiseName, typer.Option(help="Colour of the noise.")] = NoiseName.band_limited,
-    free: Annotated[str | None, typer.Option(metavar="NAMES", help="Comma-separated; replaces the default set.")] = None,
-    fix: Annotated[
-        list[str] | None, typer.Option(metavar="NAME=VALUE", help="Set a parameter and keep it; repeatable.")
-    ] = None,
-    segments: Annotated[int | None, typer.Option(min=1, help="Welch segments behind the target.")] = None,
-    quantity: Annotated[str | None, typer.Option(help="force, torque or displacement.")] = None,
+    task: TargetTask = None,
+    noise: Noise = NoiseName.band_limited,
+    free: Free = None,
+    fix: Fix = None,
+    segments: Segments = None,
+    quantity: Quantity = None,
     chains: Annotated[int, typer.Option(min=2, help="Chains, from dispersed starts.")] = 4,
     draws: Annotated[int, typer.Option(min=100, help="Draws of each chain.")] = 1000,
     warmup: Annotated[int, typer.Option(min=1, help="Steps of each chain before its draws.")] = 500,
@@ -71,11 +81,8 @@ def posterior(
 
 
 def _fitted(target: str, read: dict[str, Any], asked: dict[str, Any], seed: int) -> "FitResult":
-    from jaxmuscle.data._target import load_target
     from jaxmuscle.fits._fit import fit
     from jaxmuscle.fits._result import load_result
-    from jaxmuscle.model._tasks import TASKS
-    from jaxmuscle.objective._arguments import task_for
 
     path = Path(target)
     if path.suffix == ".json" and path.is_file() and "task_table" in json.loads(path.read_text(encoding="utf-8")):
@@ -83,17 +90,13 @@ def _fitted(target: str, read: dict[str, Any], asked: dict[str, Any], seed: int)
             raise ValueError(f"{target}: is a fit; its task, parameters and target stay as they are, so leave out --task, "
                              "--free, --fix, --segments and --quantity")  # fmt: skip
         return load_result(path)
-    loaded = load_target(target, **read)  # pyright: ignore[reportArgumentType]
-    for notice in loaded.notices:
-        err.print(f"[yellow]notice:[/] {plain(notice)}", highlight=False)
+    loaded, model = aim_of(target, asked["task"], read)
     if loaded.segments is None and loaded.sigma is None:
         raise ValueError(f"{target}: states neither segments nor sigma, so nothing says how much it scatters: give "
                          "--segments, the number of Welch segments that were averaged, or a third column sigma")  # fmt: skip
-    task, free = asked["task"], asked["free"]
-    model = task_for(loaded) if task is None else TASKS[task](settings=loaded.settings)
-    names = None if free is None else [name.strip() for name in free.split(",") if name.strip()]
+    names = names_in(asked["free"])
     with progress(f"fitting {loaded.name}") as tell:
-        return fit(model, loaded, free=names, fix=fixed_values(asked["fix"] or []), noise=asked["noise"], key=seed,
+        return fit(model, loaded, free=names, fix=fixed_values(asked["fix"]), noise=asked["noise"], key=seed,
                    progress=tell)  # fmt: skip
 
 

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from .console import csv_text, err, out, reporting, save_figure, task_of, writable
-from .options import Output, Preset, Seed, TaskName
+from .options import OtherTask, Output, Preset, Seed
 
 if TYPE_CHECKING:
     from jaxmuscle.model._tasks import AbstractTask
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 def simulate(
     preset: Preset,
-    task: Annotated[TaskName | None, typer.Option(help="Put the same muscle into another task.")] = None,
+    task: OtherTask = None,
     seeds: Annotated[int, typer.Option(min=1, help="Noise paths.")] = 50,
     seed: Seed = 0,
     output: Output = Path("out"),

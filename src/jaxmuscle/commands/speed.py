@@ -7,12 +7,12 @@ import typer
 
 from .console import out, reporting, task_of
 from .ensemble import Devices, Json, Precision, cores, use
-from .options import TaskName
+from .options import OtherTask
 
 
 def speed(
     preset: Annotated[str | None, typer.Argument(help="Preset or fit.json; the default isometric task without.")] = None,
-    task: Annotated[TaskName | None, typer.Option(help="Put the same muscle into another task.")] = None,
+    task: OtherTask = None,
     seeds: Annotated[int, typer.Option(min=1, help="Noise paths.")] = 2048,
     duration: Annotated[float, typer.Option(help="Simulated time [s].")] = 15.0,
     precision: Annotated[Precision, typer.Option(help="Of the simulation.")] = Precision.single,
