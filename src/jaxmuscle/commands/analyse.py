@@ -5,11 +5,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+import jaxmuscle as jm
+
 from .console import csv_text, err, out, plain, reporting, save_figure, writable
 from .options import Output
 
 if TYPE_CHECKING:
-    from jaxmuscle.data._recording import Recording
+    from jaxmuscle import Recording
 
 
 def analyse(
@@ -40,11 +42,10 @@ def analyse(
         if save_target is not None and save_target.suffix.lower() != ".toml":
             raise ValueError(f"--save-target {save_target}: a target is saved as TOML; give a name that ends in .toml")
         writable(output)
-        from jaxmuscle.data._recording_files import load_recording
 
         try:
             asked: Any = {"column": column, "rate": rate, "units": units, "axis": axis, "reference": reference}
-            recording = load_recording(path, **asked)
+            recording = jm.load_recording(path, **asked)
         except ImportError as error:
             raise ValueError(str(error)) from None
         if edges != "all":

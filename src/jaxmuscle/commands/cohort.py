@@ -7,13 +7,14 @@ from typing import TYPE_CHECKING, Any
 from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
+import jaxmuscle as jm
 from jaxmuscle._common.progress import progress
 
 from .console import BAD_INPUT, CONVERGED, NOT_CONVERGED, csv_text, err, out, plain, save_figure, writable, write_fit
 from .options import TaskName
 
 if TYPE_CHECKING:
-    from jaxmuscle.fits._cohort import CohortResult
+    from jaxmuscle.fits import CohortResult
 
 
 SHOWN = {
@@ -33,16 +34,13 @@ def fit_together(
     options: dict[str, Any],
 ) -> int:
     """Fit and write all targets that can be read; the exit code says whether some could not be, or did not converge."""
-    from jaxmuscle.data._target import load_target
-    from jaxmuscle.fits._cohort import CohortResult, fit_cohort
-    from jaxmuscle.model._tasks import TASKS
 
     grouped = {} if groups is None else _groups(groups)
     writable(folder)
     targets, failed = [], {}
     for name in names:
         try:
-            targets.append(load_target(name, **read))
+            targets.append(jm.load_target(name, **read))
         except (ValueError, OSError) as error:
             failed[name] = str(error)
     starts = {} if options["starts"] is None else {"starts": options["starts"]}
@@ -50,11 +48,13 @@ def fit_together(
     if not targets:
         raise ValueError(f"none of the targets can be read: {_reasons(failed)}")
     with progress(f"fitting {len(targets)} targets") as tell:
-        found = fit_cohort(targets, groups=grouped, task=None if task is None else TASKS[task], progress=tell, **options)
+        found = jm.fit_cohort(
+            targets, groups=grouped, task=None if task is None else jm.model.TASKS[task], progress=tell, **options
+        )
     failed |= found.failed
     if not found.results:
         raise ValueError(f"none of the targets can be fitted: {_reasons(failed)}")
-    cohort = CohortResult(found.results, found.groups, failed)
+    cohort = jm.fits.CohortResult(found.results, found.groups, failed)
     _write(cohort, folder)
     _show(cohort, folder)
     return BAD_INPUT if failed else CONVERGED if cohort.success else NOT_CONVERGED

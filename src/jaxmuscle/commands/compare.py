@@ -5,13 +5,14 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+import jaxmuscle as jm
 from jaxmuscle._common.progress import progress
 
 from .console import CONVERGED, NOT_CONVERGED, aim_of, csv_text, out, plain, reporting, save_figure, writable
 from .options import Fix, Free, Output, Quantity, Seed, Segments, TargetTask, fixed_values, names_in
 
 if TYPE_CHECKING:
-    from jaxmuscle.comparison._comparison import Comparison
+    from jaxmuscle.comparison import Comparison
 
 
 def compare(
@@ -41,7 +42,6 @@ def compare(
     """
     with reporting():
         from jaxmuscle._common.environment import keep_compiled_programs
-        from jaxmuscle.comparison._compare import compare_noise
 
         keep_compiled_programs()
         fixed = fixed_values(fix)
@@ -49,7 +49,7 @@ def compare(
         aim, model = aim_of(target, task, {"quantity": quantity, "segments": segments})
         writable(output)
         with progress(f"comparing noises on {aim.name}") as tell:
-            found = compare_noise(model, aim, free=names, fix=fixed, key=seed, progress=tell)
+            found = jm.compare_noise(model, aim, free=names, fix=fixed, key=seed, progress=tell)
         _write(found, output)
         _show(found, output)
     raise typer.Exit(CONVERGED if found.success else NOT_CONVERGED)

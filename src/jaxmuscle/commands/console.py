@@ -12,10 +12,12 @@ from typing import TYPE_CHECKING, Any
 import typer
 from rich.console import Console
 
+import jaxmuscle as jm
+
 from .options import TaskName
 
 if TYPE_CHECKING:
-    from jaxmuscle.fits._result import FitResult
+    from jaxmuscle.fits import FitResult
 
 
 def write_fit(result: "FitResult", folder: Path) -> None:
@@ -37,22 +39,18 @@ err = Console(stderr=True, soft_wrap=not sys.stderr.isatty())  # a message is on
 
 def task_of(preset: str, task: TaskName | None) -> Any:
     """The task of a preset, its muscle put into another task if one is named."""
-    from jaxmuscle.model._presets import load_preset
-    from jaxmuscle.model._tasks import TASKS
 
-    model = load_preset(preset)
-    return model if task is None or type(model) is TASKS[task] else model.as_task(TASKS[task])
+    model = jm.load_preset(preset)
+    return model if task is None or type(model) is jm.model.TASKS[task] else model.as_task(jm.model.TASKS[task])
 
 
 def aim_of(name: str, task: TaskName | None, read: dict[str, Any]) -> tuple[Any, Any]:
     """The target of that name or file, its notices said, and the task to fit to it: by default what the target measured."""
-    import jaxmuscle as jm
-    from jaxmuscle.model._tasks import TASKS
 
     target = jm.load_target(name, **read)
     for notice in target.notices:
         err.print(f"[yellow]notice:[/] {plain(notice)}", highlight=False)
-    return target, jm.task_for(target) if task is None else TASKS[task](settings=target.settings)
+    return target, jm.task_for(target) if task is None else jm.model.TASKS[task](settings=target.settings)
 
 
 @contextlib.contextmanager

@@ -11,14 +11,15 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+import jaxmuscle as jm
 from jaxmuscle._common.progress import progress
 
 from .console import NOT_CONVERGED, err, out, reporting, task_of
 from .options import OtherTask, Preset, Seed
 
 if TYPE_CHECKING:
-    from jaxmuscle.ensembles._layout import Pace
-    from jaxmuscle.model._tasks import AbstractTask
+    from jaxmuscle.ensembles import Pace
+    from jaxmuscle.model import AbstractTask
 
 
 Devices = Annotated[int | None, typer.Option(min=1, help="Cores of a CPU to use, each as a device; all by default.")]
@@ -65,13 +66,12 @@ def ensemble(
     """
     with alone_or_together(coordinator, processes):
         from jaxmuscle._common.environment import keep_compiled_programs
-        from jaxmuscle.ensembles._processes import join, launched
 
         if states and reduce:
             raise ValueError("--states belongs to a store of trajectories: leave out --reduce")
         use(precision, devices, cores(coordinator, processes))
-        if launched() or any(given is not None for given in (coordinator, processes, process_id)):
-            join(coordinator, processes, process_id)
+        if jm.ensembles.launched() or any(given is not None for given in (coordinator, processes, process_id)):
+            jm.ensembles.join(coordinator, processes, process_id)
         keep_compiled_programs()
         model = task_of(preset, task)
         settings = {"duration": duration, "dt": dt, "chunk": chunk, "resume": resume, "states": states}
@@ -86,20 +86,17 @@ def run(
     import jax
 
     from jaxmuscle._common.text import listed
-    from jaxmuscle.ensembles._ensemble import ensemble as simulate_all
-    from jaxmuscle.ensembles._layout import Watch
-    from jaxmuscle.ensembles._store import attributes_of
 
     first = jax.process_index() == 0
-    before = attributes_of(output).get("complete") if settings["resume"] and output.exists() else None
+    before = jm.ensembles.attributes_of(output).get("complete") if settings["resume"] and output.exists() else None
     if settings["resume"] and first and not before and not as_json:
         err.print(f"{output}: {'there is no store yet, starting one' if before is None else 'resuming'}", highlight=False)
     begun = time.monotonic()
     with watching(f"{seeds} seeds", first=first, as_json=as_json) as tell:
         kept: Any = {"reduce": True} if reduce else {}
-        found: Any = simulate_all(model if sweep is None else sweep, jax.random.key(seed), seeds=seeds, store=output,
-                                  progress=Watch(tell), **kept, **settings)  # fmt: skip
-    failed, elapsed = json.loads(attributes_of(output)["failed"]), time.monotonic() - begun
+        found: Any = jm.ensemble(model if sweep is None else sweep, jax.random.key(seed), seeds=seeds, store=output,
+                                  progress=jm.ensembles.Watch(tell), **kept, **settings)  # fmt: skip
+    failed, elapsed = json.loads(jm.ensembles.attributes_of(output)["failed"]), time.monotonic() - begun
     if not first:
         return not failed
     if as_json:
@@ -145,7 +142,6 @@ def watching(title: str, *, first: bool, as_json: bool) -> Iterator[Callable[["P
 def alone_or_together(coordinator: str | None, processes: int | None) -> Iterator[None]:
     """As `reporting`; one of several processes that fails ends at once, so that the others notice."""
     from jaxmuscle._common.errors import ProcessLostError
-    from jaxmuscle.ensembles._processes import launched, leave
 
     try:
         with reporting():
@@ -155,14 +151,13 @@ def alone_or_together(coordinator: str | None, processes: int | None) -> Iterato
                 err.print(f"[bold red]failed:[/] {error}. What is complete stays: start all processes again with --resume")
                 raise typer.Exit(NOT_CONVERGED) from None
     except typer.Exit as stop:
-        if stop.exit_code and (launched() or (coordinator is not None and processes not in (None, 1))):
-            leave(stop.exit_code)
+        if stop.exit_code and (jm.ensembles.launched() or (coordinator is not None and processes not in (None, 1))):
+            jm.ensembles.leave(stop.exit_code)
         raise
 
 
 def swept(model: "AbstractTask", vary: list[str]) -> Any:
     """The grid that --vary asks for, or None."""
-    from jaxmuscle.ensembles._sweep import Sweep
 
     values = {}
     for entry in vary:
@@ -171,7 +166,7 @@ def swept(model: "AbstractTask", vary: list[str]) -> Any:
             values[name.strip()] = [float(number) for number in text.split(",")]
         except ValueError:
             raise ValueError(f"--vary {entry}: give a name and numbers, such as k_w=4e5,5e5") from None
-    return Sweep.grid(model, **values) if values else None
+    return jm.Sweep.grid(model, **values) if values else None
 
 
 def cores(coordinator: str | None, processes: int | None) -> int:

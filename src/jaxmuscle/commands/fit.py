@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.table import Table
 
+import jaxmuscle as jm
 from jaxmuscle._common.progress import progress
 
 from .console import CONVERGED, INTERRUPTED, NOT_CONVERGED, aim_of, err, out, plain, reporting, writable, write_fit
@@ -27,7 +28,7 @@ from .options import (
 )
 
 if TYPE_CHECKING:
-    from jaxmuscle.fits._result import FitResult
+    from jaxmuscle.fits import FitResult
 
 
 def fit(
@@ -107,14 +108,12 @@ def fit(
 
 
 def _fit_one(target: Any, model: Any, folder: Path, options: dict[str, Any]) -> bool:
-    from jaxmuscle.fits._fit import fit as fit_task
-    from jaxmuscle.fits._search import FitInterrupted
 
     writable(folder)
     try:
         with progress(f"fitting {target.name}") as tell:
-            result = fit_task(model, target, progress=tell, **options)
-    except FitInterrupted as stop:
+            result = jm.fit(model, target, progress=tell, **options)
+    except jm.fits.FitInterrupted as stop:
         write_fit(stop.result, folder)
         err.print(f"interrupted: what had been reached is in {folder}")
         raise typer.Exit(INTERRUPTED) from None

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.table import Table
 
+import jaxmuscle as jm
 from jaxmuscle._common.progress import progress
 
 from .console import CONVERGED, NOT_CONVERGED, aim_of, err, out, plain, reporting, save_figure, writable
@@ -25,8 +26,8 @@ from .options import (
 )
 
 if TYPE_CHECKING:
-    from jaxmuscle.fits._result import FitResult
-    from jaxmuscle.uncertainty._posterior_result import Posterior
+    from jaxmuscle.fits import FitResult
+    from jaxmuscle.uncertainty import Posterior
 
 
 def posterior(
@@ -70,9 +71,7 @@ def posterior(
         result.save(output / "fit.json")
         try:
             with progress(f"posterior of {result.target.name}") as tell:
-                from jaxmuscle.uncertainty._posterior import posterior as draw_posterior
-
-                found = draw_posterior(result, key=seed, chains=chains, draws=draws, warmup=warmup, progress=tell)
+                found = jm.posterior(result, key=seed, chains=chains, draws=draws, warmup=warmup, progress=tell)
         except ImportError as error:
             raise ValueError(str(error)) from None
         _write(found, output)
@@ -81,22 +80,20 @@ def posterior(
 
 
 def _fitted(target: str, read: dict[str, Any], asked: dict[str, Any], seed: int) -> "FitResult":
-    from jaxmuscle.fits._fit import fit
-    from jaxmuscle.fits._result import load_result
 
     path = Path(target)
     if path.suffix == ".json" and path.is_file() and "task_table" in json.loads(path.read_text(encoding="utf-8")):
         if any(v is not None for v in read.values()) or any(asked[n] is not None for n in ("task", "free", "fix")):
             raise ValueError(f"{target}: is a fit; its task, parameters and target stay as they are, so leave out --task, "
                              "--free, --fix, --segments and --quantity")  # fmt: skip
-        return load_result(path)
+        return jm.load_result(path)
     loaded, model = aim_of(target, asked["task"], read)
     if loaded.segments is None and loaded.sigma is None:
         raise ValueError(f"{target}: states neither segments nor sigma, so nothing says how much it scatters: give "
                          "--segments, the number of Welch segments that were averaged, or a third column sigma")  # fmt: skip
     names = names_in(asked["free"])
     with progress(f"fitting {loaded.name}") as tell:
-        return fit(model, loaded, free=names, fix=fixed_values(asked["fix"]), noise=asked["noise"], key=seed,
+        return jm.fit(model, loaded, free=names, fix=fixed_values(asked["fix"]), noise=asked["noise"], key=seed,
                    progress=tell)  # fmt: skip
 
 

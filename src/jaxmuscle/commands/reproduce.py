@@ -5,6 +5,9 @@ from typing import Annotated
 
 import typer
 
+import jaxmuscle as jm
+from jaxmuscle import paper
+
 from .console import err, out, reporting, writable
 from .options import Output
 
@@ -28,21 +31,17 @@ def reproduce(
     """
     with reporting():
         from jaxmuscle._common.environment import keep_compiled_programs
-        from jaxmuscle.paper._numbers import given_recordings
 
         keep_compiled_programs()
         writable(output)
-        given = given_recordings(recording) if recording else None
+        given = paper.given_recordings(recording) if recording else None
         _reproduce(output, given)
 
 
 def _reproduce(folder: Path, given) -> None:
     from collections import Counter
 
-    from jaxmuscle.paper._claims import check
-    from jaxmuscle.paper._reproduce import reproduce
-
-    rows = check(reproduce(folder, given, progress=err.is_terminal))
+    rows = paper.check(jm.reproduce(folder, given, progress=err.is_terminal))
     count = Counter(row.verdict for row in rows)
     out.print(f"{len(rows)} statements: " + ", ".join(f"{n} {verdict}" for verdict, n in count.items()), highlight=False)
     for row in rows:

@@ -5,11 +5,13 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+import jaxmuscle as jm
+
 from .console import csv_text, err, out, reporting, save_figure, task_of, writable
 from .options import OtherTask, Output, Preset, Seed
 
 if TYPE_CHECKING:
-    from jaxmuscle.model._tasks import AbstractTask
+    from jaxmuscle.model import AbstractTask
 
 
 def simulate(
@@ -42,12 +44,9 @@ def _simulate(model: "AbstractTask", seeds: int, seed: int, folder: Path) -> Non
     import jax
     import numpy as np
 
-    from jaxmuscle import plot
     from jaxmuscle._common.files import replacing, write_text
-    from jaxmuscle.ensembles._ensemble import ensemble
-    from jaxmuscle.spectra._measures import coefficient_of_variation, peaks
 
-    runs = ensemble(model, jax.random.key(seed), seeds=seeds, progress=err.is_terminal)
+    runs = jm.ensemble(model, jax.random.key(seed), seeds=seeds, progress=err.is_terminal)
     spectra = runs.spectrum()
     estimate = runs.mean_spectrum()
     mean = estimate.spectrum
@@ -58,10 +57,10 @@ def _simulate(model: "AbstractTask", seeds: int, seed: int, folder: Path) -> Non
     columns = {"frequency_hz": np.asarray(mean.frequency), "power": np.asarray(mean.power), "power_stderr": estimate.stderr,
                "proportional_power": np.asarray(mean.proportional), "quantile_05": low, "quantile_95": high}  # fmt: skip
     write_text(folder / "spectrum.csv", csv_text(columns))
-    save_figure(plot.simulation(runs), folder / "simulate.png")
+    save_figure(jm.plot.simulation(runs), folder / "simulate.png")
     held = runs.filtered()
-    found = peaks(mean)
-    variation = 100 * np.mean(coefficient_of_variation(held))
+    found = jm.spectra.peaks(mean)
+    variation = 100 * np.mean(jm.spectra.coefficient_of_variation(held))
     out.print(f"{type(model).__name__}, {seeds} seeds of {runs.time[-1]:g} s", highlight=False)
     level = f"{held.mean():.4g} {model.output_unit}"
     out.print(f"{model.output_name}: mean {level}, coefficient of variation {variation:.3g} %", highlight=False)

@@ -5,6 +5,8 @@ from typing import Annotated
 
 import typer
 
+import jaxmuscle as jm
+
 from .console import out, reporting, task_of
 from .ensemble import Devices, Json, Precision, cores, use
 from .options import OtherTask
@@ -24,12 +26,9 @@ def speed(
     Reduces an ensemble as `jaxmuscle ensemble --reduce` does, without control variate; medians of three calls.
     """
     with reporting():
-        from jaxmuscle.ensembles._speed import measure
-        from jaxmuscle.model._tasks import TASKS, Isometric
-
         use(precision, devices, cores(None, None))
-        model = task_of(preset, task) if preset else Isometric() if task is None else TASKS[task]()
-        found = measure(model, seeds, duration)
+        model = task_of(preset, task) if preset else jm.Isometric() if task is None else jm.model.TASKS[task]()
+        found = jm.ensembles.measure(model, seeds, duration)
         if as_json:
             print(json.dumps(found))
             return

@@ -37,7 +37,10 @@ class Chunk(NamedTuple):
 
 
 class Pace(NamedTuple):
-    """How far this process is, in its share of the seeds (points times seeds in a sweep), and how fast."""
+    """How far this process is, in its share of the seeds (points times seeds in a sweep), and how fast.
+
+    `done` of `total` seeds; `seeds_per_second`; `real_time_factor`, simulated over real time; `left` [s].
+    """
 
     done: int
     total: int
@@ -51,7 +54,7 @@ class Pace(NamedTuple):
 
 
 class Watch(NamedTuple):
-    """Wants to know the pace in numbers."""
+    """For `progress=` of `ensemble`: `tell` is called with the `Pace` after every chunk."""
 
     tell: Callable[[Pace], None]
 

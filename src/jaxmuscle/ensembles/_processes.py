@@ -15,7 +15,9 @@ LAST_WORDS = 2.0  # seconds
 
 
 def join(coordinator: str | None, processes: int | None, process_id: int | None) -> None:
-    """Become one of several processes; without arguments as the launcher says (SLURM, Open MPI, ...).
+    """Become one of several processes; with None for all arguments as the launcher says (SLURM, Open MPI, ...).
+
+    **Arguments:** `coordinator`, "host:port" of process 0; `processes`, how many; `process_id` of this one, from 0.
 
     **Raises:** `ValueError` for arguments that do not go together, or if nobody answers.
     """
@@ -66,7 +68,7 @@ def _first_line(error: Exception) -> str:
 
 
 def leave(code: int) -> NoReturn:
-    """End this process: JAX's own end would wait for processes that will not come.
+    """End this process with the exit `code`: JAX's own end would wait for processes that will not come.
 
     Process 0 lets the others speak first, since they cannot outlive it.
     """

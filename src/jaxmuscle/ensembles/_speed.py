@@ -31,7 +31,10 @@ def peak_memory() -> int:
 
 
 def measure(task: AbstractTask, seeds: int, duration: float) -> dict[str, Any]:
-    """Compile time [s], speed and memory of a reduced ensemble: the first call, then the median of three."""
+    """Compile time [s], speed and memory of a reduced ensemble: the first call, then the median of three.
+
+    **Arguments:** `task`; `seeds`; `duration` [s]. **Returns:** a table of numbers and names.
+    """
     before = peak_memory()
     jax.config.update("jax_compilation_cache_dir", None)
     taken = []

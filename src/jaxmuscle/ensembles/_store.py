@@ -77,7 +77,7 @@ def writing(path: Path) -> Iterator[None]:
 
 
 def attributes_of(path: Path) -> dict[str, Any]:
-    """Attributes of a store. Raises `StoreError` if it is none."""
+    """Attributes of the store at `path`. **Raises:** `StoreError` if there is none."""
     try:
         return json.loads((path / "zarr.json").read_text(encoding="utf-8"))["attributes"]
     except (OSError, ValueError, KeyError) as error:

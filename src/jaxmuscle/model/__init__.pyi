@@ -21,6 +21,7 @@ from ._signals import Harmonic as Harmonic
 from ._signals import RampHold as RampHold
 from ._signals import Sampled as Sampled
 from ._signals import SmoothStep as SmoothStep
+from ._tasks import TASKS as TASKS
 from ._tasks import AbstractTask as AbstractTask
 from ._tasks import Isometric as Isometric
 from ._tasks import PrescribedForce as PrescribedForce
