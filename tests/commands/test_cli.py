@@ -19,7 +19,6 @@ from typer.testing import CliRunner
 import jaxmuscle as jm
 from jaxmuscle._common.environment import keep_compiled_programs
 from jaxmuscle.commands.main import app
-from jaxmuscle.fits import _cohort, _fit
 
 GRID = 0.390625 * np.arange(1, 31)
 POWER = 1 / (1 + (GRID / 1.2) ** 2) + 0.01
@@ -295,7 +294,7 @@ def test_several_targets_have_a_folder_each(tmp_path, monkeypatch):
         a, b = targets
         return jm.fits.CohortResult({a.name: made_result(target=a), b.name: failed_result()}, {}, {})
 
-    monkeypatch.setattr(_cohort, "fit_cohort", fake)
+    monkeypatch.setattr(jm, "fit_cohort", fake)
     paths = [csv_file(tmp_path, name=f"{name}.csv") for name in "ab"]
     arguments = ("--task", "prescribed-force", "--noise", "ornstein-uhlenbeck", "--out", tmp_path / "out")
     outcome = run("fit", *paths, *arguments)
@@ -311,7 +310,7 @@ def test_several_targets_have_a_folder_each(tmp_path, monkeypatch):
     ids=["converged", "not converged", "exploded"],
 )
 def test_the_exit_code_says_whether_it_converged(result, code, word, tmp_path, monkeypatch):
-    monkeypatch.setattr(_fit, "fit", lambda *_, **__: result)
+    monkeypatch.setattr(jm, "fit", lambda *_, **__: result)
     (tmp_path / "fit.png").write_text("of an earlier fit")
     outcome = run("fit", csv_file(tmp_path), "--out", tmp_path)
     assert outcome.exit_code == code
@@ -328,7 +327,7 @@ def test_options_reach_the_fit(tmp_path, monkeypatch):
         seen.update(options, task=task, target=target)
         return made_result()
 
-    monkeypatch.setattr(_fit, "fit", fake)
+    monkeypatch.setattr(jm, "fit", fake)
     fixed = ("--fix", "noise_K_z=0", "--fix", "noise_C_z = 0")
     many = ("--free", " c_w ,k_w,", "--starts", 3, "--seeds", 9, "--seed", 4, "--segments", 7, "--residual", "linear")
     assert run("fit", csv_file(tmp_path), "--noise", "white", *fixed, *many, "--out", tmp_path).exit_code == 0
@@ -344,7 +343,7 @@ def test_a_failing_simulation_is_not_a_users_mistake(tmp_path, monkeypatch):
     def explode(*_, **__):
         raise jm.errors.SimulationError("3 seed(s) did not stay finite [0, 1, 2]")
 
-    monkeypatch.setattr(_ensemble, "ensemble", explode)
+    monkeypatch.setattr(jm, "ensemble", explode)
     made_result().save(tmp_path / "fit.json")
     outcome = run("simulate", tmp_path / "fit.json", "--out", tmp_path / "out")
     assert outcome.exit_code == 1 and "failed: 3 seed(s) did not stay finite [0, 1, 2]" in outcome.stderr
@@ -357,7 +356,7 @@ def test_an_interrupted_fit_writes_what_had_been_reached(tmp_path, monkeypatch):
     def interrupted(*_, **__):
         raise jm.fits.FitInterrupted(made_result(success=False, message="interrupted after 3 steps"))
 
-    monkeypatch.setattr(_fit, "fit", interrupted)
+    monkeypatch.setattr(jm, "fit", interrupted)
     outcome = run("fit", csv_file(tmp_path), "--out", tmp_path / "out")
     assert outcome.exit_code == 130
     assert f"what had been reached is in {tmp_path / 'out'}" in outcome.stderr
@@ -369,7 +368,7 @@ def test_an_interruption_before_the_first_step_writes_nothing(tmp_path, monkeypa
     def interrupted(*_, **__):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(_fit, "fit", interrupted)
+    monkeypatch.setattr(jm, "fit", interrupted)
     outcome = run("fit", csv_file(tmp_path), "--out", tmp_path / "out")
     assert outcome.exit_code == 130 and "interrupted" in outcome.stderr
     assert list((tmp_path / "out").iterdir()) == []
@@ -421,7 +420,7 @@ def test_a_cache_that_cannot_be_written_is_done_without(tmp_path, monkeypatch):
     monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(tmp_path / "file" / "cache"))
     assert keep_compiled_programs() is None
     assert jax.config.jax_compilation_cache_dir is None
-    monkeypatch.setattr(_fit, "fit", lambda *_, **__: made_result())
+    monkeypatch.setattr(jm, "fit", lambda *_, **__: made_result())
     assert run("fit", csv_file(tmp_path), "--out", tmp_path / "out").exit_code == 0
 
 

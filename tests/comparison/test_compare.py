@@ -389,7 +389,7 @@ def test_the_command_writes_its_files(success, tmp_path, monkeypatch, keep_cache
         asked.update(options, task=task, target=target)
         return made(success=success)
 
-    monkeypatch.setattr(_compare, "compare_noise", compare_noise)
+    monkeypatch.setattr(jm, "compare_noise", compare_noise)
     result = command(FORCE, "--free", "c_w, noise_K_z", "--fix", "k_w=4e5", "--seed", 3, "--segments", 9, "--out", tmp_path)
     assert result.exit_code == (0 if success else 1)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["compare.csv", "compare.json", "compare.png"]
