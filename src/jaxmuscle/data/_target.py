@@ -1,6 +1,5 @@
 """Targets: a measured, digitised or reconstructed proportional power spectrum to fit a model to."""
 
-import contextlib
 import os
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -13,6 +12,7 @@ from jaxtyping import Float, Int
 
 from jaxmuscle import plot
 from jaxmuscle._common.errors import TargetError
+from jaxmuscle._common.files import write_text
 from jaxmuscle._common.text import folded
 from jaxmuscle.spectra._bin_law import bin_statistics
 from jaxmuscle.spectra._settings import SpectrumSettings
@@ -112,13 +112,11 @@ class Target(eqx.Module):
         path = Path(path).expanduser()
         if path.suffix.lower() != ".toml":
             raise TargetError(f"{path}: a target is saved as TOML; give a name that ends in .toml")
-        temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+        if not path.parent.is_dir():
+            raise TargetError(f"{path}: cannot be written: there is no folder {path.parent}")
         try:
-            temporary.write_text(tomli_w.dumps(self.to_table()), encoding="utf-8")
-            os.replace(temporary, path)
+            write_text(path, tomli_w.dumps(self.to_table()))
         except OSError as error:
-            with contextlib.suppress(OSError):
-                temporary.unlink()
             raise TargetError(f"{path}: cannot be written: {error.strerror}") from None
 
     def sampling_band(self) -> tuple[Float[np.ndarray, " bins"], Float[np.ndarray, " bins"]] | None:

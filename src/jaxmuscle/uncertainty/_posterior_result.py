@@ -1,6 +1,5 @@
 """What a posterior says: draws, summary, and the file they are kept in."""
 
-import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -10,7 +9,7 @@ from jaxtyping import Float
 
 from jaxmuscle import plot
 from jaxmuscle._common.errors import NotMixedError
-from jaxmuscle._common.files import write_json
+from jaxmuscle._common.files import replacing, write_json
 from jaxmuscle._common.text import folded
 from jaxmuscle.data._target import Target
 from jaxmuscle.model._tasks import AbstractTask
@@ -176,13 +175,8 @@ def datatree(found: Any) -> "xarray.DataTree":
 
 def write_netcdf(path: str | Path, found: Any) -> None:
     """Write the tree to a temporary file beside `path`, then rename it."""
-    path = Path(path)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
+    with replacing(path) as temporary:
         datatree(found).to_netcdf(temporary, engine="h5netcdf")
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 def summary_table(found: Any) -> dict[str, Any]:
