@@ -159,6 +159,16 @@ def test_a_target_says_that_most_of_its_variation_is_drift():
     assert float(said.split(" with it, ")[1].split(" ")[0]) == pytest.approx(without, rel=0.01)
 
 
+def test_a_recording_that_begins_later_has_the_same_window_later():
+    """Times of a recorder that ran before: nothing but the times moves."""
+    x = noisy(seed=2)
+    early, late = Recording(x, 2048).steady((2, 18)), Recording(x, 2048, start=30.0).steady((32, 48))
+    np.testing.assert_array_equal(early.samples, late.samples)
+    np.testing.assert_allclose(late.time - early.time, 30.0, rtol=1e-12)
+    np.testing.assert_array_equal(early.spectrum().power, late.spectrum().power)
+    assert early.summary().coefficient_of_variation == late.summary().coefficient_of_variation
+
+
 def test_target_carries_what_is_known(tmp_path):
     part = Recording(noisy(), 2048, name="trial", source="a file").steady((2, 18))
     target = part.target(mvc=100.0)

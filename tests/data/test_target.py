@@ -195,6 +195,16 @@ def test_settings_without_filter_survive_saving(tmp_path):
     assert load_target(tmp_path / "copy.toml") == target
 
 
+@pytest.mark.parametrize("wrong", [0.0, -0.1, np.nan, np.inf])
+@pytest.mark.parametrize("name", ["proportional_power", "sigma"])
+def test_one_value_that_no_spectrum_has_is_refused(name, wrong):
+    settings = SpectrumSettings(rate=50.0, length=64, last_bin=4, filter_cutoff=None)
+    fields = {"proportional_power": [4.0, 3.0, 2.0, 1.0], "sigma": [1.0, 1.0, 1.0, 1.0]}
+    fields[name][2] = wrong
+    with pytest.raises(TargetError, match=f"{name}: every value must be finite and larger than 0"):
+        Target("mine", fields["proportional_power"], settings=settings, sigma=fields["sigma"])
+
+
 @pytest.mark.parametrize(("path", "message"), [("copy.csv", ".toml"), ("missing/copy.toml", "written")])
 def test_save_refuses(path, message, tmp_path):
     with pytest.raises(TargetError, match=message):
