@@ -11,7 +11,7 @@ import numpy as np
 import scipy.linalg
 from jaxtyping import Array, Float
 
-from jaxmuscle import AbstractTask
+from jaxmuscle.model import AbstractTask
 
 
 def _heun(slope: Callable[[Any, Any, Any], Any], t: Any, dt: float, y: Any, u: tuple[Any, Any]) -> Any:

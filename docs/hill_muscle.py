@@ -78,7 +78,7 @@ def tendon_strain(force):
     return TOE * jnp.log1p(carried)
 
 
-class HillMuscle(jm.model.AbstractMuscle):
+class HillMuscle(jm.AbstractMuscle):
     """Contractile and parallel elastic element (the active tissue) in series with a tendon (the passive tissue).
 
         active_force  = P_0 - [a F_max f_L(λ) f_V(ν) + F_max f_P(λ)] cos α + ΔK_w x_w + ΔC_w x_w'

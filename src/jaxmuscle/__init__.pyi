@@ -29,6 +29,7 @@ from .fits._fit import fit as fit
 from .fits._joint import fit_joint as fit_joint
 from .fits._joint_result import load_joint_result as load_joint_result
 from .fits._result import load_result as load_result
+from .model._muscle import AbstractMuscle as AbstractMuscle
 from .model._muscle import Muscle as Muscle
 from .model._noise import BandLimitedNoise as BandLimitedNoise
 from .model._noise import OrnsteinUhlenbeckNoise as OrnsteinUhlenbeckNoise

@@ -109,7 +109,7 @@ def test_a_custom_law_may_reuse_a_table_name():
 
 @pytest.mark.slow
 def test_a_whole_own_muscle_runs_in_every_task():
-    class Linear(jm.model.AbstractMuscle):
+    class Linear(jm.AbstractMuscle):
         m_w: Scalar = 0.5
         m_z: Scalar = 0.4
         stiff: Scalar = 150.0

@@ -435,7 +435,7 @@ def test_a_task_from_outside_a_compiled_function():
     np.testing.assert_allclose(scaled, 2 * np.asarray(jm.expected_spectrum(task).power), rtol=1e-5)
 
 
-class Crossbridge(jm.model.AbstractMuscle):
+class Crossbridge(jm.AbstractMuscle):
     """A user's own muscle: a cubic active and a linear passive tissue. Counts how often it is traced."""
 
     m_w: float = 0.4

@@ -12,7 +12,7 @@ from jaxmuscle.response._characteristics import static_characteristics
 EXACT = {"rtol": 1e-12, "atol": 1e-12}
 
 
-class Tendon(jm.model.AbstractMuscle):
+class Tendon(jm.AbstractMuscle):
     """A user's muscle: linear active spring with an offset, exponential passive one, linear dampers."""
 
     m_w: float = 0.5

@@ -1,5 +1,6 @@
 """Trees of numbers: as arrays, as plain numbers, concrete or traced."""
 
+import math
 from typing import Any
 
 import equinox as eqx
@@ -60,3 +61,17 @@ def as_numbers(tree: Any) -> Any:
         return float(leaf) if np.ndim(leaf) == 0 else np.asarray(leaf, dtype=float)
 
     return jax.tree.map(number, tree)
+
+
+def with_nulls(values: Any) -> Any:
+    """A number, or an array as a flat list, for JSON: it has no word for what is not finite, so None there."""
+    if values is None or isinstance(values, bool | int | str):
+        return values
+    if isinstance(values, float):
+        return values if math.isfinite(values) else None
+    return [float(v) if np.isfinite(v) else None for v in np.ravel(values)]
+
+
+def from_nulls(values: list[Any] | None) -> Any:
+    """The array of a list that `with_nulls` made; None if there is none."""
+    return None if values is None else np.array([np.nan if v is None else v for v in values], dtype=float)

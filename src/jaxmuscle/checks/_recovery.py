@@ -11,6 +11,7 @@ import scipy.stats
 from jaxtyping import Float
 
 from jaxmuscle import plot
+from jaxmuscle._common.arrays import with_nulls
 from jaxmuscle._common.environment import versions
 from jaxmuscle._common.files import write_text
 from jaxmuscle._common.text import folded
@@ -177,7 +178,7 @@ class Bootstrap(eqx.Module):
 
     def to_json(self) -> str:
         """Everything but the task as JSON."""
-        rows = {q.name: {"values": _numbers(q.values), "stderrs": _numbers(q.stderrs)} for q in self.quantities.values()}
+        rows = {q.name: {"values": with_nulls(q.values), "stderrs": with_nulls(q.stderrs)} for q in self.quantities.values()}
         table = {
             "format": FORMAT,
             "target": self.target.name,
@@ -185,7 +186,7 @@ class Bootstrap(eqx.Module):
             "replicates": self.replicates,
             "failed": {str(number): why for number, why in self.failed.items()},
             "sentences": list(self.sentences),
-            "table": [{name: _number(value) for name, value in row.items()} for row in self.table()],
+            "table": [{name: with_nulls(value) for name, value in row.items()} for row in self.table()],
             "refits": rows,
             "seed": self.seed,
             "versions": self.versions,
@@ -199,11 +200,3 @@ class Bootstrap(eqx.Module):
     def plot(self, ax: "Axes | None" = None) -> "Figure | SubFigure":
         """The refits of every quantity, with the true value and the interval that the fit states."""
         return plot.bootstrap(self, ax)
-
-
-def _number(value: Any) -> Any:
-    return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
-def _numbers(values: np.ndarray) -> list[float | None]:
-    return [_number(float(v)) for v in values]

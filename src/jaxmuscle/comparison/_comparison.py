@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxmuscle import plot
+from jaxmuscle._common.arrays import with_nulls
 from jaxmuscle._common.environment import versions
 from jaxmuscle._common.files import write_text
 from jaxmuscle._common.text import folded
@@ -242,7 +243,7 @@ class Comparison(eqx.Module):
         table = {
             "format": FORMAT,
             "target": self.target.name,
-            "rows": [{name: _number(value) for name, value in row.items()} for row in self.table()],
+            "rows": [{name: with_nulls(value) for name, value in row.items()} for row in self.table()],
             "verdict": list(self.verdict),
             "left_out": self.left_out,
             "harmonic_needed": self.harmonic_needed,
@@ -253,8 +254,8 @@ class Comparison(eqx.Module):
                 {
                     "noise": row.noise,
                     "harmonic": row.harmonic,
-                    "fitted": [_number(v) for v in self.fitted[row.noise, row.harmonic].tolist()],
-                    "scores": None if row.scores is None else [_number(v) for v in row.scores.tolist()],
+                    "fitted": with_nulls(self.fitted[row.noise, row.harmonic]),
+                    "scores": with_nulls(row.scores),
                     "task": task_to_table(self.tasks[row.noise, row.harmonic]),
                 }
                 for row in self.rows
@@ -291,7 +292,3 @@ class Comparison(eqx.Module):
 
 def _short(value: Any) -> str:
     return f"{value:.1f}" if abs(value) < 1e4 else f"{value:.3g}"
-
-
-def _number(value: Any) -> Any:
-    return None if isinstance(value, float) and not math.isfinite(value) else value

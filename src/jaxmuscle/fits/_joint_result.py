@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxmuscle import plot
+from jaxmuscle._common.arrays import from_nulls, with_nulls
 from jaxmuscle._common.files import write_json
 from jaxmuscle._common.text import folded
 from jaxmuscle.data._target import Target
@@ -117,14 +118,6 @@ class JointResult(eqx.Module):
         return folded(lines)
 
 
-def _list(values: Any) -> list[Any] | None:
-    return None if values is None else [float(v) if np.isfinite(v) else None for v in np.ravel(values)]
-
-
-def _array(values: list[Any] | None) -> Any:
-    return None if values is None else np.array([np.nan if v is None else v for v in values], dtype=float)
-
-
 def _to_json(result: JointResult) -> dict[str, Any]:
     return {
         "format": FORMAT,
@@ -134,13 +127,13 @@ def _to_json(result: JointResult) -> dict[str, Any]:
         "derived": {name: estimate_to_table(p) for name, p in result.derived.items()},
         "correlation": result.correlation,
         "undetermined": list(result.undetermined),
-        "singular_values": _list(result.singular_values),
+        "singular_values": with_nulls(result.singular_values),
         "parts": {
             name: {
                 "chi2_per_bin": part.chi2_per_bin,
                 "rms_log_error": part.rms_log_error,
-                "frequency_hz": _list(part.target.frequency),
-                **{field: _list(getattr(part, field)) for field in SPECTRUM},
+                "frequency_hz": with_nulls(part.target.frequency),
+                **{field: with_nulls(getattr(part, field)) for field in SPECTRUM},
                 "nonlinearity": part.nonlinearity,
                 "target_table": part.target.to_table(),
                 "task_table": task_to_table(part.task),
@@ -162,7 +155,7 @@ def load_joint_result(path: str | Path) -> JointResult:
 
 def _from_json(table: dict[str, Any]) -> JointResult:
     def part(p: dict[str, Any]) -> JointPart:
-        spectra = {field: _array(p[field]) for field in SPECTRUM}
+        spectra = {field: from_nulls(p[field]) for field in SPECTRUM}
         return JointPart(
             Target.from_table(p["target_table"]), task_from_table(p["task_table"]), p["chi2_per_bin"], p["rms_log_error"],
             **spectra, nonlinearity=p["nonlinearity"],
@@ -176,7 +169,7 @@ def _from_json(table: dict[str, Any]) -> JointResult:
         derived={name: estimate_from_table(p) for name, p in table["derived"].items()},
         correlation=table["correlation"],
         undetermined=tuple(table["undetermined"]),
-        singular_values=_array(table["singular_values"]),
+        singular_values=from_nulls(table["singular_values"]),
         starts=tuple(Start(s["cost"], s["success"], s["steps"]) for s in table["starts"]),
         notices=tuple(table["notices"]),
         seed=table["seed"],

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxmuscle import plot
+from jaxmuscle._common.arrays import from_nulls, with_nulls
 from jaxmuscle._common.errors import ResultError
 from jaxmuscle._common.files import write_json
 from jaxmuscle._common.text import choices, folded
@@ -147,7 +148,7 @@ class FitResult(eqx.Module):
 
 def estimate_to_table(p: Estimate) -> dict[str, Any]:
     """For JSON, which knows no infinite numbers."""
-    value = float(p.value) if np.isfinite(p.value) else None
+    value = with_nulls(float(p.value))
     return {"value": value, "unit": p.unit, "stderr": p.stderr, "free": p.free, "identifiable": p.identifiable}
 
 
@@ -155,14 +156,6 @@ def estimate_from_table(table: dict[str, Any]) -> Estimate:
     """The reverse of `estimate_to_table`."""
     value = np.nan if table["value"] is None else table["value"]
     return Estimate(value, table["unit"], table["stderr"], table["free"], table["identifiable"])
-
-
-def _numbers(values: Any) -> list[Any]:
-    return [float(v) if np.isfinite(v) else None for v in np.ravel(values)]
-
-
-def _array(values: list[Any]) -> np.ndarray:
-    return np.array([np.nan if v is None else v for v in values], dtype=float)
 
 
 def _to_json(result: FitResult) -> dict[str, Any]:
@@ -178,22 +171,22 @@ def _to_json(result: FitResult) -> dict[str, Any]:
         "derived": {name: estimate_to_table(p) for name, p in result.derived.items()},
         "correlation": result.correlation,
         "undetermined": list(result.undetermined),
-        "singular_values": _numbers(result.singular_values),
+        "singular_values": with_nulls(result.singular_values),
         "chi2_per_bin": result.chi2_per_bin,
         "rms_log_error": result.rms_log_error,
         "spectrum": {
-            "frequency_hz": _numbers(result.frequency_hz),
-            "target": _numbers(result.target.proportional_power),
-            "fitted": _numbers(result.fitted),
-            "harmonic_share": _numbers(result.harmonic_share),
-            "residual": _numbers(result.residual),
-            "deviation": None if result.deviation is None else _numbers(result.deviation),
+            "frequency_hz": with_nulls(result.frequency_hz),
+            "target": with_nulls(result.target.proportional_power),
+            "fitted": with_nulls(result.fitted),
+            "harmonic_share": with_nulls(result.harmonic_share),
+            "residual": with_nulls(result.residual),
+            "deviation": with_nulls(result.deviation),
         },
         "starts": [{"cost": s.cost, "success": s.success, "steps": s.steps} for s in result.starts],
-        "stretch": {"time": _numbers(result.stretch[0]), "output": _numbers(result.stretch[1])},
+        "stretch": {"time": with_nulls(result.stretch[0]), "output": with_nulls(result.stretch[1])},
         "profile": None
         if result.profile is None
-        else {"frequency_hz": _numbers(result.profile[0]), "chi2_rise": _numbers(result.profile[1])},
+        else {"frequency_hz": with_nulls(result.profile[0]), "chi2_rise": with_nulls(result.profile[1])},
         "harmonic_p_value": result.harmonic_p_value,
         "check": result.check,
         "notices": list(result.notices),
@@ -245,16 +238,16 @@ def _from_json(table: dict[str, Any]) -> FitResult:
         derived={name: estimate_from_table(p) for name, p in table["derived"].items()},
         correlation=table["correlation"],
         undetermined=tuple(table["undetermined"]),
-        singular_values=_array(table["singular_values"]),
+        singular_values=from_nulls(table["singular_values"]),
         chi2_per_bin=table["chi2_per_bin"],
         rms_log_error=table["rms_log_error"],
-        fitted=_array(spectrum["fitted"]),
-        harmonic_share=_array(spectrum["harmonic_share"]),
-        residual=_array(spectrum["residual"]),
-        deviation=None if spectrum["deviation"] is None else _array(spectrum["deviation"]),
+        fitted=from_nulls(spectrum["fitted"]),
+        harmonic_share=from_nulls(spectrum["harmonic_share"]),
+        residual=from_nulls(spectrum["residual"]),
+        deviation=from_nulls(spectrum["deviation"]),
         starts=tuple(Start(s["cost"], s["success"], s["steps"]) for s in table["starts"]),
-        stretch=(_array(table["stretch"]["time"]), _array(table["stretch"]["output"])),
-        profile=None if profile is None else (_array(profile["frequency_hz"]), _array(profile["chi2_rise"])),
+        stretch=(from_nulls(table["stretch"]["time"]), from_nulls(table["stretch"]["output"])),
+        profile=None if profile is None else (from_nulls(profile["frequency_hz"]), from_nulls(profile["chi2_rise"])),
         harmonic_p_value=table.get("harmonic_p_value"),
         check=table.get("check", {}),
         notices=tuple(table["notices"]),
