@@ -92,6 +92,8 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 
 def pytest_runtest_setup(item: pytest.Item) -> None:
+    # A command that ran here before keeps only what took long to compile: single operations would be compiled ever again.
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     if item.get_closest_marker("gpu") and jax.default_backend() != "gpu":
         pytest.skip("needs a GPU")
 
