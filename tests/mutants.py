@@ -4,9 +4,9 @@
     python tests/mutants.py --count 10 --tests ../older/tests ...      # the same mutants seen by other tests
 
 A mutant is a copy of the package with one operator, comparison, number or condition changed. It runs the test files of its
-subject in the order of `SUBJECTS`, the most direct first, first what is not slow, and ends at the first failure or after
-`--seconds`. Other files
-might find it, too: the share that is killed is a lower bound. Mutants that were run stay in the file and are not run again.
+subject in the order of `SUBJECTS`, the most direct first, and of these first what is not slow. It ends at the first failure
+or after `--seconds`. Other files might find it, too: the share that is killed is a lower bound. Mutants that were run stay
+in the file and are not run again.
 """
 
 import argparse
