@@ -10,7 +10,7 @@ PIP = $(BIN)/python -m pip --quiet --disable-pip-version-check install
 help:
 	@echo "make fit        fit a bundled measured target; writes report and figure to out/fit"
 	@echo "make test       ruff, basedpyright and the whole test suite"
-	@echo "make test WING=spectra  the tests of one wing and of what stands above it"
+	@echo "make test WING=spectra  the tests of one folder of the package and of those above it"
 	@echo "make test-fast  the tests that are not marked slow"
 	@echo "make mutants    random faults in the package: which of them a test notices; out/mutants.json"
 	@echo "make bench      measure speed; writes out/bench.json"

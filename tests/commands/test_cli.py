@@ -338,8 +338,6 @@ def test_options_reach_the_fit(tmp_path, monkeypatch):
 
 
 def test_a_failing_simulation_is_not_a_users_mistake(tmp_path, monkeypatch):
-    from jaxmuscle.ensembles import _ensemble as _ensemble
-
     def explode(*_, **__):
         raise jm.errors.SimulationError("3 seed(s) did not stay finite [0, 1, 2]")
 

@@ -34,7 +34,6 @@ def fit_together(
     options: dict[str, Any],
 ) -> int:
     """Fit and write all targets that can be read; the exit code says whether some could not be, or did not converge."""
-
     grouped = {} if groups is None else _groups(groups)
     writable(folder)
     targets, failed = [], {}

@@ -20,17 +20,6 @@ if TYPE_CHECKING:
     from jaxmuscle.fits import FitResult
 
 
-def write_fit(result: "FitResult", folder: Path) -> None:
-    """fit.json, spectrum.csv and fit.png, each whole or not there."""
-    from jaxmuscle._common.files import write_text
-
-    result.save(folder / "fit.json")
-    columns = {"frequency_hz": result.frequency_hz, "target": result.target.proportional_power, "fitted": result.fitted,
-               "harmonic_share": result.harmonic_share, "residual_sd": result.residual}  # fmt: skip
-    write_text(folder / "spectrum.csv", csv_text(columns))
-    save_figure(result.plot(), folder / "fit.png")
-
-
 CONVERGED, NOT_CONVERGED, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
 
 out = Console(soft_wrap=False)
@@ -39,14 +28,12 @@ err = Console(stderr=True, soft_wrap=not sys.stderr.isatty())  # a message is on
 
 def task_of(preset: str, task: TaskName | None) -> Any:
     """The task of a preset, its muscle put into another task if one is named."""
-
     model = jm.load_preset(preset)
     return model if task is None or type(model) is jm.model.TASKS[task] else model.as_task(jm.model.TASKS[task])
 
 
 def aim_of(name: str, task: TaskName | None, read: dict[str, Any]) -> tuple[Any, Any]:
     """The target of that name or file, its notices said, and the task to fit to it: by default what the target measured."""
-
     target = jm.load_target(name, **read)
     for notice in target.notices:
         err.print(f"[yellow]notice:[/] {plain(notice)}", highlight=False)
@@ -113,3 +100,14 @@ def save_figure(figure: Any, path: Path) -> None:
     with replacing(path) as temporary:
         figure.savefig(temporary, dpi=150)
     plt.close(figure)
+
+
+def write_fit(result: "FitResult", folder: Path) -> None:
+    """fit.json, spectrum.csv and fit.png, each whole or not there."""
+    from jaxmuscle._common.files import write_text
+
+    result.save(folder / "fit.json")
+    columns = {"frequency_hz": result.frequency_hz, "target": result.target.proportional_power, "fitted": result.fitted,
+               "harmonic_share": result.harmonic_share, "residual_sd": result.residual}  # fmt: skip
+    write_text(folder / "spectrum.csv", csv_text(columns))
+    save_figure(result.plot(), folder / "fit.png")

@@ -158,7 +158,6 @@ def alone_or_together(coordinator: str | None, processes: int | None) -> Iterato
 
 def swept(model: "AbstractTask", vary: list[str]) -> Any:
     """The grid that --vary asks for, or None."""
-
     values = {}
     for entry in vary:
         name, _, text = entry.partition("=")

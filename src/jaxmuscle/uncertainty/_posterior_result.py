@@ -81,14 +81,10 @@ class Posterior(eqx.Module):
 
     def to_datatree(self) -> "xarray.DataTree":
         """ArviZ's groups posterior, posterior_predictive, sample_stats, observed_data, over chain, draw, frequency."""
-        pass
-
         return datatree(self)
 
     def save(self, path: str | Path) -> None:
         """Write the draws as netCDF, or a summary as JSON if the name ends in .json; replaces a file in one step."""
-        pass
-
         if Path(path).suffix == ".json":
             write_json(path, summary_table(self))
         else:
