@@ -22,9 +22,8 @@ from jaxmuscle._common.environment import keep_compiled_programs
 from jaxmuscle._common.files import write_json
 from jaxmuscle.fits._search import search_together
 from jaxmuscle.model._parameters import DEFAULT_FREE, PARAMETERS
-from jaxmuscle.objective._arguments import planned
-from jaxmuscle.objective._consequences import quantities, seen_at
-from jaxmuscle.objective._problem import theta_of
+from jaxmuscle.objective._arguments import FitOptions, planned
+from jaxmuscle.objective._consequences import expand, quantities
 
 PERTURBED = ("noise_K_w", "noise_K_z", "harmonic_amplitude")
 SOFTER = 3.0
@@ -65,13 +64,13 @@ def recorded(task: jm.model.AbstractTask, number: int, seconds: float) -> jm.Tar
 
 def true_values(task: jm.model.AbstractTask, target: jm.Target) -> tuple[dict[str, float], float]:
     """Derived quantities of the truth by its linear response, and the share of its bin that the harmonic holds."""
-    setup = planned(base(), target).setup
-    seen = seen_at(setup.linear(), theta_of(setup, task)[None])
-    values = {name: float(x[0]) for name, x in quantities(setup.linear(), seen)[0].items()}
-    share = np.asarray(seen.moments.line / seen.moments.power)[0]
+    problem = planned(base(), target, FitOptions()).problem
+    seen = expand(problem.linear(), problem.theta_of((task,))[None])
+    values = {name: float(x[0]) for name, x in quantities(problem.linear(), seen)[0][0].items()}
+    share = np.asarray(seen.moments[0].line / seen.moments[0].power)[0]
     nearest = np.argmin(np.abs(np.asarray(target.frequency) - values["harmonic_frequency"]))
     inside = values["harmonic_frequency"] <= target.frequency[-1] + target.settings.resolution / 2
-    return values | {name: float(task[name]) for name in setup.coordinates.names}, float(share[nearest]) if inside else 0.0
+    return values | {name: float(task[name]) for name in problem.coordinates.names}, float(share[nearest]) if inside else 0.0
 
 
 def judged(number: int, target: jm.Target, result: jm.fits.FitResult, length: tuple[int, int]) -> dict:
@@ -108,7 +107,7 @@ def run(numbers: list[int], seconds: float, out: Path, length: tuple[int, int] =
             except (jm.errors.SimulationError, jm.errors.OperatingPointError) as error:
                 table["failed"][str(number)] = str(error)
         with jax.enable_x64(True):
-            plans = [planned(base(), target, counts=(32, None, None)) for target in targets.values()]
+            plans = [planned(base(), target, FitOptions(starts=32)) for target in targets.values()]
             results = search_together(plans, lambda text, share: None)
             for (number, target), result in zip(targets.items(), results, strict=True):
                 table["rows"].append(judged(number, target, result, length))

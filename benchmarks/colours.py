@@ -15,11 +15,11 @@ from run import machine, write
 import jaxmuscle as jm
 from jaxmuscle._common.environment import keep_compiled_programs
 from jaxmuscle.comparison._comparison import NEEDED, Evidence, decided, lowest
-from jaxmuscle.comparison._evidence import Folds, Model, held_out, masked_bins, maxima, stacked
+from jaxmuscle.comparison._evidence import Candidate, Folds, held_out, masked_bins, maxima, stacked
 from jaxmuscle.model._parameters import DEFAULT_FREE
 from jaxmuscle.model._tasks import with_noise
-from jaxmuscle.objective._arguments import planned
-from jaxmuscle.objective._problem import Setup, theta_of
+from jaxmuscle.objective._arguments import FitOptions, planned
+from jaxmuscle.objective._problem import FitProblem
 
 COLOURS = ("band-limited", "ornstein-uhlenbeck", "pink")
 VARIED = (*DEFAULT_FREE, "noise_correlation_time")
@@ -66,17 +66,17 @@ def examined(recordings: list[Recording], colour: str, *, muscle_free: bool) -> 
     All but its four material factors is free as by default.
     """
     targets = [recording.target for recording in recordings]
-    setups = [planned(with_noise(jm.Isometric(), colour), target).setup for target in targets]
+    problems = [planned(with_noise(jm.Isometric(), colour), target, FitOptions()).problem for target in targets]
     folds, whole = Folds.of(targets, GROUPS), stacked([masked_bins(t, np.ones((1, len(t.bins)))) for t in targets])
     whole = jax.tree.map(lambda x: x[:, 0], whole)
     found: list[dict[str, Any]] = [{} for _ in recordings]
     for harmonic in (True, False):
-        models = [Model.of(setup, harmonic=harmonic) for setup in setups]
+        models = [Candidate.of(problem, harmonic=harmonic) for problem in problems]
         starts = np.stack([model.starts for model in models])
         moving = np.ones((len(targets), starts.shape[2]))
         if not muscle_free:
-            at_truth = [n in MUSCLE for n in setups[0].coordinates.names]
-            starts[:, :, at_truth] = np.array([_muscle(s, r.truth) for s, r in zip(setups, recordings, strict=True)])[
+            at_truth = [n in MUSCLE for n in problems[0].coordinates.names]
+            starts[:, :, at_truth] = np.array([_muscle(s, r.truth) for s, r in zip(problems, recordings, strict=True)])[
                 :, None
             ]
             moving[:, at_truth] = 0.0
@@ -90,10 +90,10 @@ def examined(recordings: list[Recording], colour: str, *, muscle_free: bool) -> 
     return found
 
 
-def _muscle(setup: Setup, truth: jm.model.AbstractTask) -> np.ndarray:
+def _muscle(problem: FitProblem, truth: jm.model.AbstractTask) -> np.ndarray:
     """Coordinates of the material factors at their true values."""
-    task = setup.task.replace(**{name: float(truth[name]) for name in MUSCLE})
-    return theta_of(setup, task)[[n in MUSCLE for n in setup.coordinates.names]]
+    task = problem.parts[0].task.replace(**{name: float(truth[name]) for name in MUSCLE})
+    return problem.theta_of((task,))[[n in MUSCLE for n in problem.coordinates.names]]
 
 
 def study(count: int, seconds: float, path: Path) -> dict[str, Any]:

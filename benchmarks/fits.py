@@ -11,12 +11,8 @@ import numpy as np
 from measure import Row, seconds
 
 import jaxmuscle as jm
-from jaxmuscle._common.arrays import as_numbers
-from jaxmuscle.model._parameters import PARAMETERS
-from jaxmuscle.objective._arguments import DT, free_names
-from jaxmuscle.objective._coordinates import Coordinates
-from jaxmuscle.objective._least_squares import descend
-from jaxmuscle.objective._problem import Setup, target_variation
+from jaxmuscle.objective._arguments import FitOptions, planned
+from jaxmuscle.objective._least_squares import least_squares
 from jaxmuscle.objective._starts import starting_points
 
 TARGETS = ("vastus-lateralis-26mvc", "fdi-abduction-45mvc")
@@ -51,24 +47,15 @@ def fits() -> list[Row]:
     return found
 
 
-def _setup(target: jm.Target) -> Setup:
-    """What `jm.fit(jm.task_for(target), target)` sets up."""
-    task = as_numbers(jm.task_for(target))
-    names = free_names(task, None, {}, len(target.bins))
-    values, sds = ({n: float(x[n]) for n in names} for x in (task, {n: PARAMETERS[n].prior_sd for n in names}))
-    extra = (target_variation(target), None)
-    return Setup(task, target, Coordinates.of(values, {}, sds), np.ones(len(names)), extra, "log", "linear", DT,
-                 jax.random.key(0), SEEDS, True, lambda text, share: None)  # fmt: skip
-
-
 def starts(repetitions: int) -> list[Row]:
     """The search of a default fit: every start to its minimum in linear response, and how many end in the best one."""
     found: list[Row] = []
     for name in TARGETS:
         with jax.enable_x64(True):
-            setup = _setup(jm.load_target(name))
-            points = starting_points(setup.coordinates, setup.target, STARTS)
-            program = lambda s=setup, p=points: descend(s.linear(), p, MAX_STEPS)  # noqa: E731
+            target = jm.load_target(name)
+            problem = planned(jm.task_for(target), target, FitOptions()).problem
+            points = starting_points(problem, STARTS)
+            program = lambda s=problem, p=points: least_squares(s.linear(), p, MAX_STEPS)  # noqa: E731
             wall, busy = (float(np.median(t)) for t in seconds({"search": program}, min(repetitions, 5))["search"])
             cost = program().cost
         again = int(np.sum(cost <= (1 + NEAR) * np.nanmin(cost)))

@@ -27,7 +27,6 @@ from .ensembles._sweep import Sweep as Sweep
 from .fits._cohort import fit_cohort as fit_cohort
 from .fits._fit import fit as fit
 from .fits._joint import fit_joint as fit_joint
-from .fits._joint_result import load_joint_result as load_joint_result
 from .fits._result import load_result as load_result
 from .model._muscle import AbstractMuscle as AbstractMuscle
 from .model._muscle import Muscle as Muscle

@@ -18,12 +18,11 @@ from jaxmuscle.checks import _replicates as _bootstrap_data
 from jaxmuscle.checks._goodness import Drawn, numbers_of, p_values, refitted, residuals_of
 from jaxmuscle.checks._recovery import Recovery
 from jaxmuscle.data._target import Target
-from jaxmuscle.fits._reopened import taken_up
+from jaxmuscle.fits._reopened import reopened
 from jaxmuscle.fits._search import search_together
-from jaxmuscle.objective._arguments import planned
-from jaxmuscle.objective._consequences import consequences, seen_at
+from jaxmuscle.objective._arguments import FitOptions, planned
+from jaxmuscle.objective._consequences import consequences, expand
 from jaxmuscle.objective._likelihood import Likelihood, drawn_spectra, repeated
-from jaxmuscle.objective._problem import theta_of
 from jaxmuscle.spectra._bin_law import welch_law
 
 FREE = ("c_w", "noise_K_z")
@@ -51,7 +50,7 @@ def fits(powers, segments=12, sigma=None, free=FREE, base=None):
     """Fits of many spectra of the same kind in one batch."""
     with jax.enable_x64(True):
         plans = [
-            planned(base or task(), Target(f"case{i}", p, segments=segments, sigma=sigma), free=free, counts=(8, None, None))
+            planned(base or task(), Target(f"case{i}", p, segments=segments, sigma=sigma), FitOptions(free=free, starts=8))
             for i, p in enumerate(powers)
         ]
         return search_together(plans, lambda text, share: None)
@@ -67,9 +66,9 @@ def drawn_fits():
     """Fits of spectra drawn from the law of the bins about the true spectrum."""
     result = perfect()
     with jax.enable_x64(True):
-        setup = taken_up(result)
-        moments = repeated(setup, task(), CASES)
-        powers = drawn_spectra(Likelihood.of(setup), setup.target, moments, jax.random.key(5))
+        problem = reopened(result)
+        (moments,) = repeated(problem, (task(),), CASES)
+        powers = drawn_spectra(Likelihood.of(problem).bins[0], result.target, moments, jax.random.key(5))
     return fits(list(powers))
 
 
@@ -98,9 +97,9 @@ def test_p_values_count_ties_as_extreme_and_few_runs_as_extreme():
 def test_reference_runs_are_those_of_correlated_bins(x64):
     """Orthant probability: neighbours of correlation c differ in sign with probability arccos(c)/π (many segments)."""
     target, rows = Target("flat", np.ones(30), segments=2000), 4000
-    setup = taken_up(perfect(), target)
-    moments = repeated(setup, task(), rows)
-    drawn = drawn_spectra(Likelihood.of(setup), target, moments, jax.random.key(0))
+    problem = reopened(perfect(), target)
+    (moments,) = repeated(problem, (task(),), rows)
+    drawn = drawn_spectra(Likelihood.of(problem).bins[0], target, moments, jax.random.key(0))
     power = np.asarray(moments.power)
     runs = numbers_of(residuals_of(drawn, power, target, np.zeros_like(power)))["runs"]
     law = welch_law(target.settings, target.bins, target.segments)
@@ -134,15 +133,14 @@ def linear_chi2(result):
     Smooth columns of J take up nearly two degrees of freedom each, since neighbouring bins correlate.
     """
     with jax.enable_x64(True):
-        setup = taken_up(result)
-        problem = setup.linear()
-        seen = jax.tree.map(lambda x: np.asarray(x)[0], seen_at(problem, theta_of(setup, result.task)[None]))
-        J = np.asarray(consequences(problem, seen)[1][0])
+        problem = reopened(result)
+        objective = problem.linear()
+        J = consequences(objective, expand(objective, problem.theta_of((result.task,))[None]).row(0)).jacobian
     n = len(J)
     law = welch_law(result.target.settings, result.target.bins, result.target.segments)
     sd = np.sqrt(scipy.special.polygamma(1, law.degrees / 2) / scipy.special.polygamma(1, law.degrees[n // 2] / 2))
     centre = np.eye(n) - 1 / n
-    left = (np.eye(n) - J @ np.linalg.inv(J.T @ J + np.diag(setup.prior)) @ J.T) @ centre
+    left = (np.eye(n) - J @ np.linalg.inv(J.T @ J + np.diag(problem.prior)) @ J.T) @ centre
     return np.trace(left @ (sd[:, None] * law.correlation * sd) @ left.T) / (n - 1)
 
 
@@ -170,12 +168,12 @@ def test_refits_reach_the_minima_of_a_full_search(x64):
     base = task().replace(harmonic_amplitude=0.005, harmonic_frequency=4.3)
     free = (*FREE, "harmonic_amplitude", "harmonic_frequency")
     power = np.asarray(jm.expected_spectrum(base).power)
-    setup = taken_up(fits([power / power.sum()], free=free, base=base)[0])
-    moments = repeated(setup, base, 20)
-    drawn = drawn_spectra(Likelihood.of(setup), setup.target, moments, jax.random.key(3))
-    found = refitted(setup, theta_of(setup, base), Drawn(drawn, power / power.sum(), (None, None)))
+    problem = reopened(fits([power / power.sum()], free=free, base=base)[0])
+    (moments,), (part,) = repeated(problem, (base,), 20), problem.parts
+    drawn = drawn_spectra(Likelihood.of(problem).bins[0], part.target, moments, jax.random.key(3))
+    found = refitted(problem, problem.theta_of((base,)), Drawn((drawn,), (power / power.sum(),), (None,), (None,)))
     full = fits(list(drawn), free=free, base=base)
-    mine = numbers_of(residuals_of(drawn, found.expected, setup.target, found.share))["chi2_per_bin"]
+    mine = numbers_of(residuals_of(drawn, found.expected[0], part.target, found.share[0]))["chi2_per_bin"]
     theirs = np.array([result.chi2_per_bin for result in full])
     assert np.sum(np.abs(mine - theirs) < 0.02 * theirs + 1e-3) >= 18
     assert abs(mine.mean() - theirs.mean()) < 0.03
@@ -308,11 +306,11 @@ def test_what_cannot_be_simulated_is_reported(monkeypatch):
 @pytest.mark.slow
 def test_simulated_recordings_scatter_as_the_law_says(x64):
     """Mean and spread of one bin's power over the replicates against ν of its segments; trials count by their length."""
-    result = eqx.tree_at(lambda r: r.target, perfect(), Target("trials", expected(), segments=(4, 8)))
-    made, failed = _bootstrap_data.simulated_data(taken_up(result), task(), 64)
-    assert not failed and made[0][0].segments == (4, 8)
-    logs = np.log(np.stack([target.proportional_power for target, _ in made.values()]) / expected())
-    nu = result.target.degrees_of_freedom
+    trials = Target("trials", expected(), segments=(4, 8))
+    made, failed = _bootstrap_data.replicates_of(reopened(perfect(), trials), (task(),), 64)
+    assert not failed and made[0][0][0].segments == (4, 8)
+    logs = np.log(np.stack([target.proportional_power for ((target, _),) in made.values()]) / expected())
+    nu = trials.degrees_of_freedom
     # Bins 10 to 25, of little power, hardly feel the normalisation.
     spread = logs[:, 10:25].var(axis=0, ddof=1).mean()
     wanted = scipy.special.polygamma(1, nu / 2)

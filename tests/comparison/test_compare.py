@@ -20,9 +20,9 @@ import jaxmuscle as jm
 from jaxmuscle.commands.main import app
 from jaxmuscle.comparison import _compare
 from jaxmuscle.comparison._comparison import COLUMNS, Evidence, decided
-from jaxmuscle.comparison._evidence import Folds, Model, effective_parameters, without_harmonic
+from jaxmuscle.comparison._evidence import Candidate, Folds, effective_parameters, without_harmonic
 from jaxmuscle.model._tasks import with_noise
-from jaxmuscle.objective._arguments import planned
+from jaxmuscle.objective._arguments import FitOptions, planned
 from jaxmuscle.objective._likelihood import log_density, log_likelihood, measured_bins
 
 FREE = ("c_w", "noise_K_z", "harmonic_amplitude", "harmonic_frequency", "noise_correlation_time")
@@ -203,15 +203,17 @@ def test_every_bin_is_left_out_once_and_put_back_alone():
 
 def test_without_harmonic_its_power_is_zero(x64):
     target = target_of(true_task("band-limited"))
-    setup = planned(true_task("band-limited"), target, free=("c_w", "harmonic_amplitude", "harmonic_frequency")).setup
-    c = without_harmonic(setup).coordinates
+    problem = planned(
+        true_task("band-limited"), target, FitOptions(free=("c_w", "harmonic_amplitude", "harmonic_frequency"))
+    ).problem
+    c = without_harmonic(problem).coordinates
     assert c.values(np.array([0.3, 2.0, -1.0]))["harmonic_amplitude"] == 0.0
     assert c.values(np.zeros(3))["c_w"] == 60.0
-    fixed = planned(true_task("band-limited"), target, free=("c_w",)).setup
-    assert float(without_harmonic(fixed).task["harmonic_amplitude"]) == 0.0
-    starts = Model.of(setup, harmonic=False).starts
+    fixed = planned(true_task("band-limited"), target, FitOptions(free=("c_w",))).problem
+    assert float(without_harmonic(fixed).parts[0].task["harmonic_amplitude"]) == 0.0
+    starts = Candidate.of(problem, harmonic=False).starts
     assert np.all(starts[:, 1:] == 0) and np.ptp(starts[:, 0]) > 0
-    assert len(Model.of(setup, harmonic=True).starts) >= 32
+    assert len(Candidate.of(problem, harmonic=True).starts) >= 32
 
 
 # --- its words

@@ -16,17 +16,19 @@ from hypothesis import strategies as st
 import jaxmuscle as jm
 from jaxmuscle._common.arrays import as_arrays
 from jaxmuscle.fits import _search
-from jaxmuscle.fits._checks import AMBIGUOUS, rival_frequencies
+from jaxmuscle.fits._checks import AMBIGUOUS, rivals
 from jaxmuscle.model._parameters import DEFAULT_FREE, PARAMETERS
 from jaxmuscle.model._tasks import with_noise
 from jaxmuscle.objective._arguments import DT, RESIDUALS, free_names
-from jaxmuscle.objective._consequences import BATCH, _moments_and_slopes, consequences, derived, seen_at
+from jaxmuscle.objective._consequences import BATCH, _moments_and_slopes, consequences, derived, expand
 from jaxmuscle.objective._coordinates import Coordinates
 from jaxmuscle.objective._covariance import identifiability, undetermined_directions
-from jaxmuscle.objective._least_squares import Descent, _residuals, descend
+from jaxmuscle.objective._least_squares import Minima, _residuals, least_squares
 from jaxmuscle.objective._moment_models import MonteCarlo, welch_operator
-from jaxmuscle.objective._problem import Setup, residual_sigma, target_variation
+from jaxmuscle.objective._problem import FitProblem, Part, target_variation
+from jaxmuscle.objective._residuals import residual_sigma
 from jaxmuscle.objective._starts import contenders
+from jaxmuscle.response._equilibrium import slowest_rate
 from jaxmuscle.response._expected import Moments
 from jaxmuscle.simulation._batch import draw
 from jaxmuscle.simulation._integrator import Grid
@@ -48,11 +50,17 @@ def simple_target(**fields: Any) -> jm.Target:
 
 
 def setup_of(task, target, free, *, residual="log", extra=(None, None), seeds=8, key=0, control=False):
-    """What `fit` makes of its arguments, for one problem without a search. Needs float64."""
+    """What `fit` makes of its arguments, for one objective without a search. Needs float64."""
     values = {name: float(task[name]) for name in free}
     coordinates = Coordinates.of(values, {}, {name: PARAMETERS[name].prior_sd for name in free})
-    return Setup(task, target, coordinates, np.ones(len(free)), extra, residual, "montecarlo", DT, jax.random.key(key),
-                 seeds, control, lambda text, share: None)  # fmt: skip
+    part = Part("", task, target, coordinates, tuple(range(len(free))), *extra)
+    return FitProblem((part,), coordinates, np.ones(len(free)), residual, "montecarlo", DT, jax.random.key(key), seeds,
+                      control, lambda text, share: None)  # fmt: skip
+
+
+def part_of(problem, seeds=8):
+    """The residuals of its one target by Monte Carlo."""
+    return problem.montecarlo(seeds).parts[0]
 
 
 # --- the spectrum as one matrix
@@ -207,20 +215,31 @@ def test_a_bound_below_zero_does_not_bind_a_positive_parameter(x64):
     np.testing.assert_allclose(given.theta(jnp.asarray([0.0])), 0.0)
 
 
-# --- descent, on problems whose minimum is known
+# --- minima, on objectives whose minimum is known
 
 
 class Direct(eqx.Module):
-    """A problem whose model gives the residuals themselves."""
+    """An objective whose model gives the residuals themselves."""
 
     model: None = None
     data: None = None
+    linear: bool = eqx.field(static=True, default=False)
+
+    @property
+    def parts(self):
+        return (self,)
 
     def theta(self, s):
         return s
 
+    def own(self, values, i):
+        return values
+
+    def spread(self, slope, i):
+        return slope
+
     def residuals(self, theta, moments, data):
-        return moments
+        return moments[0]
 
 
 class Curved(Direct):
@@ -234,13 +253,13 @@ class Curved(Direct):
 
 
 def watch(reports):
-    return lambda descent: reports.append(descent)
+    return lambda minima: reports.append(minima)
 
 
 def test_descent_finds_the_minimum_from_every_start_but_a_bad_one(x64):
     reports = []
     starts = np.array([[-1.0, 1.0], [np.nan, 0.0], [2.0, 2.0], [-2.0, 0.0]])
-    found = descend(Curved(), starts, 80, report=watch(reports))
+    found = least_squares(Curved(), starts, 80, report=watch(reports))
     # Settled means that a thousandth of the cost is left to gain: half a squared distance of 1/8000.
     np.testing.assert_allclose(found.cost[[0, 2]], 0.125, rtol=1e-3)
     np.testing.assert_allclose(found.s[[0, 2], 0], 1.0, atol=0.02)
@@ -259,7 +278,7 @@ def test_a_step_to_where_the_model_explodes_is_rejected(x64):
             return jnp.log(theta)
 
     reports = []
-    found = descend(Cliff(), np.array([[5.0]]), 60, report=watch(reports))
+    found = least_squares(Cliff(), np.array([[5.0]]), 60, report=watch(reports))
     assert np.all(np.isfinite([r.cost[0] for r in reports]))
     costs = [r.cost[0] for r in reports]
     assert costs == sorted(costs, reverse=True)
@@ -267,13 +286,13 @@ def test_a_step_to_where_the_model_explodes_is_rejected(x64):
 
 
 def test_no_finite_start_has_infinite_cost(x64):
-    found = descend(Curved(), np.full((2, 2), np.nan), 20)
+    found = least_squares(Curved(), np.full((2, 2), np.nan), 20)
     assert not np.any(np.isfinite(found.cost)) and not np.any(found.settled)
     assert np.all(found.steps < 20)
 
 
 def test_descent_takes_the_problem_that_prepare_gives(x64):
-    """Exchanged at the first step, as for more sub-steps: the minimum is the new problem's."""
+    """Exchanged at the first step, as for more sub-steps: the minimum is the new objective's."""
 
     class Line(Direct):
         at: float = 0.0
@@ -281,21 +300,21 @@ def test_descent_takes_the_problem_that_prepare_gives(x64):
         def moments(self, theta):
             return theta - self.at
 
-    found = descend(Line(at=1.0), np.zeros((1, 1)), 20, prepare=lambda p, s: Line(at=2.0))
+    found = least_squares(Line(at=1.0), np.zeros((1, 1)), 20, prepare=lambda p, s: Line(at=2.0))
     np.testing.assert_allclose(found.s, 2.0, atol=1e-6)
 
 
 def test_residuals_and_their_slopes_are_exact_where_the_model_was_seen(x64):
-    problem, s = Curved(), np.array([[0.4, -0.3], [1.2, 0.7]])
-    seen = seen_at(problem, s)
+    objective, s = Curved(), np.array([[0.4, -0.3], [1.2, 0.7]])
+    seen = expand(objective, s)
     for i, point in enumerate(jnp.asarray(s)):
         here = jax.tree.map(lambda x, i=i: x[i], seen)
-        np.testing.assert_allclose(_residuals(point, (problem, None, here))[0], problem.moments(point), rtol=1e-14)
-        slope = jax.jacfwd(lambda s, here=here: _residuals(s, (problem, None, here))[0])(point)
-        np.testing.assert_allclose(slope, jax.jacfwd(problem.moments)(point), rtol=1e-14)
+        np.testing.assert_allclose(_residuals(point, (objective, None, here))[0], objective.moments(point), rtol=1e-14)
+        slope = jax.jacfwd(lambda s, here=here: _residuals(s, (objective, None, here))[0])(point)
+        np.testing.assert_allclose(slope, jax.jacfwd(objective.moments)(point), rtol=1e-14)
 
 
-# --- the problem that a fit solves
+# --- the objective that a fit solves
 
 FREE = ("c_w", "noise_K_w", "harmonic_frequency")
 
@@ -309,12 +328,16 @@ def _problem(residual, extra=(None, None)):
 @pytest.mark.parametrize("residual", RESIDUALS)
 @pytest.mark.slow
 def test_gradients_of_the_residuals_are_differences(x64, residual):
-    problem = _problem(residual, ((np.log(0.02), 0.1), (2.0, 0.1)))
+    objective = _problem(residual, ((np.log(0.02), 0.1), (2.0, 0.1)))
     s = jnp.asarray([0.2, -0.1, 0.05])
-    whole = lambda s: problem.residuals(problem.theta(s), problem.moments(problem.theta(s)), problem.data)  # noqa: E731
+
+    def whole(s):
+        theta = objective.theta(s)
+        return objective.residuals(theta, (objective.parts[0].moments(theta),), objective.data)
+
     evaluate = eqx.filter_jit(whole)
-    seen = jax.tree.map(lambda x: x[0], seen_at(problem, np.asarray(problem.theta(s))[None]))
-    forward = jax.jacfwd(lambda s: _residuals(s, (problem, problem.data, seen))[0])(s)
+    seen = expand(objective, np.asarray(objective.theta(s))[None]).row(0)
+    forward = jax.jacfwd(lambda s: _residuals(s, (objective, objective.data, seen))[0])(s)
     np.testing.assert_allclose(forward, eqx.filter_jit(jax.jacfwd(whole))(s), rtol=1e-9, atol=1e-12)
     h = 1e-4
     central = np.stack([(evaluate(s + h * e) - evaluate(s - h * e)) / (2 * h) for e in np.eye(3)], axis=1)
@@ -326,9 +349,9 @@ def test_gradients_of_the_residuals_are_differences(x64, residual):
 
 
 def test_the_extra_residuals_are_log_variation_and_mean(x64):
-    problem = _problem("log", ((np.log(0.02), 0.1), (2.0, 0.1)))
-    moments = eqx.filter_jit(problem.moments)(jnp.zeros(3))
-    rows = problem.data_residuals(moments, problem.data)[-2:]
+    (objective,) = _problem("log", ((np.log(0.02), 0.1), (2.0, 0.1))).parts
+    moments = eqx.filter_jit(objective.moments)(jnp.zeros(3))
+    rows = objective.data_residuals(moments, objective.data)[-2:]
     expected = [np.log(float(moments.variation) / 0.02) / 0.1, (float(moments.mean) - 2.0) / 0.1]
     np.testing.assert_allclose(rows, expected)
 
@@ -336,12 +359,12 @@ def test_the_extra_residuals_are_log_variation_and_mean(x64):
 @pytest.mark.slow
 def test_the_residuals_vanish_for_a_target_that_the_model_makes(x64):
     for residual in RESIDUALS:
-        problem = _problem(residual)
-        moments = eqx.filter_jit(problem.moments)(jnp.zeros(3))
-        bias = np.exp(problem.statistics.bias) if residual == "log" else 1.0
-        made = eqx.tree_at(lambda p: p.data.target, problem, moments.proportional * bias)
+        (objective,) = _problem(residual).parts
+        moments = eqx.filter_jit(objective.moments)(jnp.zeros(3))
+        bias = np.exp(objective.statistics.bias) if residual == "log" else 1.0
+        made = eqx.tree_at(lambda p: p.data.target, objective, moments.proportional * bias)
         np.testing.assert_allclose(made.data_residuals(moments, made.data), 0.0, atol=1e-12)
-        shifted = made.data_residuals(eqx.filter_jit(problem.moments)(jnp.full(3, 0.2)), made.data)
+        shifted = made.data_residuals(eqx.filter_jit(objective.moments)(jnp.full(3, 0.2)), made.data)
         assert np.abs(shifted).max() > 0.1
 
 
@@ -364,11 +387,9 @@ def test_linear_and_cumulative_residuals_are_in_standard_deviations(x64):
 
 
 def null_sentences(task, extra):
-    setup = setup_of(task, VASTUS, DEFAULT_FREE, extra=extra)
-    problem = setup.montecarlo(8)
-    seen = jax.tree.map(lambda x: x[0], seen_at(problem, np.zeros((1, len(DEFAULT_FREE)))))
-    jacobian = consequences(problem, seen)[1][0]
-    return undetermined_directions(DEFAULT_FREE, identifiability(np.asarray(jacobian)))
+    objective = setup_of(task, VASTUS, DEFAULT_FREE, extra=extra).montecarlo(8)
+    seen = expand(objective, np.zeros((1, len(DEFAULT_FREE)))).row(0)
+    return undetermined_directions(DEFAULT_FREE, identifiability(consequences(objective, seen).jacobian))
 
 
 @pytest.mark.slow
@@ -386,16 +407,16 @@ def test_the_measured_variation_fixes_the_scale(x64):
 @pytest.mark.slow
 def test_stiff_points_get_substeps(x64):
     """c_w / m_w = 4000/s: λ dt = 10 on the grid of the fit, which Heun's method does not survive."""
-    setup = setup_of(jm.Isometric().replace(c_w=2000.0), simple_target(), ("c_w", "k_w"))
-    problem = setup.montecarlo(8)
-    assert problem.model.grid.substeps == 1
-    finer = setup.finer(problem, np.zeros((1, 2)))
-    assert finer.model.grid.substeps == 16
-    assert setup.finer(finer, np.array([[-5.0, 0.0]])).model.grid.substeps == 16  # never fewer again
-    assert setup.finer(problem, np.array([[-5.0, 0.0], [np.nan, 0.0]])).model.grid.substeps == 1
-    assert setup.finer(problem, np.array([[-5.0, 0.0], [0.0, 0.0]])).model.grid.substeps == 16
-    assert np.all(np.isfinite(eqx.filter_jit(finer.moments)(jnp.zeros(2)).power))
-    assert not np.all(np.isfinite(eqx.filter_jit(problem.moments)(jnp.zeros(2)).power))
+    problem = setup_of(jm.Isometric().replace(c_w=2000.0), simple_target(), ("c_w", "k_w"))
+    objective = problem.montecarlo(8)
+    assert objective.parts[0].model.grid.substeps == 1
+    finer = problem.finer(objective, np.zeros((1, 2)))
+    assert finer.parts[0].model.grid.substeps == 16
+    assert problem.finer(finer, np.array([[-5.0, 0.0]])).parts[0].model.grid.substeps == 16  # never fewer again
+    assert problem.finer(objective, np.array([[-5.0, 0.0], [np.nan, 0.0]])).parts[0].model.grid.substeps == 1
+    assert problem.finer(objective, np.array([[-5.0, 0.0], [0.0, 0.0]])).parts[0].model.grid.substeps == 16
+    assert np.all(np.isfinite(eqx.filter_jit(finer.parts[0].moments)(jnp.zeros(2)).power))
+    assert not np.all(np.isfinite(eqx.filter_jit(objective.parts[0].moments)(jnp.zeros(2)).power))
 
 
 # --- arguments
@@ -435,7 +456,8 @@ def test_free_by_default():
         ({"residual": "logs"}, "residual = 'logs': did you mean 'log'"),
         ({"noise": "pinkish"}, "noise = 'pinkish': .*band-limited"),
         ({"starts": 0}, "starts = 0 must be at least 1"),
-        ({"seeds": 0}, "seeds = 0 must be at least 1"),
+        ({"seeds": -1}, "seeds = -1 must be at least 0"),
+        ({"seeds": 0, "method": "montecarlo"}, "seeds = 0: a Monte Carlo fit needs at least one"),
         ({"free": ["c_W"]}, "free: .*'c_W': did you mean 'c_w'"),
         ({"free": []}, "no parameter is free"),
         ({"free": ["c_w"], "fix": {"c_w": 1.0}}, "c_w cannot be both free and fixed"),
@@ -484,7 +506,8 @@ def true_derived(task):
     runs = jm.ensemble(task, jax.random.key(7), seeds=64)
     line = jm.simulate(references.quiet(task), jax.random.key(0)).spectrum().power
     held = np.asarray(runs.between())
-    moments = Moments(*map(jnp.asarray, (runs.mean_spectrum().power, line, held.mean(), held.var(axis=1).mean())))
+    seen = runs.mean_spectrum().power, line, held.mean(), held.var(axis=1).mean(), slowest_rate(task)
+    moments = Moments(*map(jnp.asarray, seen))
     return {name: float(value) for name, value in derived(as_arrays(task), moments).items()}
 
 
@@ -705,15 +728,15 @@ def test_controlled_moments_are_those_of_a_controlled_ensemble(x64):
 
 
 def test_any_number_of_points_is_one_compiled_program(x64):
-    setup = setup_of(jm.Isometric(), simple_target(), FREE, control=True)
-    problem = setup.linear()
+    problem = setup_of(jm.Isometric(), simple_target(), FREE, control=True)
+    objective = problem.linear()
     theta = np.random.default_rng(0).normal(size=(BATCH + 5, 3))
-    seen = seen_at(problem, theta)
+    seen = expand(objective, theta)
     traces = _moments_and_slopes._cached._cache_size()
-    single = seen_at(problem, theta[-2:])
+    single = expand(objective, theta[-2:])
     assert _moments_and_slopes._cached._cache_size() == traces
-    np.testing.assert_allclose(seen.moments.power[-2:], single.moments.power, rtol=1e-12)
-    assert seen.slopes.power.shape == (BATCH + 5, 30, 3)
+    np.testing.assert_allclose(seen.moments[0].power[-2:], single.moments[0].power, rtol=1e-12)
+    assert seen.slopes[0].power.shape == (BATCH + 5, 30, 3)
 
 
 @pytest.mark.slow
@@ -754,24 +777,24 @@ def ended(coordinates, frequencies, costs):
     """Starts that ended at these harmonic frequencies with these costs."""
     values = np.array([[f] for f in frequencies])
     s = coordinates.from_theta(np.log(values / coordinates.centre) / coordinates.sd)
-    return Descent(s, np.array(costs), np.ones(len(costs), int), np.ones(len(costs), bool))
+    return Minima(s, np.array(costs), np.ones(len(costs), int), np.ones(len(costs), bool))
 
 
 def test_other_minima_in_frequency_are_polished_too(x64):
-    coordinates = Coordinates.of({"harmonic_frequency": 4.25}, {}, {"harmonic_frequency": 1.0})
-    found = ended(coordinates, [3.9, 4.1, 6.6, 6.7, 8.0, 10.0], [5.0, 5.1, 6.0, 5.9, np.nan, 30.0])
-    assert contenders(coordinates, VASTUS, found, 6.0) == [0, 3]  # 4.1 and 6.6 Hz are nearer than a bin to a better one
-    assert contenders(coordinates, VASTUS, found, 0.5) == [0]
-    others = Coordinates.of({"c_w": 400.0}, {}, {"c_w": 1.0})
-    assert contenders(others, VASTUS, ended(others, [400.0, 500.0], [2.0, 1.0]), 9.0) == [1]
+    problem = setup_of(jm.Isometric(), VASTUS, ("harmonic_frequency",))
+    found = ended(problem.coordinates, [3.9, 4.1, 6.6, 6.7, 8.0, 10.0], [5.0, 5.1, 6.0, 5.9, np.nan, 30.0])
+    assert contenders(problem, found, 6.0) == [0, 3]  # 4.1 and 6.6 Hz are nearer than a bin to a better one
+    assert contenders(problem, found, 0.5) == [0]
+    other = setup_of(jm.Isometric(), VASTUS, ("c_w",))
+    assert contenders(other, ended(other.coordinates, [400.0, 500.0], [2.0, 1.0]), 9.0) == [1]
 
 
 def test_a_frequency_that_the_spectrum_leaves_open_is_called_ambiguous(x64):
-    setup = setup_of(jm.Isometric(), VASTUS, ("harmonic_frequency",))
-    close = ended(setup.coordinates, [3.9, 6.6], [5.0, 5.0 + 0.9 * AMBIGUOUS])
-    clear = ended(setup.coordinates, [3.9, 6.6], [5.0, 5.0 + 1.1 * AMBIGUOUS])
-    assert rival_frequencies(setup, clear) == []
-    assert rival_frequencies(setup, close) == pytest.approx([6.6])
+    problem = setup_of(jm.Isometric(), VASTUS, ("harmonic_frequency",))
+    close = ended(problem.coordinates, [3.9, 6.6], [5.0, 5.0 + 0.9 * AMBIGUOUS])
+    clear = ended(problem.coordinates, [3.9, 6.6], [5.0, 5.0 + 1.1 * AMBIGUOUS])
+    assert rivals(problem, clear) == ([], [])
+    assert rivals(problem, close) == (["6.60 Hz"], ["harmonic_frequency"])
 
 
 def test_two_equal_lines_make_the_frequency_ambiguous():

@@ -13,14 +13,14 @@ from test_result import assert_equal
 
 import jaxmuscle as jm
 from jaxmuscle._common.arrays import as_arrays
-from jaxmuscle._common.errors import ResultError
 from jaxmuscle.fits._joint import planned_jointly
-from jaxmuscle.fits._joint_search import joint_starts
 from jaxmuscle.model._parameters import DEFAULT_FREE
-from jaxmuscle.objective._arguments import joint_names
-from jaxmuscle.objective._consequences import derived, seen_at
-from jaxmuscle.objective._coordinates import at
+from jaxmuscle.objective._arguments import FitOptions, joint_names, task_for
+from jaxmuscle.objective._consequences import derived, expand
+from jaxmuscle.objective._coordinates import task_at
 from jaxmuscle.objective._covariance import identifiability, undetermined_directions
+from jaxmuscle.objective._residuals import Residuals
+from jaxmuscle.objective._starts import starting_points
 
 TRUTH = jm.Isometric().replace(k_w=3.5e5, k_z=7e5, c_w=80.0, harmonic_frequency=5.0, harmonic_amplitude=0.012)
 SEEDS = 24
@@ -96,7 +96,7 @@ def test_two_force_levels_tell_what_one_does_not():
     for name, part in joint.parts.items():
         assert part.chi2_per_bin < 1 + 4 * 0.31  # its standard deviation, see test_uncertainty
         assert float(part.task["P_w"]) == float(LEVELS[name]["P_w"])
-        assert part.nonlinearity is not None and part.nonlinearity < 0.02
+        assert part.check["largest_deviation"] < 0.02
     assert joint.parameters["P_w@high"].value == 12.0 and not joint.parameters["P_w@high"].free
 
 
@@ -184,37 +184,42 @@ def test_names(free, separate, names):
     assert {t: list(of.values()) for t, of in found.items()} == names
 
 
-def joint_plan(**options: Any):
+def planned(targets, tasks=None, separate=(), proportional=(), **options: Any):
+    tasks = {name: task_for(target) for name, target in targets.items()} if tasks is None else tasks
+    return planned_jointly(tasks, targets, FitOptions(**options), separate, proportional)
+
+
+def joint_problem(**options: Any):
     load = FORCE.replace(F_ext=1.0)
     targets = {"force": expected(ISOMETRIC), "shift": expected(load)}
-    return planned_jointly(targets, tasks={"force": ISOMETRIC, "shift": load}, **options)
+    return planned(targets, {"force": ISOMETRIC, "shift": load}, **options).problem
 
 
 def test_the_joint_problem_is_its_parts(x64):
-    setup = joint_plan(separate=("c_w",), coefficient_of_variation=False).setup
-    assert setup.coordinates.names == ("k_w", "k_z", "c_w@force", "c_z", "harmonic_amplitude", "harmonic_frequency",
-                                       "noise_K_w", "noise_K_z", "c_w@shift")  # fmt: skip
-    problem = setup.linear()
+    problem = joint_problem(separate=("c_w",), coefficient_of_variation=False)
+    assert problem.coordinates.names == ("k_w", "k_z", "c_w@force", "c_z", "harmonic_amplitude", "harmonic_frequency",
+                                         "noise_K_w", "noise_K_z", "c_w@shift")  # fmt: skip
+    objective = problem.linear()
     theta = 0.2 * np.random.default_rng(0).standard_normal((2, 9))
-    seen = seen_at(problem, theta)
+    seen = expand(objective, theta)
     columns = [list(range(8)), [0, 1, 8, 3, 4, 5, 6, 7]]
-    for i, (part, own) in enumerate(zip(problem.parts, columns, strict=True)):
-        alone = seen_at(part, theta[:, own])
-        np.testing.assert_array_equal(seen.moments[i].power, alone.moments.power)
-        np.testing.assert_array_equal(seen.slopes[i].power[..., own], alone.slopes.power)
+    for i, (part, own) in enumerate(zip(objective.parts, columns, strict=True)):
+        alone = expand(Residuals((part,), part.coordinates, np.ones(8), np.ones(8), (tuple(range(8)),)), theta[:, own])
+        np.testing.assert_array_equal(seen.moments[i].power, alone.moments[0].power)
+        np.testing.assert_array_equal(seen.slopes[i].power[..., own], alone.slopes[0].power)
         assert not np.any(np.delete(seen.slopes[i].power, own, axis=-1))
-    here = jax.tree.map(lambda x: x[0], seen)
-    residuals = np.asarray(problem.residuals(jnp.asarray(theta[0]), here.moments, problem.data))
-    parts = [p.data_residuals(m, p.data) for p, m in zip(problem.parts, here.moments, strict=True)]
+    here = seen.row(0)
+    residuals = np.asarray(objective.residuals(jnp.asarray(theta[0]), here.moments, objective.data))
+    parts = [p.data_residuals(m, p.data) for p, m in zip(objective.parts, here.moments, strict=True)]
     np.testing.assert_allclose(residuals, np.concatenate([*parts, theta[0]]))
 
 
 def test_slopes_of_the_joint_moments_are_those_of_differences(x64):
-    problem = joint_plan(separate=("harmonic_frequency",)).setup.linear()
+    objective = joint_problem(separate=("harmonic_frequency",)).linear()
     theta, step = np.full((1, 9), 0.1), 1e-5
-    seen = seen_at(problem, theta)
+    seen = expand(objective, theta)
     for j in range(9):
-        up, down = (seen_at(problem, theta + side * step * np.eye(9)[j]).moments for side in (1, -1))
+        up, down = (expand(objective, theta + side * step * np.eye(9)[j]).moments for side in (1, -1))
         for i in range(2):
             slope = (up[i].power - down[i].power)[0] / (2 * step)
             size = np.abs(slope).max() + 1e-6 * np.abs(seen.moments[i].power).max()
@@ -222,14 +227,15 @@ def test_slopes_of_the_joint_moments_are_those_of_differences(x64):
 
 
 def test_tasks_at_theta_have_the_shared_values(x64):
-    setup = joint_plan(separate=("c_w",)).setup
+    problem = joint_problem(separate=("c_w",))
     theta = np.linspace(-0.4, 0.4, 9)
-    tasks = setup.tasks(theta)
+    force, shift = problem.tasks_at(theta)
     for name in ("k_w", "noise_K_z", "harmonic_frequency"):
-        assert float(tasks["force"][name]) == float(tasks["shift"][name])
-    assert float(tasks["force"]["c_w"]) == pytest.approx(60 * np.exp(theta[2]))
-    assert float(tasks["shift"]["c_w"]) == pytest.approx(60 * np.exp(theta[8]))
-    assert float(tasks["shift"]["F_ext"]) == 1.0
+        assert float(force[name]) == float(shift[name])
+    assert float(force["c_w"]) == pytest.approx(60 * np.exp(theta[2]))
+    assert float(shift["c_w"]) == pytest.approx(60 * np.exp(theta[8]))
+    assert float(shift["F_ext"]) == 1.0
+    np.testing.assert_allclose(problem.theta_of((force, shift)), theta, atol=1e-12)
 
 
 @pytest.mark.slow
@@ -237,9 +243,9 @@ def test_proportional_parameters_keep_the_ratio_of_their_tasks(x64):
     names = ("k_w", "k_z", "c_w", "c_z", "noise_K_w", "noise_K_z", "noise_C_w", "noise_C_z", "harmonic_amplitude")
     tasks = {f"{100 * level:g}": jm.at_level(TRUTH, level) for level in (0.15, 0.6)}
     targets = {name: expected(task) for name, task in tasks.items()}
-    setup = planned_jointly(targets, tasks=tasks, proportional=names).setup
-    assert setup.coordinates.names == DEFAULT_FREE
-    weak, strong = setup.tasks(np.linspace(-0.5, 0.5, 8)).values()
+    problem = planned(targets, tasks, proportional=names).problem
+    assert problem.coordinates.names == DEFAULT_FREE
+    weak, strong = problem.tasks_at(np.linspace(-0.5, 0.5, 8))
     for name in names:
         ratio = float(tasks["60"][name]) / float(tasks["15"][name])
         assert float(strong[name]) / float(weak[name]) == pytest.approx(ratio), name
@@ -250,8 +256,8 @@ def test_starts_are_at_the_maxima_of_all_targets(x64):
         return expected(ISOMETRIC.replace(harmonic_frequency=f, harmonic_amplitude=0.02), name=str(f))
 
     for separate in ((), ("harmonic_frequency",)):
-        setup = planned_jointly({"a": peaked(4.0), "b": peaked(8.0)}, separate=separate).setup
-        c, starts = setup.coordinates, joint_starts(setup, 32)
+        problem = planned({"a": peaked(4.0), "b": peaked(8.0)}, separate=separate).problem
+        c, starts = problem.coordinates, starting_points(problem, 32)
         for target, maximum in (("a", 4.0), ("b", 8.0)):
             name = f"harmonic_frequency@{target}" if separate else "harmonic_frequency"
             column = c.names.index(name)
@@ -304,12 +310,11 @@ def test_a_result_holds_everything(quick):
         assert part.fitted.sum() == pytest.approx(1.0) and part.chi2_per_bin < 0.05
     assert np.array(quick.correlation["matrix"]).shape == (6, 6)
     with jax.enable_x64(True):
-        setup = planned_jointly(quick.targets, tasks=quick.tasks, free=("c_w",), separate=("harmonic_amplitude",)).setup
-        problem = setup.linear()
-        seen = jax.tree.map(lambda x: x[0], seen_at(problem, np.zeros((1, 1))))
+        objective = planned(quick.targets, quick.tasks, ("harmonic_amplitude",), free=("c_w",)).problem.linear()
+        seen = expand(objective, np.zeros((1, 1))).row(0)
         for i, target in enumerate(quick.parts):
-            part = problem.parts[i]
-            values = derived(at(part.task, part.coordinates, jnp.zeros(1)), seen.moments[i])
+            part = objective.parts[i]
+            values = derived(task_at(part.task, part.coordinates, jnp.zeros(1)), seen.moments[i])
             for name in ("corner_frequency", "mean", "high_frequency_floor"):
                 assert quick.derived[f"{name}@{target}"].value == pytest.approx(float(values[name]))
     assert any(notice.startswith("in linear response") for notice in quick.notices)
@@ -327,23 +332,20 @@ def test_a_result_in_words(quick):
 def test_what_is_saved_is_read_back_equal(quick, tmp_path):
     path = tmp_path / "new" / "joint.json"
     quick.save(path)
-    assert_equal(jm.load_joint_result(path), quick)
-    with pytest.raises(ResultError, match=r"is not a joint result of format joint-1; write it with JointResult\.save"):
-        wrong = tmp_path / "wrong.json"
-        wrong.write_text('{"format": 1}')
-        jm.load_joint_result(wrong)
-    with pytest.raises(ResultError, match="cannot be read"):
-        jm.load_joint_result(tmp_path / "none.json")
-    with pytest.raises(ResultError, match="has no entry 'success'"):
-        wrong.write_text('{"format": "joint-1"}')
-        jm.load_joint_result(wrong)
+    assert_equal(jm.load_result(path), quick)
+
+
+def test_what_belongs_to_one_target_is_asked_of_its_part(quick):
+    for name in ("task", "target", "fitted", "chi2_per_bin", "residual"):
+        with pytest.raises(AttributeError, match=r"2 targets were fitted together: low, high.*result\.parts\['low'\]"):
+            getattr(quick, name)
 
 
 def test_the_figure(quick):
     figure = quick.plot()
     try:
         titles = [ax.get_title(loc="left") for ax in figure.axes]
-        assert titles.count("Target above (+) or below (–) fit") == 2
+        assert titles.count("Residual per bin: target above (+) or below (–) fit") == 2
         assert "low: Isometric" in titles and "high: Isometric" in titles
         said = {text.get_text() for ax in figure.axes for text in ax.texts}
         assert {"Fitted parameters", "harmonic_amplitude@low", "mean@high"} <= said
@@ -360,7 +362,7 @@ def test_a_fit_that_fails_is_a_result(tmp_path):
     assert not joint.success and "no start has a finite spectrum of every target" in joint.message
     assert str(joint).startswith("NOT FITTED: a, b")
     joint.save(tmp_path / "failed.json")
-    assert_equal(jm.load_joint_result(tmp_path / "failed.json"), joint)
+    assert_equal(jm.load_result(tmp_path / "failed.json"), joint)
     plt.close(joint.plot())
 
 
@@ -380,8 +382,7 @@ SHIFT = jm.Target("shift", 1 / np.arange(1.0, 31.0), segments=12, quantity="disp
 @pytest.mark.parametrize(
     ("targets", "options", "message"),
     [
-        ({}, {}, "0 given, a joint fit needs at least two"),
-        ({"a": A}, {}, r"1 given, a joint fit needs at least two; fit\(task, target\) fits one"),
+        ({}, {}, "targets: none given: name at least one"),
         ({"a": A, "b@c": B}, {}, "a name must not be empty nor contain '@', as 'b@c' does"),
         ({"a": A, "b": "vastus-lateralis-27mvc"}, {}, "vastus-lateralis-26mvc"),
         ({"a": A, "b": B}, {"tasks": {"c": ISOMETRIC}}, "tasks: no target is called 'c'"),
@@ -404,7 +405,7 @@ SHIFT = jm.Target("shift", 1 / np.arange(1.0, 31.0), segments=12, quantity="disp
          "target 'b' is a displacement, but its task Isometric gives F_ext in N"),
         ({"a": A, "b": B}, {"bounds": {"m_w": (0.1, 1.0)}}, "bounds: unknown or not free parameter 'm_w'"),
         ({"a": A, "b": B}, {"priors": {"k_w@a": 0.1}}, "priors: unknown or not free parameter 'k_w@a'"),
-        ({"a": A, "b": B}, {"starts": 0}, "starts = 0 and max_steps = 40 must be at least 1"),
+        ({"a": A, "b": B}, {"starts": 0}, "starts = 0 must be at least 1"),
         ({"a": A, "b": B}, {"residual": "square"}, "residual = 'square'"),
     ],
 )  # fmt: skip
@@ -415,10 +416,10 @@ def test_bad_arguments(targets, options, message):
 
 @pytest.mark.slow
 def test_priors_and_bounds_by_joint_or_plain_name(x64):
-    plan = planned_jointly({"a": A, "b": B}, separate=("c_w",), priors={"c_w": 0.5, "c_w@b": 0.25, "k_w": None},
+    plan = planned({"a": A, "b": B}, separate=("c_w",), priors={"c_w": 0.5, "c_w@b": 0.25, "k_w": None},
                            bounds={"c_w@a": (10.0, 200.0)})  # fmt: skip
-    c = plan.setup.coordinates
+    c = plan.problem.coordinates
     sd = dict(zip(c.names, c.sd, strict=True))
     assert (sd["c_w@a"], sd["c_w@b"]) == (0.5, 0.25)
-    assert plan.setup.prior[c.names.index("k_w")] == 0 and plan.settings["prior_sd"]["k_w"] is None
+    assert plan.problem.prior[c.names.index("k_w")] == 0 and plan.settings["prior_sd"]["k_w"] is None
     assert np.isfinite(c.low[c.names.index("c_w@a")]) and not np.isfinite(c.low[c.names.index("c_w@b")])

@@ -15,11 +15,15 @@ import jaxmuscle as jm
 from jaxmuscle._common.errors import PresetError, ResultError
 from jaxmuscle._common.files import replacing, write_json, write_text
 from jaxmuscle.fits import Estimate
-from jaxmuscle.fits._result import FORMAT, Start
+from jaxmuscle.fits._part import Start
+from jaxmuscle.fits._result import FORMAT
 from jaxmuscle.model._presets import task_from_table, task_to_table
 
 POWER = 1 / (1 + np.arange(1, 31) ** 2)
 TARGET = jm.Target("made", POWER, segments=[6, 7], coefficient_of_variation=0.02, notices=["a notice"])
+
+
+PART = [field.name for field in dataclasses.fields(jm.fits.FittedPart)]
 
 
 def made_result(**changes: Any) -> jm.fits.FitResult:
@@ -60,7 +64,8 @@ def made_result(**changes: Any) -> jm.fits.FitResult:
         "settings": {"free": ["k_w", "c_w"], "starts": 2, "bounds": {"k_w": [1.0, 2e6]}, "mean_force": None},
         "versions": {"jaxmuscle": "0.1", "jax": "0.8"},
     } | changes
-    return jm.fits.FitResult(**fields)
+    own = {name: fields.pop(name) for name in PART}
+    return jm.fits.FitResult(parts={own["target"].name: jm.fits.FittedPart(**own)}, **fields)
 
 
 def failed_result():
@@ -223,7 +228,7 @@ def test_json_refuses_what_it_has_no_word_for(tmp_path):
         ("[1, 2]", f"is not a fit result of format {FORMAT}; write it with FitResult.save"),
         ("{}", f"is not a fit result of format {FORMAT}"),
         ('{"format": 99}', "is not a fit result of format"),
-        (f'{{"format": {FORMAT}, "message": "m"}}', "has no entry 'spectrum'"),
+        (f'{{"format": {FORMAT}, "message": "m"}}', "has no entry 'target'"),
     ],
 )
 def test_what_is_not_a_result(text, message, tmp_path):

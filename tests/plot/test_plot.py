@@ -269,7 +269,10 @@ def result(**changes):
         "seed": 7,
         "settings": {"check_seeds": 64},
     }
-    return types.SimpleNamespace(**(fields | changes))
+    found = types.SimpleNamespace(**(fields | changes))
+    found.only = found
+    found.parts = {found.target.name: found}
+    return found
 
 
 def failed():
@@ -333,7 +336,7 @@ def test_fit_tells_verdict_parameters_and_what_is_not_determined():
 
 def test_fit_draws_the_profile_over_the_frequency():
     found = result()
-    ax = plot.fit(found).axes[-1]
+    ax = plot.fit(found).axes[5]
     np.testing.assert_array_equal(ax.lines[0].get_xdata(), found.profile[0])
     np.testing.assert_array_equal(ax.lines[0].get_ydata(), found.profile[1])
     assert "harmonic p = 0.08" in ax.get_title("left") and ax.get_ylabel() == "Δχ²"

@@ -19,18 +19,19 @@ from test_result import made_result
 import jaxmuscle as jm
 from jaxmuscle._common.arrays import as_arrays
 from jaxmuscle.fits._joint import planned_jointly
-from jaxmuscle.fits._reopened import taken_up
+from jaxmuscle.fits._reopened import reopened
 from jaxmuscle.model._parameters import DEFAULT_FREE, PARAMETERS
-from jaxmuscle.objective._consequences import quantities, seen_at
-from jaxmuscle.objective._least_squares import descend
-from jaxmuscle.objective._likelihood import Likelihood
-from jaxmuscle.objective._problem import target_variation, theta_of
-from jaxmuscle.objective._scoring import climb
+from jaxmuscle.objective._arguments import FitOptions
+from jaxmuscle.objective._consequences import expand, quantities
+from jaxmuscle.objective._least_squares import least_squares
+from jaxmuscle.objective._likelihood import Likelihood, without_offsets
+from jaxmuscle.objective._problem import target_variation
+from jaxmuscle.objective._scoring import maximise
 from jaxmuscle.response._equilibrium import equilibrium
 from jaxmuscle.response._expected import expected_moments
 from jaxmuscle.spectra._bin_law import samples_of, welch_law
 from jaxmuscle.spectra._settings import WINDOW
-from jaxmuscle.uncertainty._designs import design_information, information_of, seen_here, without_offset
+from jaxmuscle.uncertainty._designs import design_information, information_of, seen_here, without_further
 
 TRUTH = jm.Isometric().replace(harmonic_amplitude=0.012, harmonic_frequency=5.0)
 LOADED = TRUTH.as_task(jm.PrescribedForce, P_w=0.0)
@@ -82,9 +83,11 @@ def proportional_information(task, segments, free=DEFAULT_FREE):
 
 
 def setup_at(result, target=None):
-    """Setup with the fitted task, and θ. Needs float64."""
-    setup = taken_up(result, target)
-    return dataclasses.replace(setup, task=result.task), theta_of(setup, result.task)
+    """FitProblem with the fitted task, and θ. Needs float64."""
+    problem = reopened(result, target)
+    (part,) = problem.parts
+    fitted_part = dataclasses.replace(part, task=result.task)
+    return dataclasses.replace(problem, parts=(fitted_part,)), problem.theta_of((result.task,))
 
 
 def same_information(found, expected):
@@ -98,24 +101,24 @@ def same_information(found, expected):
 
 @pytest.mark.slow
 def test_the_information_is_that_of_log_contrasts(x64):
-    setup, theta = setup_at(fitted())
-    same_information(information_of(setup, seen_here(setup, theta)), proportional_information(TRUTH, (SEGMENTS,)))
+    problem, theta = setup_at(fitted())
+    same_information(information_of(problem, seen_here(problem, theta)), proportional_information(TRUTH, (SEGMENTS,)))
 
 
 def test_a_coefficient_of_variation_adds_its_gradient(x64):
     result = fitted(coefficient_of_variation=0.015)
-    setup, theta = setup_at(result)
-    row = slopes(TRUTH, lambda m: 0.5 * np.log(m.variance) - np.log(m.mean), step=0.2 * STEP) / setup.extra[0][1]
+    problem, theta = setup_at(result)
+    row = slopes(TRUTH, lambda m: 0.5 * np.log(m.variance) - np.log(m.mean), step=0.2 * STEP) / problem.parts[0].variation[1]
     expected = proportional_information(TRUTH, (SEGMENTS,)) + np.outer(row, row)
-    same_information(information_of(setup, seen_here(setup, theta)), expected)
+    same_information(information_of(problem, seen_here(problem, theta)), expected)
 
 
 def test_eliminating_the_offset_is_inverting_with_it():
     root = np.random.default_rng(0).standard_normal((5, 9))
     whole = root @ root.T
-    np.testing.assert_allclose(np.linalg.inv(without_offset(whole)), np.linalg.inv(whole)[:-1, :-1])
+    np.testing.assert_allclose(np.linalg.inv(without_offsets(whole, len(whole) - 1)), np.linalg.inv(whole)[:-1, :-1])
     whole[-1], whole[:, -1] = 0, 0
-    np.testing.assert_array_equal(without_offset(whole), whole[:-1, :-1])
+    np.testing.assert_array_equal(without_offsets(whole, len(whole) - 1), whole[:-1, :-1])
 
 
 def drawn(task, segments, count, seed):
@@ -129,17 +132,16 @@ def drawn(task, segments, count, seed):
 
 def highest_posteriors(result, count):
     """Derived quantities at the posterior's maxima for spectra drawn at the fit, and those of the fit with their slopes."""
-    setup, theta = setup_at(result)
-    likelihood = Likelihood.of(setup)
+    problem, theta = setup_at(result)
+    likelihood = Likelihood.of(problem)
     powers = drawn(result.task, result.target.segments, count, 3)
-    bins = jax.tree.map(lambda x: np.broadcast_to(x, (count, *np.shape(x))), likelihood.bins)
-    bins = bins._replace(log_power=np.log(powers))
-    peak = climb(likelihood, np.tile(theta, (count, 1)), setup.prior, bins=bins)
+    (bins,) = jax.tree.map(lambda x: np.broadcast_to(x, (count, *np.shape(x))), likelihood.bins)
+    bins = (bins._replace(log_power=np.log(powers)),)
+    peak = maximise(likelihood, np.tile(theta, (count, 1)), problem.prior, bins=bins)
     assert peak.settled.mean() > 0.97
-    problem = dataclasses.replace(setup, extra=(None, None)).linear()
-    read = functools.partial(jax.tree.map, np.asarray)
-    values, _ = read(quantities(problem, seen_at(problem, peak.theta)))
-    truth, gradients = read(quantities(problem, seen_at(problem, theta[None])))
+    objective = without_further(problem).linear()
+    (values,), _ = quantities(objective, expand(objective, peak.theta))
+    (truth,), (gradients,) = quantities(objective, expand(objective, theta[None]))
     return peak, values, {n: float(v[0]) for n, v in truth.items()}, {n: g[0] for n, g in gradients.items()}
 
 
@@ -207,9 +209,9 @@ def test_a_longer_recording_multiplies_the_information():
 
 @pytest.mark.parametrize("what", ["variation", "mean"])
 def test_a_single_number_adds_one_row(x64, what):
-    setup, theta = setup_at(fitted())
+    problem, theta = setup_at(fitted())
     given = {"coefficient_of_variation": True} if what == "variation" else {"mean": 0.03}
-    found = design_information(setup, theta, jm.Design("one number", segments=0, **given))
+    found = design_information(problem, theta, jm.Design("one number", segments=0, **given))
     if what == "variation":
         # The variance in the window ripples with the frequency.
         row = slopes(TRUTH, lambda m: 0.5 * np.log(m.variance) - np.log(m.mean), step=0.2 * STEP)
@@ -235,18 +237,18 @@ def test_a_design_at_other_values_knows_the_factors(x64):
     stronger = jm.at_level(TRUTH, 0.5)
     assert float(stronger["k_w"]) > 1.5 * float(TRUTH["k_w"])
     elsewhere = {n: 0.7 * float(TRUTH[n]) for n in DEFAULT_FREE}
-    setup, theta = setup_at(fitted(settings={"prior_centre": elsewhere}))
+    problem, theta = setup_at(fitted(settings={"prior_centre": elsewhere}))
     np.testing.assert_allclose(theta, -np.log(0.7))
-    found = design_information(setup, theta, jm.Design("half of the maximum", stronger, 12))
+    found = design_information(problem, theta, jm.Design("half of the maximum", stronger, 12))
     same_information(found, proportional_information(stronger, (12,)))
 
 
 def test_separate_parameters_are_eliminated(x64):
-    setup, theta = setup_at(fitted())
+    problem, theta = setup_at(fitted())
     task = TRUTH.replace(P_w=10.0)
-    present = information_of(setup, seen_here(setup, theta))
-    tied = design_information(setup, theta, jm.Design("tied", task))
-    loose = design_information(setup, theta, jm.Design("loose", task, separate=AMPLITUDES))
+    present = information_of(problem, seen_here(problem, theta))
+    tied = design_information(problem, theta, jm.Design("tied", task))
+    loose = design_information(problem, theta, jm.Design("loose", task, separate=AMPLITUDES))
     own = [DEFAULT_FREE.index(n) for n in AMPLITUDES]
     where = np.arange(8)
     where[own] = 8 + np.arange(3)
@@ -408,7 +410,7 @@ def test_a_target_with_a_sigma_only():
 
 def test_another_target_can_be_given():
     result = fitted()
-    longer = eqx.tree_at(lambda r: r.target, result, jm.Target("longer", result.fitted, segments=4 * SEGMENTS)).target
+    longer = jm.Target("longer", result.fitted, segments=4 * SEGMENTS)
     a, b = (jm.identifiability(result, target, designs=()).present for target in (None, longer))
     assert b.quantities["harmonic_share"].stderr == pytest.approx(0.5 * a.quantities["harmonic_share"].stderr, rel=0.03)
 
@@ -445,24 +447,24 @@ def test_a_design_keeps_its_promise(x64):
     tasks = {"force": TRUTH, "displacement": held}
     targets = {name: jm.Target(name, np.asarray(jm.expected_spectrum(task).proportional), segments=SEGMENTS,
                                quantity=name) for name, task in tasks.items()}  # fmt: skip
-    setup = planned_jointly(targets, tasks=tasks).setup
-    theta = np.zeros(len(setup.coordinates.names))
-    seen = seen_at(setup.linear(), theta[None])
-    problem = setup.linear([np.asarray(m.line / m.power)[0] for m in seen.moments])
+    problem = planned_jointly(tasks, targets, FitOptions()).problem
+    theta = np.zeros(len(problem.coordinates.names))
+    seen = expand(problem.linear(), theta[None])
+    objective = problem.linear([np.asarray(m.line / m.power)[0] for m in seen.moments])
     drawings = [drawn(task, (SEGMENTS,), count, seed) for seed, task in enumerate(tasks.values())]
     data = tuple(
         eqx.tree_at(lambda d: d.target, jax.tree.map(lambda x: np.broadcast_to(x, (count, *np.shape(x))), one), powers)
-        for one, powers in zip(problem.data, drawings, strict=True)
+        for one, powers in zip(objective.data, drawings, strict=True)
     )
-    found = descend(problem, np.tile(setup.coordinates.from_theta(theta), (count, 1)), 40, data=data)
+    found = least_squares(objective, np.tile(problem.coordinates.from_theta(theta), (count, 1)), 40, data=data)
     assert found.settled.mean() > 0.97
-    reached = np.asarray(problem.theta(found.s))
-    kept = [n for n in setup.coordinates.names if promised.quantities[n].determined]
+    reached = np.asarray(objective.theta(found.s))
+    kept = [n for n in problem.coordinates.names if promised.quantities[n].determined]
     assert {"k_w", "k_z", "c_w", "c_z"} <= set(kept)
     chance = DOUBTFUL / 2 / len(kept)
     low, high = np.sqrt(scipy.stats.chi2.ppf([chance, 1 - chance], count - 1) / (count - 1))
     for name in kept:
-        spread = reached[:, setup.coordinates.names.index(name)].std(ddof=1)
+        spread = reached[:, problem.coordinates.names.index(name)].std(ddof=1)
         # Least squares of log powers scatters more than the information allows: ν/2 ψ'(ν/2) = 1.03 in variance, and 1.13
         # for not weighing the correlation; the prior takes a tenth of the variance at most.
         assert 0.95 * low < spread / promised.quantities[name].left < 1.1 * high, name
@@ -482,11 +484,11 @@ def test_a_joint_fit_reports_the_promised_errors():
 
 def test_pairs_add_up(x64):
     """A pair's information is the sum of its parts'."""
-    setup, theta = setup_at(fitted())
+    problem, theta = setup_at(fitted())
     designs = [jm.Design("the mean", segments=0, mean=0.02), jm.Design("longer", segments=100)]
     found = jm.identifiability(fitted(), designs=designs).pairs
-    present = information_of(setup, seen_here(setup, theta))
-    both = present + sum(design_information(setup, theta, d) for d in designs)
+    present = information_of(problem, seen_here(problem, theta))
+    both = present + sum(design_information(problem, theta, d) for d in designs)
     np.testing.assert_allclose(found[0].singular_values**2, np.maximum(np.linalg.eigvalsh(both)[::-1], 0),
                                atol=1e-9 * np.abs(both).max())  # fmt: skip
     assert len(found) == len(list(itertools.combinations(designs, 2)))

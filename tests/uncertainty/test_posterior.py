@@ -1,5 +1,6 @@
 """Posterior and profile: against known densities, one another, and what must be refused."""
 
+import dataclasses
 import functools
 import importlib.util
 import json
@@ -18,13 +19,12 @@ from typer.testing import CliRunner
 
 import jaxmuscle as jm
 from jaxmuscle.commands.main import app
-from jaxmuscle.fits._reopened import taken_up
+from jaxmuscle.fits._reopened import reopened
 from jaxmuscle.model._parameters import PARAMETERS
 from jaxmuscle.objective._likelihood import Likelihood
-from jaxmuscle.objective._problem import theta_of
 from jaxmuscle.uncertainty._chains import Chains, sample
 from jaxmuscle.uncertainty._posterior_checks import diagnosed, modes_of, verdict
-from jaxmuscle.uncertainty._posterior_density import marginal_of
+from jaxmuscle.uncertainty._posterior_density import density_about
 
 FREE = ("c_w", "noise_K_z", "harmonic_amplitude", "harmonic_frequency")
 
@@ -189,31 +189,34 @@ def test_what_the_data_leave_open_has_an_open_profile():
 def test_density_is_summed_over_the_frequency():
     """Against adaptive quadrature of the likelihood over the frequency at a point of the other coordinates."""
     with jax.enable_x64(True):
-        setup = taken_up(sloppy())
-        likelihood = Likelihood.of(setup)
-        marginal, _, _ = marginal_of(setup, likelihood, theta_of(setup, sloppy().task))
+        problem = reopened(sloppy())
+        likelihood = Likelihood.of(problem)
+        density, _, _ = density_about(problem, likelihood, problem.theta_of((sloppy().task,)))
+
+        (band,) = density.bands
 
         @jax.jit
         def summed(white):
-            s, offset = marginal.split(white)
-            return s, offset, jax.nn.logsumexp(marginal.heights(marginal.features(s), offset))
+            s, offset = density.split(white)
+            return s, offset, jax.nn.logsumexp(density.heights(band, s, offset, {}))
 
-        s, offset, found = summed(jnp.full(marginal.size, 0.2))
-        column = setup.coordinates.names.index("harmonic_frequency")
-        theta = np.array(setup.coordinates.theta(np.asarray(s)))
-        likelihood_at = jax.jit(lambda theta: likelihood.at(likelihood.problem.moments(theta), offset))
+        s, offset, found = summed(jnp.full(density.size, 0.2))
+        column = problem.coordinates.names.index("harmonic_frequency")
+        theta = np.array(problem.coordinates.theta(np.asarray(s)))
+        (part,) = likelihood.objective.parts
+        likelihood_at = jax.jit(lambda theta: likelihood.at((part.moments(theta),), offset))
 
-        def density(f):
-            theta[column] = setup.coordinates.theta_of("harmonic_frequency", f)
+        def integrand(f):
+            theta[column] = problem.coordinates.theta_of("harmonic_frequency", f)
             return np.exp(float(likelihood_at(jnp.asarray(theta))) - 0.5 * theta[column] ** 2 - np.log(f) - found)
 
-        edges = (marginal.frequency[0], marginal.frequency[-1])
-        whole, _ = scipy.integrate.quad(density, *edges, limit=200, epsrel=1e-4, points=[1.0, 4.0, 7.0, 12.0])
+        edges = (band.frequency[0], band.frequency[-1])
+        whole, _ = scipy.integrate.quad(integrand, *edges, limit=200, epsrel=1e-4, points=[1.0, 4.0, 7.0, 12.0])
         assert whole == pytest.approx(1.0, abs=0.02)
-        numeric = jax.jit(jax.grad(lambda white: marginal.log_density(white)))(jnp.full(marginal.size, 0.2))
-        step, log_density = 1e-5, jax.jit(lambda white: marginal.log_density(white))
-        for i in range(marginal.size):
-            sides = [float(log_density(0.2 + d * np.eye(marginal.size)[i])) for d in (-step, step)]
+        numeric = jax.jit(jax.grad(lambda white: density.log_density(white)))(jnp.full(density.size, 0.2))
+        step, log_density = 1e-5, jax.jit(lambda white: density.log_density(white))
+        for i in range(density.size):
+            sides = [float(log_density(0.2 + d * np.eye(density.size)[i])) for d in (-step, step)]
             assert float(numeric[i]) == pytest.approx((sides[1] - sides[0]) / (2 * step), rel=1e-4, abs=1e-5)
 
 
@@ -221,25 +224,25 @@ def test_density_is_summed_over_the_frequency():
 def test_the_common_scale_is_counted_from_the_coefficient_of_variation():
     """The density of the amplitudes as they are, up to a constant; the coordinate alone moves the model's variation."""
     with jax.enable_x64(True):
-        setup = taken_up(sloppy())
-        marginal, _, _ = marginal_of(setup, Likelihood.of(setup), theta_of(setup, sloppy().task))
-        assert marginal.level is not None
-        plain = eqx.tree_at(lambda m: m.level, marginal, None, is_leaf=lambda x: x is None)
-        columns = list(marginal.columns)
+        problem = reopened(sloppy())
+        density, _, _ = density_about(problem, Likelihood.of(problem), problem.theta_of((sloppy().task,)))
+        (level,) = density.levels
+        plain = dataclasses.replace(density, levels=())
+        columns = list(density.columns)
 
         @jax.jit
         def both(white):
-            s, offset = marginal.split(white)
+            s, offset = density.split(white)
             sampled = jnp.append(s[jnp.asarray(columns)], offset)
             same = jnp.linalg.solve(plain.scale, sampled - plain.centre)
-            return marginal.log_density(white), plain.log_density(same)
+            return density.log_density(white), plain.log_density(same)
 
-        points = 0.5 * np.random.default_rng(0).normal(size=(12, marginal.size))
+        points = 0.5 * np.random.default_rng(0).normal(size=(12, density.size))
         found = np.array([both(jnp.asarray(point)) for point in points])
         assert np.ptp(found[:, 0]) > 3  # else there is nothing to compare
         np.testing.assert_allclose(np.diff(found[:, 0]), np.diff(found[:, 1]), atol=1e-6)
-        level, s = marginal.level, jnp.asarray(marginal.point)
-        moved = [float(marginal.log_variation(marginal.levelled(s.at[level.column].add(d))[0], level.weight)[0])
+        s = jnp.asarray(density.point)
+        moved = [float(density.log_variation(density.levelled(s.at[level.column].add(d))[0], 0, level.weight)[0])
                  for d in (0.0, 0.1)]  # fmt: skip
         assert moved[1] - moved[0] == pytest.approx(0.1 * level.sd, rel=1e-3)  # noise on damping is fixed, but tiny
 

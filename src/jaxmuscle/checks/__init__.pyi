@@ -2,5 +2,6 @@
 
 from ._bootstrap import bootstrap as bootstrap
 from ._goodness import Goodness as Goodness
+from ._goodness import GoodnessPart as GoodnessPart
 from ._goodness import goodness as goodness
 from ._recovery import Bootstrap as Bootstrap

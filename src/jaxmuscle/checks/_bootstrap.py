@@ -7,18 +7,17 @@ import jax
 import numpy as np
 from jax import Array
 
-from jaxmuscle._common.arrays import as_numbers
 from jaxmuscle._common.progress import teller
-from jaxmuscle.fits._reopened import taken_up
+from jaxmuscle.fits._reopened import reopened
 from jaxmuscle.fits._result import FitResult
 from jaxmuscle.fits._search import search_together
-from jaxmuscle.objective._arguments import Plan
-from jaxmuscle.objective._consequences import quantities, seen_at
-from jaxmuscle.objective._problem import Setup, theta_of
-from jaxmuscle.spectra._bin_law import bin_statistics
+from jaxmuscle.objective._arguments import Plan, settings_of
+from jaxmuscle.objective._consequences import expand, quantities
+from jaxmuscle.objective._likelihood import check_known
+from jaxmuscle.objective._problem import FitProblem
 
 from ._recovery import Bootstrap, Recovery
-from ._replicates import Made, drawn_data, simulated_data, with_data
+from ._replicates import Made, replicates_of, with_data
 
 STARTS = 32
 TOGETHER = 50
@@ -52,25 +51,23 @@ def bootstrap(
     """
     if replicates < 2:
         raise ValueError(f"replicates = {replicates} must be at least 2: one refit has no spread")
-    if not bin_statistics(result.target).known:
-        raise ValueError(f"{result.target.name}: states neither segments nor sigma, so nothing says how much it scatters: "
-                         "give segments, the number of Welch segments that were averaged, or a sigma per bin")  # fmt: skip
-    stated = {n: e for n, e in ({n: p for n, p in result.parameters.items() if p.free} | result.derived).items()
-              if e.stderr is not None}  # fmt: skip
+    for target in result.targets.values():
+        check_known(target)
+    stated = result.determined
     if not stated:
-        raise ValueError(f"{result.target.name}: the fit determines no quantity, so there is no stated error to check")
+        raise ValueError(f"{result.title}: the fit determines no quantity, so there is no stated error to check")
     tell = teller(progress)
     with jax.enable_x64(True):
-        setup = taken_up(result, key=key)
+        problem = reopened(result, key=key)
         tell("making data", 0.0)
-        simulated = result.target.segments is not None
-        made, failed = (simulated_data if simulated else drawn_data)(setup, result.task, replicates)
-        fits, more = _fitted(setup, result, made, tell)
-        true = _true(setup, result)
+        made, failed = replicates_of(problem, tuple(result.tasks.values()), replicates)
+        fits, more = _fitted(problem, result, made, tell)
+        true = _true(problem, result)
     found = {name: Recovery(name, e.unit, true[name], float(e.stderr), *_read(fits, name)) for name, e in stated.items()
              if e.stderr is not None} if len(fits) > 1 else {}  # fmt: skip
-    return Bootstrap(result.target, result.task, found, replicates, dict(sorted((failed | more).items())),
-                     SIMULATED if simulated else DRAWN, key if isinstance(key, int) else None)  # fmt: skip
+    laws = {SIMULATED if target.segments is not None else DRAWN for target in result.targets.values()}
+    return Bootstrap(result.title, result.tasks, found, replicates, dict(sorted((failed | more).items())),
+                     "; ".join(sorted(laws, reverse=True)), key if isinstance(key, int) else None)  # fmt: skip
 
 
 def _read(fits: list[FitResult], name: str) -> tuple[np.ndarray, np.ndarray]:
@@ -79,28 +76,28 @@ def _read(fits: list[FitResult], name: str) -> tuple[np.ndarray, np.ndarray]:
             np.array([np.nan if e.stderr is None else e.stderr for e in estimates], dtype=float))  # fmt: skip
 
 
-def _true(setup: Setup, result: FitResult) -> dict[str, float]:
-    """Values of the fitted task in linear response."""
-    seen = seen_at(setup.linear(), theta_of(setup, result.task)[None])
-    values = quantities(setup.linear(), seen)[0]
-    parameters = {name: float(value) for name, value in as_numbers(result.task.parameters).items()}
-    return parameters | {name: float(np.asarray(x)[0]) for name, x in values.items()}
+def _true(problem: FitProblem, result: FitResult) -> dict[str, float]:
+    """Values of the fitted tasks in linear response."""
+    objective = problem.linear()
+    values = quantities(objective, expand(objective, problem.theta_of(tuple(result.tasks.values()))[None]))[0]
+    places = {name: problem.where(name) for name in result.derived_names}
+    derived = {name: float(values[i][base][0]) for name, (i, base) in places.items()}
+    return {name: p.value for name, p in result.parameters.items()} | derived
 
 
-def _fitted(setup: Setup, result: FitResult, made: Made, tell: Callable[[str, float], None]) -> Any:
+def _fitted(problem: FitProblem, result: FitResult, made: Made, tell: Callable[[str, float], None]) -> Any:
     """Refits that succeeded, and why others did not."""
     fits: list[FitResult] = []
     failed: dict[int, str] = {}
     numbers = list(made)
-    settings = result.settings | {"starts": STARTS, "prior_centre": dict(zip(setup.coordinates.names,
-                                  map(float, setup.coordinates.centre), strict=True))}  # fmt: skip
+    settings = result.settings | {"starts": STARTS} | settings_of(problem, result.settings["bounds"])
     for start in range(0, len(numbers), TOGETHER):
         part = numbers[start : start + TOGETHER]
 
         def show(text: str, share: float, before: int = start, size: int = len(part)) -> None:
             tell(text, 0.1 + 0.9 * (before + share * size) / len(numbers))
 
-        plans = [Plan(with_data(setup, *made[n]), STARTS, settings["max_steps"], 0, settings, None) for n in part]
+        plans = [Plan(with_data(problem, made[n]), STARTS, settings["max_steps"], 0, settings, None) for n in part]
         for number, fit in zip(part, search_together(plans, show), strict=True):
             if fit.success:
                 fits.append(fit)

@@ -10,14 +10,17 @@ from jaxtyping import Float
 
 from jaxmuscle import plot
 from jaxmuscle._common.environment import versions
+from jaxmuscle._common.parts import only
 from jaxmuscle._common.text import folded
 from jaxmuscle.data._target import Target
-from jaxmuscle.fits._reopened import taken_up
+from jaxmuscle.fits._reopened import reopened
 from jaxmuscle.fits._result import FitResult
-from jaxmuscle.objective._consequences import seen_at
-from jaxmuscle.objective._least_squares import descend
-from jaxmuscle.objective._likelihood import LEAST, Likelihood, drawn_spectra, repeated
-from jaxmuscle.objective._problem import Data, Problem, Setup, theta_of
+from jaxmuscle.objective._consequences import expand
+from jaxmuscle.objective._least_squares import least_squares
+from jaxmuscle.objective._likelihood import LEAST, Likelihood, check_known, drawn_spectra, repeated
+from jaxmuscle.objective._problem import FitProblem
+from jaxmuscle.objective._residuals import Data, Residuals
+from jaxmuscle.objective._starts import frequency_names
 from jaxmuscle.response._expected import Moments
 from jaxmuscle.spectra._bin_law import BinStatistics, bin_statistics
 
@@ -37,13 +40,14 @@ def _p(value: float) -> str:
     return f"p = {value:.2g}"
 
 
-def _check(result: FitResult, judged: Target) -> None:
-    for of in (result.target, judged):
-        if not bin_statistics(of).known:
-            raise ValueError(f"{of.name}: states neither segments nor sigma, so nothing says how much it scatters: give "
-                             "segments, the number of Welch segments that were averaged, or a sigma per bin")  # fmt: skip
-    if judged.settings != result.target.settings or not np.array_equal(judged.bins, result.target.bins):
-        raise ValueError(f"{judged.name}: other bins or spectrum settings than {result.target.name}, which was fitted")
+def _check(result: FitResult, judged: Target | None) -> None:
+    for of in (*result.targets.values(), *([] if judged is None else [judged])):
+        check_known(of)
+    if judged is None:
+        return
+    fitted = result.target
+    if judged.settings != fitted.settings or not np.array_equal(judged.bins, fitted.bins):
+        raise ValueError(f"{judged.name}: other bins or spectrum settings than {fitted.name}, which was fitted")
 
 
 def numbers_of(residuals: Rows) -> dict[str, Float[np.ndarray, " rows"]]:
@@ -56,20 +60,24 @@ def numbers_of(residuals: Rows) -> dict[str, Float[np.ndarray, " rows"]]:
 
 
 def p_values(observed: dict[str, np.ndarray], reference: dict[str, np.ndarray]) -> dict[str, float]:
-    """How often a replicate is as extreme, `(1 + count) / (1 + replicates)`; "all": how often its smallest p is as small."""
-    pooled = np.stack([np.append(observed[n], reference[n]) * (-1 if n == "runs" else 1) for n in CHECKS])
+    """How often a replicate is as extreme, `(1 + count) / (1 + replicates)`; "all": how often its smallest p is as small.
+
+    Of runs few are extreme, of all else much.
+    """
+    pooled = np.stack([np.append(observed[n], reference[n]) * (-1 if n.startswith("runs") else 1) for n in observed])
     each = np.stack([len(row) - np.searchsorted(np.sort(row), row) for row in pooled]) / pooled.shape[1]
     smallest = each.min(axis=0)
-    return {n: float(p) for n, p in zip(CHECKS, each[:, 0], strict=True)} | {"all": float(np.mean(smallest <= smallest[0]))}
+    return {n: float(p) for n, p in zip(observed, each[:, 0], strict=True)} | {
+        "all": float(np.mean(smallest <= smallest[0]))
+    }
 
 
-class Goodness(eqx.Module):
-    """How a spectrum lies about the fit, against spectra drawn from the fit that were themselves fitted.
+class GoodnessPart(eqx.Module):
+    """How the spectrum of one target lies about the fit, against spectra drawn from the fit that were themselves fitted.
 
     `residual` z_k of every bin [standard deviations of its log power]; `observed` {chi2_per_bin, runs, largest}, each with
     its `reference` values of the replicates and `p_values`, and "all", the p-value of the smallest of the three;
-    `residuals` of the replicates; `foretold`, whether the spectrum is another than the one fitted; `law` of the bins;
-    `lost`, replicates whose refit was not finite; `seed`, `versions`.
+    `residuals` of the replicates; `foretold`, whether the spectrum is another than the one fitted; `law` of the bins.
     """
 
     target: Target
@@ -80,9 +88,6 @@ class Goodness(eqx.Module):
     residuals: Float[np.ndarray, "replicates bins"]
     foretold: bool
     law: str
-    lost: int
-    seed: int | None
-    versions: dict[str, str] = eqx.field(default_factory=versions)
 
     @property
     def sentences(self) -> tuple[str, ...]:
@@ -114,10 +119,77 @@ class Goodness(eqx.Module):
     def __str__(self) -> str:
         done = "foretold by fits of" if self.foretold else "each fitted anew,"
         head = f"{self.target.name}: against {len(self.residuals)} spectra drawn from the fit, {done} {self.law} law"
-        lines = [head]
-        for sentence in self.sentences + ((f"{self.lost} refits were not finite and are left out",) if self.lost else ()):
-            lines.append(f"- {sentence}")
-        return folded(lines)
+        return folded([head, *(f"- {sentence}" for sentence in self.sentences)])
+
+
+class Goodness(eqx.Module):
+    """Whether a fit is as good as the scatter of its data allows.
+
+    `parts`, a `GoodnessPart` for each target by name; `p_value`, that of the smallest p-value of all checks of all targets;
+    `lost`, replicates whose refit was not finite; `seed`, `versions`. One of one target has what its part has.
+    """
+
+    parts: dict[str, GoodnessPart]
+    p_value: float
+    lost: int
+    seed: int | None
+    versions: dict[str, str] = eqx.field(default_factory=versions)
+
+    @property
+    def only(self) -> GoodnessPart:
+        """The part of a fit of one target. Raises `AttributeError` where there are several."""
+        return only(self.parts, "goodness")
+
+    @property
+    def target(self) -> Target:
+        """The target."""
+        return self.only.target
+
+    @property
+    def residual(self) -> Float[np.ndarray, " bins"]:
+        """Residual of every bin."""
+        return self.only.residual
+
+    @property
+    def observed(self) -> dict[str, float]:
+        """The three numbers."""
+        return self.only.observed
+
+    @property
+    def reference(self) -> dict[str, Float[np.ndarray, " replicates"]]:
+        """The three numbers of the replicates."""
+        return self.only.reference
+
+    @property
+    def p_values(self) -> dict[str, float]:
+        """p-value of each number and of all."""
+        return self.only.p_values
+
+    @property
+    def residuals(self) -> Float[np.ndarray, "replicates bins"]:
+        """Residuals of the replicates."""
+        return self.only.residuals
+
+    @property
+    def foretold(self) -> bool:
+        """Whether the spectrum is another than the one fitted."""
+        return next(iter(self.parts.values())).foretold
+
+    @property
+    def law(self) -> str:
+        """Law of the bins."""
+        return self.only.law
+
+    @property
+    def sentences(self) -> tuple[str, ...]:
+        """Each check in words, then the three together."""
+        return self.only.sentences
+
+    def __str__(self) -> str:
+        lines = [str(part) for part in self.parts.values()]
+        if len(self.parts) > 1:
+            lines.append(f"all targets together: {_p(self.p_value)}")
+        return "\n".join(lines + [f"- {self.lost} refits were not finite and are left out"] * bool(self.lost))
 
     def plot(self, ax: "Axes | None" = None) -> "Figure | SubFigure":
         """Residuals with what is usual in each bin, and the three checks with their reference distributions."""
@@ -144,35 +216,32 @@ def goodness(result: FitResult, target: Target | None = None, *, replicates: int
     """
     if replicates < 19:
         raise ValueError(f"replicates = {replicates} must be at least 19: with fewer no p-value can be as small as 0.05")
-    judged = result.target if target is None else target
-    _check(result, judged)
+    _check(result, target)
     with jax.enable_x64(True):
-        setup = taken_up(result, key=key)
-        drawn, moments = _drawn(setup, result, replicates)
-        refits = refitted(setup, theta_of(setup, result.task), drawn)
-        expected, share = refits.expected, refits.share
+        problem = reopened(result, key=key)
+        drawn, moments = _drawn(problem, result, replicates)
+        refits = refitted(problem, problem.theta_of(tuple(result.tasks.values())), drawn)
         power = drawn.power
         if target is not None:
-            likelihood = Likelihood.of(taken_up(result, target, key=key))
-            power = drawn_spectra(likelihood, target, moments, jax.random.fold_in(setup.key, 22))
-    residual = residuals_of(judged.proportional_power[None], result.fitted[None], judged, result.harmonic_share[None])[0]
+            (bins,) = Likelihood.of(reopened(result, target, key=key)).bins
+            power = (drawn_spectra(bins, target, moments[0], jax.random.fold_in(problem.key, 22)),)
     kept = np.isfinite(refits.cost)
     if np.sum(kept) < 19:
-        raise ValueError(f"{judged.name}: only {np.sum(kept)} of {replicates} refits are finite: fit again first")
-    residuals = residuals_of(power[kept], expected[kept], judged, share[kept])
-    observed, reference = numbers_of(residual[None]), numbers_of(residuals)
-    return Goodness(
-        judged,
-        residual,
-        {name: float(x[0]) for name, x in observed.items()},
-        reference,
-        p_values(observed, reference),
-        residuals,
-        target is not None,
-        "gamma" if judged.segments is not None else "Gaussian",
-        int(np.sum(~kept)),
-        key if isinstance(key, int) else None,
-    )
+        raise ValueError(f"{result.title}: only {np.sum(kept)} of {replicates} refits are finite: fit again first")
+    parts = {}
+    for (name, fitted), drawn_power, expected, share in zip(result.parts.items(), power, refits.expected, refits.share,
+                                                            strict=True):  # fmt: skip
+        judged = fitted.target if target is None else target
+        residual = residuals_of(judged.proportional_power[None], fitted.fitted[None], judged, fitted.harmonic_share[None])[0]
+        residuals = residuals_of(drawn_power[kept], expected[kept], judged, share[kept])
+        observed, reference = numbers_of(residual[None]), numbers_of(residuals)
+        law = "gamma" if judged.segments is not None else "Gaussian"
+        parts[name] = GoodnessPart(judged, residual, {n: float(x[0]) for n, x in observed.items()}, reference,
+                                   p_values(observed, reference), residuals, target is not None, law)  # fmt: skip
+    observed = {f"{n}@{name}": np.array([x]) for name, part in parts.items() for n, x in part.observed.items()}
+    reference = {f"{n}@{name}": x for name, part in parts.items() for n, x in part.reference.items()}
+    together = p_values(observed, reference)["all"]
+    return Goodness(parts, together, int(np.sum(~kept)), key if isinstance(key, int) else None)
 
 
 def residuals_of(power: Rows, expected: Rows, target: Target, share: Rows) -> Rows:
@@ -189,82 +258,88 @@ def _scatter(target: Target, statistics: BinStatistics, share: Rows) -> tuple[Ro
 
 
 class Drawn(NamedTuple):
-    """Spectra drawn from the fit, with the further data of a fit (log coefficient of variation, mean), if it has them."""
+    """Of every part: spectra drawn from the fit, what they scatter about, and their further data (None without)."""
 
-    power: Rows
-    expected: Float[np.ndarray, " bins"]
-    extra: tuple[Any, Any]
+    power: tuple[Rows, ...]
+    expected: tuple[Float[np.ndarray, " bins"], ...]
+    variation: tuple[Any, ...]
+    mean: tuple[Any, ...]
 
 
 class Refits(NamedTuple):
-    """Where every drawn spectrum's fit ended; `expected` proportional power, `share` of the line."""
+    """Where every drawn set's fit ended; of every part the `expected` proportional power and the `share` of the line."""
 
     theta: Float[np.ndarray, "rows free"]
     cost: Float[np.ndarray, " rows"]
-    expected: Rows
-    share: Rows
+    expected: tuple[Rows, ...]
+    share: tuple[Rows, ...]
 
 
-def _drawn(setup: Setup, result: FitResult, count: int) -> tuple[Drawn, Moments]:
-    keys = jax.random.split(jax.random.fold_in(setup.key, 21), 3)
-    moments = repeated(setup, result.task, count)
-    power = drawn_spectra(Likelihood.of(setup), setup.target, moments, keys[0])
-    expected = moments.power[0] / np.sum(moments.power[0])
+def _drawn(problem: FitProblem, result: FitResult, count: int) -> tuple[Drawn, tuple[Moments, ...]]:
+    moments = repeated(problem, tuple(result.tasks.values()), count)
+    found = []
+    for i, (part, bins, seen) in enumerate(zip(problem.parts, Likelihood.of(problem).bins, moments, strict=True)):
+        key = jax.random.fold_in(problem.key, 21)
+        keys = jax.random.split(jax.random.fold_in(key, i) if i else key, 3)
 
-    def scattered(given: Any, values: np.ndarray, key: Array) -> Any:
-        return (
-            None
-            if given is None
-            else (values + given[1] * np.asarray(jax.random.normal(key, (count,))), np.full(count, float(given[1])))
-        )
+        def scattered(given: Any, values: np.ndarray, key: Array) -> Any:
+            if given is None:
+                return None
+            return values + given[1] * np.asarray(jax.random.normal(key, (count,))), np.full(count, float(given[1]))
 
-    variation, mean = setup.extra
-    extra = scattered(variation, np.log(moments.variation), keys[1]), scattered(mean, np.asarray(moments.mean), keys[2])
-    return Drawn(power, expected, extra), moments
+        power = drawn_spectra(bins, part.target, seen, keys[0])
+        variation = scattered(part.variation, np.log(seen.variation), keys[1])
+        mean = scattered(part.mean, np.asarray(seen.mean), keys[2])
+        found.append((power, seen.power[0] / np.sum(seen.power[0]), variation, mean))
+    return Drawn(*zip(*found, strict=True)), moments
 
 
-def refitted(setup: Setup, theta: Float[np.ndarray, " free"], drawn: Drawn) -> Refits:
-    """Every drawn spectrum fitted: all bins scattering alike first, then again with the line's share of each known."""
-    problem, count = setup.linear(), len(drawn.power)
-    starts = _starts(setup, theta, drawn)
+def refitted(problem: FitProblem, theta: Float[np.ndarray, " free"], drawn: Drawn) -> Refits:
+    """Every drawn set fitted: all bins scattering alike first, then again with the line's share of each known."""
+    objective, count = problem.linear(), len(drawn.power[0])
+    starts = _starts(problem, theta, drawn)
     each = starts.shape[1]
-    data = _data(problem, drawn, np.zeros_like(drawn.power), setup.target)
-    first = descend(problem, setup.coordinates.from_theta(starts.reshape(count * each, -1)), 40,
-                    data=jax.tree.map(lambda x: np.repeat(x, each, axis=0), data))  # fmt: skip
+    data = _data(problem, objective, drawn, tuple(np.zeros_like(power) for power in drawn.power))
+    first = least_squares(objective, problem.coordinates.from_theta(starts.reshape(count * each, -1)), 40,
+                          data=jax.tree.map(lambda x: np.repeat(x, each, axis=0), data))  # fmt: skip
     cost = np.where(np.isfinite(first.cost), first.cost, np.inf).reshape(count, each)
     s = first.s.reshape(count, each, -1)[np.arange(count), np.argmin(cost, axis=1)]
-    share = _seen_share(problem, s)[1]
-    second = descend(problem, s, 40, data=_data(problem, drawn, share, setup.target))
-    expected, share = _seen_share(problem, second.s)
-    return Refits(np.asarray(problem.theta(second.s)), second.cost, expected, share)
+    share = _seen_share(objective, s)[1]
+    second = least_squares(objective, s, 40, data=_data(problem, objective, drawn, share))
+    return Refits(np.asarray(objective.theta(second.s)), second.cost, *_seen_share(objective, second.s))
 
 
-def _starts(setup: Setup, theta: np.ndarray, drawn: Drawn) -> Float[np.ndarray, "rows starts free"]:
-    """The fit's own values; and its harmonic, as strong as its prior has it, in the highest excesses of each spectrum."""
-    names, c = setup.coordinates.names, setup.coordinates
-    if "harmonic_frequency" not in names:
-        return np.broadcast_to(theta, (len(drawn.power), 1, len(theta)))
-    excess = np.log(drawn.power / drawn.expected)
-    score = np.stack([np.convolve(row - row.mean(), LINE_SHAPE, "same") for row in excess])
-    points = np.broadcast_to(theta, (len(score), 1 + ELSEWHERE, len(theta))).copy()
-    frequency, n = np.asarray(setup.target.frequency), score.shape[1]
-    for turn in range(1, 1 + ELSEWHERE):
-        best = np.argmax(score, axis=1)
-        points[:, turn, names.index("harmonic_frequency")] = c.theta_of("harmonic_frequency", frequency[best])
-        if "harmonic_amplitude" in names:
-            points[:, turn, names.index("harmonic_amplitude")] = 0.0
-        score = np.where(np.abs(np.arange(n) - best[:, None]) <= 1, -np.inf, score)
-    return points
+def _starts(problem: FitProblem, theta: np.ndarray, drawn: Drawn) -> Float[np.ndarray, "rows starts free"]:
+    """The fit's own values; and each harmonic, as strong as its prior has it, in the highest excesses of each spectrum."""
+    c, count = problem.coordinates, len(drawn.power[0])
+    starts = [np.broadcast_to(theta, (count, len(theta)))]
+    for name in frequency_names(c):
+        strengths = [i for i, n in enumerate(c.names) if n in ("harmonic_amplitude", name.replace("frequency", "amplitude"))]
+        for part, power, expected in zip(problem.parts, drawn.power, drawn.expected, strict=True):
+            if c.names.index(name) not in part.columns:
+                continue
+            excess = np.log(power / expected)
+            score = np.stack([np.convolve(row - row.mean(), LINE_SHAPE, "same") for row in excess])
+            for _ in range(ELSEWHERE):
+                best, points = np.argmax(score, axis=1), np.array(starts[0])
+                points[:, c.names.index(name)] = c.theta_of(name, np.asarray(part.target.frequency)[best])
+                points[:, strengths] = 0.0
+                starts.append(points)
+                score = np.where(np.abs(np.arange(score.shape[1]) - best[:, None]) <= 1, -np.inf, score)
+    return np.stack(starts, axis=1)
 
 
-def _data(problem: Problem, drawn: Drawn, share: Rows, target: Target) -> Data:
-    bias, sd = _scatter(target, bin_statistics(target), share)
-    sigma = np.broadcast_to(np.asarray(problem.data.sigma), (len(drawn.power), *np.shape(problem.data.sigma)))
-    return Data(drawn.power, bias, sd, sigma, drawn.extra)
+def _data(problem: FitProblem, objective: Residuals, drawn: Drawn, share: tuple[Rows, ...]) -> tuple[Data, ...]:
+    made = []
+    for i, (part, own) in enumerate(zip(problem.parts, objective.data, strict=True)):
+        bias, sd = _scatter(part.target, bin_statistics(part.target), share[i])
+        sigma = np.broadcast_to(np.asarray(own.sigma), (len(drawn.power[i]), *np.shape(own.sigma)))
+        made.append(Data(drawn.power[i], bias, sd, sigma, drawn.variation[i], drawn.mean[i]))
+    return tuple(made)
 
 
-def _seen_share(problem: Problem, s: np.ndarray) -> tuple[Rows, Rows]:
-    moments = seen_at(problem, np.asarray(problem.theta(s))).moments
-    power = np.asarray(moments.power)
-    share = np.clip(np.nan_to_num(np.asarray(moments.line) / power), 0.0, 1.0)
-    return power / power.sum(axis=1, keepdims=True), share
+def _seen_share(objective: Residuals, s: np.ndarray) -> tuple[tuple[Rows, ...], tuple[Rows, ...]]:
+    moments = expand(objective, np.asarray(objective.theta(s))).moments
+    power = [np.asarray(m.power) for m in moments]
+    share = tuple(np.clip(np.nan_to_num(np.asarray(m.line) / p), 0.0, 1.0) for m, p in zip(moments, power, strict=True))
+    return tuple(p / p.sum(axis=1, keepdims=True) for p in power), share

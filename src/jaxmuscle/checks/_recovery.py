@@ -15,7 +15,6 @@ from jaxmuscle._common.arrays import with_nulls
 from jaxmuscle._common.environment import versions
 from jaxmuscle._common.files import write_text
 from jaxmuscle._common.text import folded
-from jaxmuscle.data._target import Target
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -102,12 +101,12 @@ class Bootstrap(eqx.Module):
     """What refits of data made from a fit found.
 
     `quantities` {name: `Recovery`}, those that the fit determines; `replicates` asked for; `failed` {replicate: why it
-    was not simulated or fitted}; `source`, how the data were made; `task`, made from; `target`, whose fit it is; `seed`;
-    `versions`.
+    was not simulated or fitted}; `source`, how the data were made; `tasks`, made from; `target`, name of what was fitted;
+    `seed`; `versions`.
     """
 
-    target: Target
-    task: Any
+    target: str
+    tasks: dict[str, Any]
     quantities: dict[str, Recovery]
     replicates: int
     failed: dict[int, str]
@@ -164,24 +163,22 @@ class Bootstrap(eqx.Module):
 
     def __str__(self) -> str:
         done = self.replicates - len(self.failed)
-        lines = [f"{self.target.name}: {done} refits of data made from the fit"]
-        head = f"  {'':<24}{'true':>9} {'stated':>8} {'spread/stated':>14} {'bias':>9} {'in 95 %':>7}"
-        lines.append(head)
+        lines = [f"{self.target}: {done} refits of data made from the fit"]
+        wide = max(24, *(1 + len(name) for name in self.quantities)) if self.quantities else 24
+        lines.append(f"  {'':<{wide}}{'true':>9} {'stated':>8} {'spread/stated':>14} {'bias':>9} {'in 95 %':>7}")
         for q in self.quantities.values():
             share = "-" if math.isnan(q.coverage) else f"{100 * q.coverage:.0f} %"
             mark = "" if q.verdict == "holds" else " *"
-            lines.append(f"  {q.name:<24}{q.true:>9.4g} {q.stated:>8.2g} {q.ratio:>7.2f} ± {q.ratio_stderr:<4.2f} "
+            lines.append(f"  {q.name:<{wide}}{q.true:>9.4g} {q.stated:>8.2g} {q.ratio:>7.2f} ± {q.ratio_stderr:<4.2f} "
                          f"{q.bias:>9.1g} {share:>7}{mark}")  # fmt: skip
-        for sentence in self.sentences:
-            lines.append(f"- {sentence}")
-        return folded(lines)
+        return "\n".join([*lines, folded(f"- {sentence}" for sentence in self.sentences)])
 
     def to_json(self) -> str:
         """Everything but the task as JSON."""
         rows = {q.name: {"values": with_nulls(q.values), "stderrs": with_nulls(q.stderrs)} for q in self.quantities.values()}
         table = {
             "format": FORMAT,
-            "target": self.target.name,
+            "target": self.target,
             "source": self.source,
             "replicates": self.replicates,
             "failed": {str(number): why for number, why in self.failed.items()},

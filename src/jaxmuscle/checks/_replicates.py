@@ -6,6 +6,7 @@ from typing import Any
 
 import jax
 import numpy as np
+from jax import Array
 
 from jaxmuscle._common.arrays import as_arrays, as_numbers
 from jaxmuscle._common.errors import SimulationError
@@ -13,40 +14,59 @@ from jaxmuscle.data._target import Target
 from jaxmuscle.ensembles._ensemble import ensemble
 from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.objective._likelihood import Likelihood, drawn_spectra, repeated
-from jaxmuscle.objective._problem import Setup, target_variation
+from jaxmuscle.objective._problem import FitProblem, Part, target_variation
 from jaxmuscle.response._equilibrium import slowest_rate
 from jaxmuscle.response._linearised import settled
 from jaxmuscle.spectra._measures import coefficient_of_variation
 
 LEAD, FORGOTTEN = 5.0, 8.0
-Made = dict[int, tuple[Target, float]]
+Datum = tuple[Target, float]
+Made = dict[int, tuple[Datum, ...]]
 
 
-def simulated_data(setup: Setup, task: AbstractTask, count: int) -> tuple[Made, dict[int, str]]:
-    """Targets from the nonlinear simulator, with their mean output; and why others could not be made."""
-    still = as_numbers(settled(as_arrays(task)))
-    trials = list(setup.target.segments or ())
-    chosen = setup.target.bins - setup.target.settings.first_bin
-    made: Made = {}
+def replicates_of(problem: FitProblem, tasks: tuple[AbstractTask, ...], count: int) -> tuple[Made, dict[int, str]]:
+    """Targets of every part with their mean output, as the tasks would give them; and why others could not be made.
+
+    From the nonlinear simulator; where a target states no segments, drawn about its spectrum in linear response.
+    """
     failed: dict[int, str] = {}
-    runs = [_runs(still, setup, K, trial, np.arange(count), failed) for trial, K in enumerate(trials)]
+    parts = []
+    for i, (part, task) in enumerate(zip(problem.parts, tasks, strict=True)):
+        key = jax.random.fold_in(problem.key, 31)
+        key = jax.random.fold_in(key, 1000 + i) if i else key
+        if part.target.segments is None:
+            parts.append(_drawn(problem, tasks, i, count, key))
+        else:
+            parts.append(_simulated(part, task, count, key, failed))
+    made = {n: tuple(part[n] for part in parts) for n in range(count) if all(n in part for part in parts)}
+    return made, {n: why for n, why in failed.items() if n not in made}
+
+
+def _simulated(part: Part, task: AbstractTask, count: int, key: Array, failed: dict[int, str]) -> dict[int, Datum]:
+    """Targets from the nonlinear simulator, with their mean output."""
+    still = as_numbers(settled(as_arrays(task)))
+    trials = list(part.target.segments or ())
+    runs = [_runs(still, part.target, K, jax.random.fold_in(key, trial), np.arange(count), failed)
+            for trial, K in enumerate(trials)]  # fmt: skip
+    made = {}
     for number in range(count):
-        if number in failed:
-            continue
-        rows = [each[number] for each in runs]
-        # Trials count in proportion to their segments, as in the law of the bins.
-        power = np.average([row[0] for row in rows], axis=0, weights=trials)[chosen]
-        made[number] = _target(setup.target, number, power, [row[1] for row in rows]), float(np.mean([r[2] for r in rows]))
-    return made, failed
+        if all(number in each for each in runs):
+            rows = [each[number] for each in runs]
+            # Trials count in proportion to their segments, as in the law of the bins.
+            power = np.average([row[0] for row in rows], axis=0, weights=trials)[part.chosen]
+            target = _target(part.target, number, power, [row[1] for row in rows])
+            made[number] = target, float(np.mean([row[2] for row in rows]))
+    return made
 
 
-def _runs(task: Any, setup: Setup, segments: int, trial: int, numbers: np.ndarray, failed: dict[int, str]) -> dict[int, Any]:
+def _runs(
+    task: Any, target: Target, segments: int, key: Array, numbers: np.ndarray, failed: dict[int, str]
+) -> dict[int, Any]:
     """Welch power, coefficient of variation and mean of one trial of every replicate that stays finite."""
-    settings = setup.target.settings
+    settings = target.settings
     rate = float(slowest_rate(as_arrays(task)))
     start = math.ceil(max(LEAD, FORGOTTEN / rate) * settings.rate) / settings.rate
     window = start, start + (settings.length + (segments - 1) * settings.step) / settings.rate
-    key = jax.random.fold_in(jax.random.fold_in(setup.key, 31), trial)
     try:
         runs = ensemble(task, key, seeds=numbers, duration=window[1], control=False)
     except SimulationError as error:
@@ -54,7 +74,7 @@ def _runs(task: Any, setup: Setup, segments: int, trial: int, numbers: np.ndarra
             failed[int(numbers[0])] = str(error)
             return {}
         halves = np.array_split(numbers, 2)
-        return {n: x for half in halves for n, x in _runs(task, setup, segments, trial, half, failed).items()}
+        return {n: x for half in halves for n, x in _runs(task, target, segments, key, half, failed).items()}
     power, held = np.asarray(runs.spectrum(settings, window).power), runs.filtered(settings, window)
     variation = np.asarray(coefficient_of_variation(held))
     return {int(n): (power[i], float(variation[i]), float(held[i].mean())) for i, n in enumerate(numbers)}
@@ -77,22 +97,23 @@ def _target(like: Target, number: int, power: np.ndarray, variation: list[float]
     )
 
 
-def drawn_data(setup: Setup, task: AbstractTask, count: int) -> tuple[Made, dict[int, str]]:
-    """Targets drawn from the Gaussian law about the fitted spectrum in linear response."""
-    keys = jax.random.split(jax.random.fold_in(setup.key, 31), 3)
-    moments = repeated(setup, task, count)
-    power = drawn_spectra(Likelihood.of(setup), setup.target, moments, keys[0])
-    scatter = [0.0 if given is None else float(given[1]) for given in setup.extra]
+def _drawn(problem: FitProblem, tasks: tuple[AbstractTask, ...], i: int, count: int, key: Array) -> dict[int, Datum]:
+    """Targets drawn from the Gaussian law about the fitted spectrum of one part in linear response."""
+    part, moments, keys = problem.parts[i], repeated(problem, tasks, count)[i], jax.random.split(key, 3)
+    power = drawn_spectra(Likelihood.of(problem).bins[i], part.target, moments, keys[0])
+    scatter = [0.0 if given is None else float(given[1]) for given in (part.variation, part.mean)]
     variation = moments.variation * np.exp(scatter[0] * np.asarray(jax.random.normal(keys[1], (count,))))
     mean = moments.mean + scatter[1] * np.asarray(jax.random.normal(keys[2], (count,)))
-    relative = np.asarray(setup.target.sigma) / setup.target.proportional_power
-    made = {i: (_target(setup.target, i, p, [float(v)], relative * p), float(m))
-            for i, (p, v, m) in enumerate(zip(power, variation, mean, strict=True))}  # fmt: skip
-    return made, {}
+    relative = np.asarray(part.target.sigma) / part.target.proportional_power
+    return {n: (_target(part.target, n, p, [float(v)], relative * p), float(m))
+            for n, (p, v, m) in enumerate(zip(power, variation, mean, strict=True))}  # fmt: skip
 
 
-def with_data(setup: Setup, target: Target, mean: float) -> Setup:
-    """The setup with other data, of the same kinds."""
-    variation, force = setup.extra
-    extra = (None if variation is None else target_variation(target), None if force is None else (mean, force[1]))
-    return dataclasses.replace(setup, target=target, extra=extra)
+def with_data(problem: FitProblem, data: tuple[Datum, ...]) -> FitProblem:
+    """The problem with other data, of the same kinds."""
+    parts = []
+    for part, (target, mean) in zip(problem.parts, data, strict=True):
+        variation = None if part.variation is None else target_variation(target)
+        stated = None if part.mean is None else (mean, part.mean[1])
+        parts.append(dataclasses.replace(part, target=target, variation=variation, mean=stated))
+    return dataclasses.replace(problem, parts=tuple(parts))

@@ -68,6 +68,13 @@ def plain(text: object) -> str:
     return str(text).replace("[", r"\[")
 
 
+def show(result: object, *, success: bool) -> None:
+    """A result as it prints itself, its first line in colour."""
+    first, *rest = str(result).splitlines()
+    out.print(f"[{'green' if success else 'bold red'}]{plain(first)}[/]", highlight=False, soft_wrap=True)
+    out.print(plain("\n".join(rest)), highlight=False, soft_wrap=True)
+
+
 def writable(folder: Path) -> None:
     """Fail before the long work, not after it."""
     if folder.exists() and not folder.is_dir():

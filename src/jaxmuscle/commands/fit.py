@@ -1,15 +1,14 @@
 """`jaxmuscle fit`."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
-from rich.table import Table
 
 import jaxmuscle as jm
 from jaxmuscle._common.progress import progress
 
-from .console import CONVERGED, INTERRUPTED, NOT_CONVERGED, aim_of, err, out, plain, reporting, writable, write_fit
+from .console import CONVERGED, INTERRUPTED, NOT_CONVERGED, aim_of, err, out, reporting, show, writable, write_fit
 from .options import (
     AxisName,
     Fix,
@@ -26,9 +25,6 @@ from .options import (
     fixed_values,
     names_in,
 )
-
-if TYPE_CHECKING:
-    from jaxmuscle.fits import FitResult
 
 
 def fit(
@@ -118,33 +114,6 @@ def _fit_one(target: Any, model: Any, folder: Path, options: dict[str, Any]) -> 
         err.print(f"interrupted: what had been reached is in {folder}")
         raise typer.Exit(INTERRUPTED) from None
     write_fit(result, folder)
-    _show_fit(result, folder)
-    return result.success
-
-
-def _show_fit(result: "FitResult", folder: Path) -> None:
-    table = Table(title=f"{result.target.name}: {type(result.task).__name__}, {type(result.task.noise).__name__}",
-                  title_justify="left")  # fmt: skip
-    for column, justify in (("parameter", "left"), ("value", "right"), ("std. error", "right"), ("unit", "left")):
-        table.add_column(column, justify=justify)  # pyright: ignore[reportArgumentType]
-    free = [(name, p) for name, p in result.parameters.items() if p.free]
-    for name, p in [*free, *result.derived.items()]:
-        if name == next(iter(result.derived), None):
-            table.add_section()
-        error = p.error_in_words() if p.stderr is not None else f"[dim]{p.error_in_words()}[/]"
-        table.add_row(name, f"{p.value:.4g}", error, "" if p.unit == "1" else p.unit)
-    out.print(table)
-    if result.chi2_per_bin is not None:
-        out.print(f"chi² per bin {result.chi2_per_bin:.2f}, rms log error {result.rms_log_error:.2f}", highlight=False)
-    for sentence in result.remarks:
-        out.print(plain(sentence[0].upper() + sentence[1:]), highlight=False)
-    if result.undetermined:
-        out.print("Not determined by the data (kept near the default by the prior):", highlight=False)
-        for sentence in result.undetermined:
-            out.print(f"  - {plain(sentence)}", highlight=False)
-    for notice in result.notices:
-        if notice not in result.target.notices:
-            out.print(f"[yellow]notice:[/] {plain(notice)}", highlight=False)
-    word = "[green]converged[/]" if result.success else "[bold red]failed[/]"
-    out.print(f"{word}: {plain(result.message)}", highlight=False)
+    show(result, success=result.success)
     out.print(f"Written: {folder}/fit.json, fit.png, spectrum.csv", highlight=False)
+    return result.success

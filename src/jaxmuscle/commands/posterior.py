@@ -5,12 +5,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.table import Table
 
 import jaxmuscle as jm
 from jaxmuscle._common.progress import progress
 
-from .console import CONVERGED, NOT_CONVERGED, aim_of, err, out, plain, reporting, save_figure, writable
+from .console import CONVERGED, NOT_CONVERGED, aim_of, err, out, plain, reporting, save_figure, show, writable
 from .options import (
     Fix,
     Free,
@@ -110,19 +109,5 @@ def _show(found: "Posterior", folder: Path) -> None:
     if not found.success:
         err.print(f"[bold red]failed:[/] {plain(found.message)}; the chains are in {folder}", highlight=False)
         return
-    table = Table(title=f"Posterior of {found.target.name}", title_justify="left")
-    for column in ("quantity", "median", "95 % from", "to", "R-hat", "unit"):
-        table.add_column(column, justify="left" if column in ("quantity", "unit") else "right")
-    summary = found.summary()
-    for name in summary.rows:
-        row, unit = summary[name], found.unit(name)
-        if name == next(iter(found.derived)):
-            table.add_section()
-        known = name in found.determined
-        cells = (name, f"{summary.rows[name][2]:.4g}", f"{row['low']:.4g}", f"{row['high']:.4g}", f"{row['r_hat']:.3f}")
-        table.add_row(*cells, "" if unit == "1" else unit, style=None if known else "dim")
-    out.print(table)
-    out.print("Dim: not determined by the data, the prior keeps it where it is", highlight=False)
-    for line in str(found).splitlines()[1:]:
-        out.print(plain(line.strip()), highlight=False)
+    show(found.summary(), success=True)
     out.print(f"written to {folder}", highlight=False)

@@ -14,13 +14,13 @@ from jaxmuscle._common.text import choices
 from jaxmuscle.data._target import Target
 from jaxmuscle.model._parameters import PARAMETERS
 from jaxmuscle.model._tasks import NOISES, AbstractTask, with_noise
-from jaxmuscle.objective._arguments import planned
-from jaxmuscle.objective._coordinates import at
-from jaxmuscle.objective._problem import Setup
+from jaxmuscle.objective._arguments import FitOptions, planned
+from jaxmuscle.objective._coordinates import task_at
+from jaxmuscle.objective._problem import FitProblem
 from jaxmuscle.spectra._bin_law import bin_statistics, standardised
 
 from ._comparison import NEEDED, ComparedModel, Comparison, score_difference
-from ._evidence import Folds, Model, held_out, masked_bins, maxima
+from ._evidence import Candidate, Folds, held_out, masked_bins, maxima
 
 Value = TypeVar("Value")
 
@@ -69,15 +69,17 @@ def compare_noise(
     tell = teller(progress)
     with jax.enable_x64(True):
         carried, left_out = _carried(task, noises, dict(fix or {}))
-        setups = _setups(carried, target, free, dict(fix or {}), dict(priors or {}), dict(bounds or {}), key)
+        problems = _setups(carried, target, free, dict(fix or {}), dict(priors or {}), dict(bounds or {}), key)
         folds = None if target.segments is None else Folds.of([target], groups)
         found: dict[tuple[str, bool], dict[str, Any]] = {}
-        for number, (noise, setup) in enumerate(setups.items()):
-            for harmonic in (True, False) if float(setup.task["harmonic_amplitude"]) > 0 else (False,):
-                tell(f"{noise}, {'with' if harmonic else 'without'} harmonic", (number + 0.5 * (not harmonic)) / len(setups))
-                found[noise, harmonic] = _fitted(setup, folds, harmonic=harmonic)
+        for number, (noise, problem) in enumerate(problems.items()):
+            for harmonic in (True, False) if float(problem.parts[0].task["harmonic_amplitude"]) > 0 else (False,):
+                tell(
+                    f"{noise}, {'with' if harmonic else 'without'} harmonic", (number + 0.5 * (not harmonic)) / len(problems)
+                )
+                found[noise, harmonic] = _fitted(problem, folds, harmonic=harmonic)
     tell("done", 1.0)
-    sought = any("harmonic_frequency" in setup.coordinates.names for setup in setups.values())
+    sought = any("harmonic_frequency" in problem.coordinates.names for problem in problems.values())
     needed = NEEDED + 2 * np.log(len(target.bins)) * sought
     tasks, fitted = ({model: values.pop(name) for model, values in found.items()} for name in ("task", "fitted"))
     seed = key if isinstance(key, int) else None
@@ -111,7 +113,7 @@ def _setups(
     priors: dict[str, float | None],
     bounds: dict[str, tuple[float, float]],
     key: Array | int,
-) -> dict[str, Setup]:
+) -> dict[str, FitProblem]:
     """The fit of each noise; what concerns a parameter that only other noises have is left to them."""
     everywhere = {name for task in carried.values() for name in task.parameter_names}
     everywhere |= {name for name in PARAMETERS if name.startswith("noise_")}
@@ -120,30 +122,30 @@ def _setups(
         for name in names:
             if name not in everywhere:
                 raise ValueError(f"{argument}: unknown parameter {name!r}: {choices(name, everywhere)}")
-    setups = {}
+    problems = {}
     for noise, task in carried.items():
         own = set(task.parameter_names)
         names = None if chosen is None else [n for n in chosen if n in own]
-        setups[noise] = planned(task, target, free=names, fix=_of(fix, own), priors=_of(priors, own),
-                                bounds=_of(bounds, own), key=key).setup  # fmt: skip
-    return setups
+        options = FitOptions(free=names, fix=_of(fix, own), priors=_of(priors, own), bounds=_of(bounds, own), key=key)
+        problems[noise] = planned(task, target, options).problem
+    return problems
 
 
 def _of(given: dict[str, Value], names: set[str]) -> dict[str, Value]:
     return {name: value for name, value in given.items() if name in names}
 
 
-def _fitted(setup: Setup, folds: Folds | None, *, harmonic: bool) -> dict[str, Any]:
+def _fitted(problem: FitProblem, folds: Folds | None, *, harmonic: bool) -> dict[str, Any]:
     """One model at its maximum, with its score."""
-    model, target = Model.of(setup, harmonic=harmonic), setup.target
-    moving = np.ones((1, len(setup.prior)))
+    model, target = Candidate.of(problem, harmonic=harmonic), problem.parts[0].target
+    moving = np.ones((1, len(problem.prior)))
     bins = None if folds is None else masked_bins(target, np.ones((1, len(target.bins))))
     peak = maxima(model, model.starts[None], bins, moving)
     held = None if folds is None else held_out(model, peak.theta, folds, moving)
     residual = standardised(target.proportional_power, peak.proportional[0], bin_statistics(target, peak.line[0]))
-    problem = model.likelihood.problem
+    (part,) = model.likelihood.objective.parts
     return {
-        "task": as_numbers(at(problem.task, problem.coordinates, jnp.asarray(peak.theta[0]))),
+        "task": as_numbers(task_at(part.task, part.coordinates, jnp.asarray(peak.theta[0]))),
         "fitted": peak.proportional[0],
         "log_likelihood": float(peak.log_likelihood[0]),
         "parameters": float(peak.parameters[0]),

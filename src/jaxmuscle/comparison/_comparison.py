@@ -157,7 +157,7 @@ class Comparison(eqx.Module):
 
     @property
     def success(self) -> bool:
-        """Whether every climb settled."""
+        """Whether every search settled."""
         return all(row.success for row in self.rows)
 
     @property

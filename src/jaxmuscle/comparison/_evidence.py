@@ -9,10 +9,10 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxmuscle.data._target import Target
-from jaxmuscle.objective._consequences import BATCH, seen_at
-from jaxmuscle.objective._likelihood import Bins, Likelihood, _precision
-from jaxmuscle.objective._problem import Setup
-from jaxmuscle.objective._scoring import Peak, climb
+from jaxmuscle.objective._consequences import BATCH, expand
+from jaxmuscle.objective._likelihood import Bins, Likelihood, _precision, without_offsets
+from jaxmuscle.objective._problem import FitProblem
+from jaxmuscle.objective._scoring import Maximum, maximise
 from jaxmuscle.objective._starts import points_about, starting_points
 from jaxmuscle.response._expected import Moments
 from jaxmuscle.spectra._bin_law import welch_law
@@ -45,45 +45,47 @@ class HeldOut(NamedTuple):
     settled: Bool[np.ndarray, " sets"]
 
 
-class Model(NamedTuple):
-    """A likelihood with the precision Λ of its prior, and where to begin."""
+class Candidate(NamedTuple):
+    """A likelihood of one target with the precision Λ of its prior, and where to begin."""
 
     likelihood: Likelihood
     precision: Float[np.ndarray, " free"]
     starts: Float[np.ndarray, "starts free"]
 
     @classmethod
-    def of(cls, setup: Setup, *, harmonic: bool) -> "Model":
-        """Of a setup, or of the same without harmonic: amplitude zero, whatever the coordinates of amplitude and frequency.
+    def of(cls, problem: FitProblem, *, harmonic: bool) -> "Candidate":
+        """Of a fit, or of the same without harmonic: amplitude zero, whatever the coordinates of amplitude and frequency.
 
         The data then say nothing about these two, so that they stay at their prior's centre and count as no parameters; the
         compiled programs are those of the model with harmonic.
         """
-        rng = np.random.default_rng(np.asarray(jax.random.key_data(setup.key)).tolist())
-        names = setup.coordinates.names
+        rng = np.random.default_rng(np.asarray(jax.random.key_data(problem.key)).tolist())
+        names = problem.coordinates.names
         scattered = 0.5 * rng.standard_normal((RANDOM, len(names)))
         if harmonic:
-            spread = setup.coordinates.theta(starting_points(setup.coordinates, setup.target, SPREAD))
-            starts = np.concatenate([points_about(setup, np.zeros(len(names))), spread, scattered])
+            spread = problem.coordinates.theta(starting_points(problem, SPREAD))
+            starts = np.concatenate([points_about(problem, np.zeros(len(names))), spread, scattered])
         else:
-            setup = without_harmonic(setup)
-            spread = setup.coordinates.theta(starting_points(setup.coordinates, setup.target, PLAIN - RANDOM))
+            problem = without_harmonic(problem)
+            spread = problem.coordinates.theta(starting_points(problem, PLAIN - RANDOM))
             starts = np.concatenate([spread, scattered])
             starts[:, [n in HARMONIC for n in names]] = 0.0
-        return cls(Likelihood.of(setup), setup.prior, starts)
+        return cls(Likelihood.of(problem), problem.prior, starts)
 
 
-def without_harmonic(setup: Setup) -> Setup:
-    """The setup with a harmonic of amplitude zero."""
-    names = setup.coordinates.names
-    if "harmonic_amplitude" not in names:
-        return dataclasses.replace(setup, task=setup.task.replace(harmonic_amplitude=0.0))
-    centre = np.where(np.array(names) == "harmonic_amplitude", 0.0, setup.coordinates.centre)
-    return dataclasses.replace(setup, coordinates=eqx.tree_at(lambda c: c.centre, setup.coordinates, centre))
+def without_harmonic(problem: FitProblem) -> FitProblem:
+    """The fit with a harmonic of amplitude zero."""
+    (part,), c = problem.parts, problem.coordinates
+    if "harmonic_amplitude" not in c.names:
+        task = part.task.replace(harmonic_amplitude=0.0)
+        return dataclasses.replace(problem, parts=(dataclasses.replace(part, task=task),))
+    centre = np.where(np.array(c.names) == "harmonic_amplitude", 0.0, c.centre)
+    still = eqx.tree_at(lambda c: c.centre, c, centre)
+    return dataclasses.replace(problem, coordinates=still, parts=(dataclasses.replace(part, coordinates=still),))
 
 
 def maxima(
-    model: Model,
+    model: Candidate,
     starts: Float[np.ndarray, "sets starts free"],
     bins: Bins | None,
     moving: Float[np.ndarray, "sets free"],
@@ -94,7 +96,7 @@ def maxima(
     peak = _climbed(model, starts.reshape(-1, free), bins, moving, owner)
     on = np.concatenate([s * count + _different(cost) for s, cost in enumerate(peak.cost.reshape(sets, count))])
     peak, settled = _highest(model, peak.theta[on], bins, moving, owner[on])
-    moments = seen_at(model.likelihood.problem, peak.theta).moments
+    (moments,) = expand(model.likelihood.objective, peak.theta).moments
     return Maxima(
         peak.theta,
         marginals(model.likelihood, moments, bins),
@@ -113,12 +115,12 @@ def _different(cost: Float[np.ndarray, " starts"]) -> Int[np.ndarray, " kept"]:
 
 
 def _highest(
-    model: Model,
+    model: Candidate,
     theta: Float[np.ndarray, "rows free"],
     bins: Bins | None,
     moving: np.ndarray,
     owner: Int[np.ndarray, " rows"],
-) -> tuple[Peak, Bool[np.ndarray, " sets"]]:
+) -> tuple[Maximum, Bool[np.ndarray, " sets"]]:
     """The best row of every data set, once a block of steps improves it by less than `ENOUGH`; whether it came to that."""
     sets, theta = len(moving), theta.copy()
     best: list[Any] = [None] * sets
@@ -135,12 +137,12 @@ def _highest(
             i = int(own[np.argmin(reached[own])])
             settled[s] = peak.settled[i] or (np.isfinite(cost[s]) and cost[s] - reached[i] < ENOUGH)
             best[s], cost[s] = peak.row(i), reached[i]
-    return Peak(*(np.concatenate(x) for x in zip(*best, strict=True))), settled
+    return Maximum(*(np.concatenate(x) for x in zip(*best, strict=True))), settled
 
 
-def _climbed(model: Model, theta: np.ndarray, bins: Bins | None, moving: np.ndarray, owner: np.ndarray) -> Peak:
-    own = None if bins is None else jax.tree.map(lambda x: np.asarray(x)[owner], bins)
-    return climb(model.likelihood, theta, model.precision, bins=own, moving=moving[owner], max_steps=BLOCK)
+def _climbed(model: Candidate, theta: np.ndarray, bins: Bins | None, moving: np.ndarray, owner: np.ndarray) -> Maximum:
+    own = None if bins is None else (jax.tree.map(lambda x: np.asarray(x)[owner], bins),)
+    return maximise(model.likelihood, theta, model.precision, bins=own, moving=moving[owner], max_steps=BLOCK)
 
 
 def effective_parameters(
@@ -154,8 +156,7 @@ def effective_parameters(
     """
     found = []
     for whole, moves in zip(curvature, moving > 0, strict=True):
-        inner, border, corner = whole[:-1, :-1], whole[:-1, -1], whole[-1, -1]
-        both = (inner - np.outer(border, border) / corner if corner > 0 else inner)[np.ix_(moves, moves)]
+        both = without_offsets(whole, len(precision))[np.ix_(moves, moves)]
         data = both - np.diag(precision[moves])
         found.append(np.trace(data @ np.linalg.pinv(both, hermitian=True)))
     return np.array(found)
@@ -163,7 +164,7 @@ def effective_parameters(
 
 @eqx.filter_jit
 def _marginals(likelihood: Likelihood, moments: Moments, bins: Bins | None) -> Any:
-    return jax.vmap(likelihood.marginal)(moments, bins)
+    return jax.vmap(lambda m, b: likelihood.marginal((m,), None if b is None else (b,)))(moments, bins)
 
 
 def marginals(likelihood: Likelihood, moments: Moments, bins: Bins | None) -> Float[np.ndarray, " rows"]:
@@ -210,14 +211,14 @@ def stacked(bins: list[Bins]) -> Bins:
 
 
 def held_out(
-    model: Model, theta: Float[np.ndarray, "sets free"], folds: Folds, moving: Float[np.ndarray, "sets free"]
+    model: Candidate, theta: Float[np.ndarray, "sets free"], folds: Folds, moving: Float[np.ndarray, "sets free"]
 ) -> HeldOut:
     """`ln f(p_k | bins kept; θ of the fold) = ln f(p_k and bins kept) - ln f(bins kept)`, refitted from `theta`."""
     sets, groups = np.shape(folds.kept.logdet)
     owner = np.repeat(np.arange(sets), groups)
     kept, more = (jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), b) for b in (folds.kept, folds.more))
     peak, settled = _highest(model, theta[owner], kept, moving[owner], np.arange(sets * groups))
-    moments = seen_at(model.likelihood.problem, peak.theta).moments
+    (moments,) = expand(model.likelihood.objective, peak.theta).moments
     row = (np.arange(sets)[:, None] * groups + folds.group).ravel()
     above = marginals(model.likelihood, jax.tree.map(lambda x: x[row], moments), more)
     scores = above - marginals(model.likelihood, moments, kept)[row]

@@ -5,9 +5,8 @@ from ._cohort import Difference as Difference
 from ._cohort import fit_cohort as fit_cohort
 from ._fit import fit as fit
 from ._joint import fit_joint as fit_joint
-from ._joint_result import JointResult as JointResult
-from ._joint_result import load_joint_result as load_joint_result
-from ._result import Estimate as Estimate
+from ._part import Estimate as Estimate
+from ._part import FittedPart as FittedPart
 from ._result import FitResult as FitResult
 from ._result import load_result as load_result
 from ._search import FitInterrupted as FitInterrupted

@@ -7,18 +7,17 @@ import numpy as np
 
 from jaxmuscle._common.arrays import as_arrays
 from jaxmuscle.data._target import Target
-from jaxmuscle.model._tasks import AbstractTask
-from jaxmuscle.objective._consequences import Seen, consequences, seen_at
-from jaxmuscle.objective._least_squares import Descent
-from jaxmuscle.objective._problem import Problem, Setup
-from jaxmuscle.objective._starts import contenders, harmonic_frequencies
+from jaxmuscle.objective._consequences import Expansion, consequences, expand
+from jaxmuscle.objective._least_squares import Minima
+from jaxmuscle.objective._problem import FitProblem
+from jaxmuscle.objective._residuals import Residuals
+from jaxmuscle.objective._starts import contenders, frequency_names, harmonic_frequencies
 from jaxmuscle.response._expected import Moments, expected_moments
-from jaxmuscle.response._linearised import linearised
 from jaxmuscle.simulation._trajectory import Trajectory
 from jaxmuscle.spectra._bin_law import BinStatistics, trial_samples
 from jaxmuscle.spectra._settings import WINDOW
 
-from ._result import Estimate
+from ._part import Estimate
 
 AMBIGUOUS = 1.92
 NONLINEAR = 0.1
@@ -27,11 +26,11 @@ RISEN = 1.5
 
 
 class Stage(NamedTuple):
-    """A stage of a search: its name, its problem, and where its starts stand."""
+    """A stage of a search: its name, the residuals it lowers, and where its starts stand."""
 
     name: str
-    problem: Problem
-    descent: Descent
+    objective: Residuals
+    minima: Minima
 
 
 def controlled_moments(runs: Trajectory, target: Target) -> tuple[Moments, Moments | None]:
@@ -51,13 +50,13 @@ def controlled_moments(runs: Trajectory, target: Target) -> tuple[Moments, Momen
         power = expected.power + power - np.asarray(beside.spectrum(settings).power)
         variance = expected.variance + variance - beside.filtered(settings).var(axis=1)
     line = np.zeros_like(power) if expected is None else np.broadcast_to(expected.line, power.shape)
-    return Moments(power, line, held.mean(axis=1), variance), expected
+    mean = held.mean(axis=1)
+    return Moments(power, line, mean, variance, np.full_like(mean, np.nan)), expected
 
 
-def seen_best(problem: Any, descent: Descent) -> Seen:
+def seen_best(objective: Residuals, minima: Minima) -> Expansion:
     """What the model gives at the best point."""
-    seen = seen_at(problem, np.asarray(problem.theta(descent.s)))
-    return jax.tree.map(lambda x: x[descent.best], seen)
+    return expand(objective, np.asarray(objective.theta(minima.s))).row(minima.best)
 
 
 def linear_check(each: np.ndarray, expected: np.ndarray, statistics: BinStatistics) -> dict[str, float | int]:
@@ -73,55 +72,68 @@ def linear_check(each: np.ndarray, expected: np.ndarray, statistics: BinStatisti
     }
 
 
-def polish_check(setup: Setup, stages: list[Stage], found: dict[str, Estimate]) -> dict[str, float | int]:
+def polish_check(problem: FitProblem, stages: list[Stage], found: dict[str, Estimate]) -> dict[str, float | int]:
     """How far the nonlinear correction moved the determined quantities, in standard errors."""
     names = [stage.name for stage in stages]
-    if "polishing" not in names or setup.method != "linear":
+    if "polishing" not in names or problem.method != "linear":
         return {}
     before, after = stages[names.index("linear response")], stages[-1]
-    old, new = (consequences(stage.problem, seen_best(stage.problem, stage.descent))[0][1] for stage in (before, after))
-    moves = [abs(float(new[name] - old[name])) / p.stderr for name, p in found.items() if p.stderr]
+    old, new = (problem.by_name(consequences(s.objective, seen_best(s.objective, s.minima)).values) for s in (before, after))
+    # Of several targets, a quantity that is the same for all is that of the first.
+    held = {name: name if name in new else f"{name}@{problem.parts[0].name}" for name in found}
+    moves = [abs(float(new[held[n]] - old[held[n]])) / p.stderr for n, p in found.items() if p.stderr]
     return {"polish_moved_se": max(moves, default=0.0), "polish_turns": len(stages) - 1 - names.index("linear response")}
 
 
-def unsettled(setup: Setup, task: AbstractTask) -> float:
-    """Share of the input's rise that is left when the analysed window begins."""
-    if not setup.control:
-        return 0.0
-    rate = np.abs(np.linalg.eigvals(np.asarray(linearised(as_arrays(task)).system.A))).min()
-    return float(np.exp(-rate * (WINDOW[0] - RISEN)))
+def polish_notices(check: dict[str, float | int]) -> tuple[str, ...]:
+    """The notice of a correction that matters."""
+    if not check.get("polish_moved_se", 0.0) > 1:
+        return ()
+    return (f"the nonlinear correction moved a determined quantity by {check['polish_moved_se']:.1f} standard errors: check "
+            "with method='montecarlo'",)  # fmt: skip
 
 
-def rival_frequencies(setup: Setup, final: Descent) -> list[float]:
-    """Harmonic frequencies of other minima that fit almost as well as the best one, best first [Hz].
+def unsettled(problem: FitProblem, moments: Moments) -> float:
+    """Share of an input's rise that is left when the analysed window begins."""
+    return float(np.exp(-float(moments.rate) * (WINDOW[0] - RISEN))) if problem.control else 0.0
+
+
+def rivals(problem: FitProblem, minima: Minima) -> tuple[list[str], list[str]]:
+    """Other minima that fit almost as well as the best one, in words, and which harmonic frequencies differ in them.
 
     Almost as well: a cost `½ Σ r²` within 1.92 of the lowest, half the 95 % quantile of χ² with one degree of freedom, so
     that a likelihood interval for the frequency would contain them.
     """
-    chosen = contenders(setup.coordinates, setup.target, final, AMBIGUOUS)
-    if len(chosen) < 2:
-        return []
-    frequency = harmonic_frequencies(setup.coordinates, final)
-    return [float(frequency[i]) for i in chosen[1:]]
+    chosen = contenders(problem, minima, AMBIGUOUS)
+    names = frequency_names(problem.coordinates)
+    theta = np.asarray(problem.coordinates.theta(minima.s))
+    frequency = {name: harmonic_frequencies(problem, theta, name)[chosen] for name in names}
+    told, moved = [], []
+    for i in range(1, len(chosen)):
+        differ = [n for n, f in frequency.items() if abs(f[i] - f[0]) >= problem.finest.settings.resolution]
+        told.append(" with ".join(f"{n} " * (len(names) > 1) + f"{frequency[n][i]:.2f} Hz" for n in differ))
+        moved += differ
+    return told, sorted(set(moved))
 
 
-def notices_of(
-    target: Any, statistics: BinStatistics, rivals: list[float], check: dict[str, float | int], left: float
-) -> tuple[str, ...]:
+def ambiguity(told: list[str], moved: list[str]) -> tuple[str, ...]:
+    """The notice of such minima."""
+    if not told:
+        return ()
+    verb = "is" if len(moved) == 1 else "are"
+    return (f"{' and '.join(moved)} {verb} ambiguous: {' or '.join(told)} fits almost as well (log-likelihood within "
+            f"{AMBIGUOUS}); the other numbers hold for what is shown",)  # fmt: skip
+
+
+def notices_of(target: Any, statistics: BinStatistics, check: dict[str, float | int], left: float) -> tuple[str, ...]:
+    """What has to be said of one target and its task."""
     notices = list(target.notices)
     if not statistics.known:
         notices.append("the target states neither segments nor sigma: every bin counts alike and there is no chi2")
-    if rivals:
-        others = " and ".join(f"{f:.2f} Hz" for f in rivals)
-        notices.append(f"harmonic_frequency is ambiguous: {others} fits almost as well (log-likelihood within {AMBIGUOUS}); "
-                       "the other numbers hold for the frequency shown")  # fmt: skip
     if check.get("largest_deviation", 0.0) > NONLINEAR:
         notices.append(f"the response is not linear here: simulation and linear response differ by up to "
                        f"{100 * check['largest_deviation']:.0f} % of a bin (the fit is corrected for it); large noise or "
                        "harmonic: check with method='montecarlo'")  # fmt: skip
-    if check.get("polish_moved_se", 0.0) > 1:
-        notices.append(f"the nonlinear correction moved a determined quantity by {check['polish_moved_se']:.1f} standard "
-                       "errors: check with method='montecarlo'")  # fmt: skip
     if left > LEFT:
         notices.append(f"slow task: {100 * left:.1g} % of the input's rise is left when the analysed window begins; the fit "
                        "is about the settled task, simulate that with jaxmuscle.settled(task)")  # fmt: skip

@@ -9,15 +9,15 @@ import equinox as eqx
 import jax
 import numpy as np
 import scipy.stats
+from jaxtyping import PRNGKeyArray
 
 from jaxmuscle import plot
-from jaxmuscle._common.arrays import as_numbers
 from jaxmuscle._common.environment import versions
 from jaxmuscle._common.progress import teller
 from jaxmuscle.data._target import Target, load_target
 from jaxmuscle.model._noise import AbstractNoise
 from jaxmuscle.model._tasks import AbstractTask, with_noise
-from jaxmuscle.objective._arguments import Plan, planned, task_for
+from jaxmuscle.objective._arguments import FitOptions, Plan, planned, task_for
 from jaxmuscle.spectra._bin_law import trial_samples
 
 from ._result import FitResult
@@ -137,7 +137,7 @@ def _quantities(result: FitResult) -> dict[str, Any]:
 
 
 def _determined(result: FitResult) -> dict[str, Any]:
-    return {name: e for name, e in _quantities(result).items() if e.stderr is not None}
+    return result.determined
 
 
 def _difference(quantity: str, a: tuple[str, list[Any]], b: tuple[str, list[Any]]) -> Difference:
@@ -162,8 +162,14 @@ def fit_cohort(
     noise: str | AbstractNoise | None = None,
     fix: Mapping[str, float] | None = None,
     starts: int = 32,
+    free: Iterable[str] | None = None,
+    residual: str = "log",
+    bounds: Mapping[str, tuple[float, float]] | None = None,
+    priors: Mapping[str, float | None] | None = None,
+    coefficient_of_variation: bool = True,
+    max_steps: int = 40,
+    key: PRNGKeyArray | int = 0,
     progress: bool | Callable[[str, float], None] = False,
-    **options: Any,
 ) -> CohortResult:
     """Fit many targets, in linear response, all starts of all of them in one batch.
 
@@ -172,20 +178,20 @@ def fit_cohort(
     batch are those of the same task, bins and settings.
 
     **Arguments:** `targets`, or names and paths of them; `groups` {target name: group}; `task`, the same kind for all
-    (by default what each measured); `noise`, `fix`, and other options (`free`, `residual`, `bounds`, `priors`, `key`,
-    `max_steps`, `coefficient_of_variation`) as in `fit`; `starts` for each target; `progress`, True or a function of
-    (text, share).
+    (by default what each measured); `noise`, `fix`, `free`, `residual`, `bounds`, `priors`, `key`, `max_steps`,
+    `coefficient_of_variation` as in `fit`; `starts` for each target; `progress`, True or a function of (text, share).
 
     **Returns:** a `CohortResult`. A target that cannot be read, or not be fitted with these options, is
     listed in `failed` with the reason and does not stop the rest.
 
-    **Raises:** `ValueError` for no targets, equal names and a group of an unknown target; `TypeError` for an option that
-    is not one of those above.
+    **Raises:** `ValueError` for no targets, equal names and a group of an unknown target.
     """
     loaded, failed = _loaded(targets)
     unknown = set(groups or {}) - set(loaded) - set(failed)
     if unknown:
         raise ValueError(f"groups: no target is called {', '.join(sorted(unknown))}; there are {', '.join(loaded)}")
+    options = FitOptions(free=free, fix=fix, residual=residual, starts=starts, key=key, bounds=bounds, priors=priors,
+                         coefficient_of_variation=coefficient_of_variation, max_steps=max_steps)  # fmt: skip
     tell = teller(progress)
     results: dict[str, FitResult] = {}
     with jax.enable_x64(True):
@@ -194,7 +200,7 @@ def fit_cohort(
             model = task_for(target) if task is None else task(settings=target.settings)
             model = with_noise(model, noise, fix)
             try:
-                plan = planned(model, target, fix=fix, method="linear", counts=(starts, None, None), **options)
+                plan = planned(model, target, options)
             except ValueError as error:
                 failed[name] = str(error)
                 continue
@@ -224,8 +230,8 @@ def _loaded(targets: Iterable[Target | str | PathLike[str]]) -> tuple[dict[str, 
 
 def _alike(plan: Plan) -> Any:
     """Equal for fits that differ in their data only, and in the length of their recordings by less than a half."""
-    setup = plan.setup
-    length = round(2 * np.log2(trial_samples(setup.target)))
-    present = tuple(extra is not None for extra in setup.extra)
-    values = tuple(as_numbers(setup.task.parameters).items())
-    return type(setup.task), type(setup.task.noise), values, setup.target.settings, tuple(setup.target.bins), present, length
+    (part,) = plan.problem.parts
+    target, task = part.target, part.task
+    length = round(2 * np.log2(trial_samples(target)))
+    present = part.variation is not None, part.mean is not None
+    return type(task), type(task.noise), tuple(task.parameters.items()), target.settings, tuple(target.bins), present, length

@@ -8,7 +8,7 @@ from jaxtyping import PRNGKeyArray
 from jaxmuscle.data._target import Target
 from jaxmuscle.model._noise import AbstractNoise
 from jaxmuscle.model._tasks import AbstractTask, with_noise
-from jaxmuscle.objective._arguments import DT, planned
+from jaxmuscle.objective._arguments import DT, FitOptions, planned
 
 from ._result import FitResult
 from ._search import search
@@ -49,20 +49,22 @@ def fit(
     **Arguments:** `task` (its values are the prior's centre; `task_for(target)` makes one) and `target`, whose spectrum
     settings replace the task's; `free`, names to fit (default: `DEFAULT_FREE`, those of them that the task has);
     `fix`, values to set, which are then not free; `noise`, a name or an object; `residual`, "log", "linear" or
-    "cumulative"; `starts` (100, or 8 for a task without linear response); `seeds` (32, or 48 then); `key`, a `jax.random`
-    key or a seed number; `bounds` {name: (low, high)}; `priors` {name: sd in log, or None for a flat one};
+    "cumulative"; `starts` (100, or 8 for a task without linear response); `seeds` (32, or 48 then; 0: no nonlinear
+    correction); `key`, a `jax.random` key or a seed number; `bounds` {name: (low, high)}; `priors` {name: sd in log, or None
+    for a flat one};
     `coefficient_of_variation`, whether the target's, if it states one, is one more residual (it fixes the scale of the
     noise); `mean_force` (value, sd) [N] as a further residual; `max_steps` for each descent; `check_seeds` (64, or 200
-    then); `dt` [s], noise grid of a Monte Carlo fit; `progress`, True or a function of (text, share).
+    then; 0: not simulated); `dt` [s], noise grid of a Monte Carlo fit; `progress`, True or a function of (text, share).
 
     **Returns:** a `FitResult`; a fit that fails is one, too, and says why.
 
     **Raises:** `ValueError` for bad arguments (unknown names with the nearest known, too few bins, values outside
     bounds); `FitInterrupted` on Ctrl-C, with what was reached.
     """
-    task, counts = with_noise(task, noise, fix), (starts, seeds, check_seeds)
+    options = FitOptions(
+        free=free, fix=fix, method=method, residual=residual, starts=starts, seeds=seeds, check_seeds=check_seeds, key=key,
+        bounds=bounds, priors=priors, coefficient_of_variation=coefficient_of_variation, mean_force=mean_force,
+        max_steps=max_steps, dt=dt, progress=progress,
+    )  # fmt: skip
     with jax.enable_x64(True):
-        plan = planned(task, target, free=free, fix=fix, method=method, residual=residual, counts=counts, key=key,
-                       bounds=bounds, priors=priors, coefficient_of_variation=coefficient_of_variation,
-                       mean_force=mean_force, max_steps=max_steps, dt=dt, progress=progress)  # fmt: skip
-        return search(plan)
+        return search(planned(with_noise(task, noise, fix), target, options))

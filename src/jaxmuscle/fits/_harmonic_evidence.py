@@ -8,9 +8,10 @@ import numpy as np
 from jaxtyping import Float
 from scipy.special import gammaincinv, ndtr
 
-from jaxmuscle.objective._consequences import consequences, seen_at
-from jaxmuscle.objective._least_squares import Descent, descend
-from jaxmuscle.objective._problem import Problem, Setup
+from jaxmuscle.objective._consequences import consequences, expand
+from jaxmuscle.objective._least_squares import Minima, least_squares
+from jaxmuscle.objective._problem import FitProblem
+from jaxmuscle.objective._residuals import Residuals
 
 from ._checks import seen_best
 
@@ -30,73 +31,77 @@ class HarmonicTest(NamedTuple):
     p_value: float | None
 
 
-def harmonic_test(setup: Setup, final: Descent) -> HarmonicTest | None:
-    """Profile and p-value in linear response; None if the task has none or its harmonic is not fitted.
+def harmonic_test(problem: FitProblem, final: Minima) -> HarmonicTest | None:
+    """Profile and p-value in linear response; None for several targets, without one, or if the harmonic is not fitted.
 
     All bins scatter here as if none held a line (see `bin_statistics`): else the best frequency would count for more.
     """
-    names = setup.coordinates.names
-    if not setup.control or "harmonic_frequency" not in names:
+    names = problem.coordinates.names
+    if len(problem.parts) > 1 or not problem.control or "harmonic_frequency" not in names:
         return None
-    problem = setup.linear()
-    setup.tell("profile over frequency", 0.9)
-    frequency, rise = _profile(setup, problem, final)
-    if "harmonic_amplitude" not in names or problem.residual != "log" or not problem.statistics.known:
+    objective = problem.linear()
+    problem.tell("profile over frequency", 0.9)
+    frequency, rise = _profile(problem, objective, final)
+    if "harmonic_amplitude" not in names or problem.residual != "log" or not objective.parts[0].statistics.known:
         return HarmonicTest(frequency, rise, None)
-    setup.tell("bootstrap without harmonic", 0.95)
-    return HarmonicTest(frequency, rise, _p_value(setup, problem, final))
+    problem.tell("bootstrap without harmonic", 0.95)
+    return HarmonicTest(frequency, rise, _p_value(problem, objective, final))
 
 
-def _pinned(problem: Problem, columns: list[int]) -> Problem:
-    moving = np.ones(len(problem.coordinates.names))
+def _pinned(objective: Residuals, columns: list[int]) -> Residuals:
+    moving = np.ones(len(objective.coordinates.names))
     moving[columns] = 0.0
-    return eqx.tree_at(lambda p: p.moving, problem, moving)
+    return eqx.tree_at(lambda p: p.moving, objective, moving)
 
 
-def _profile(setup: Setup, problem: Problem, final: Descent) -> tuple[np.ndarray, np.ndarray]:
-    coordinates, column = setup.coordinates, setup.coordinates.names.index("harmonic_frequency")
-    frequency = np.linspace(float(setup.target.frequency[0]), float(setup.target.frequency[-1]), PROFILE)
+def _profile(problem: FitProblem, objective: Residuals, final: Minima) -> tuple[np.ndarray, np.ndarray]:
+    coordinates, column = problem.coordinates, problem.coordinates.names.index("harmonic_frequency")
+    frequency = np.linspace(
+        float(problem.parts[0].target.frequency[0]), float(problem.parts[0].target.frequency[-1]), PROFILE
+    )
     theta = np.tile(np.asarray(coordinates.theta(final.s[final.best])), (PROFILE, 1))
     theta[:, column] = coordinates.theta_of("harmonic_frequency", frequency)
-    found = descend(_pinned(problem, [column]), coordinates.from_theta(theta), STEPS)
-    best = descend(problem, final.s[[final.best]], STEPS)
+    found = least_squares(_pinned(objective, [column]), coordinates.from_theta(theta), STEPS)
+    best = least_squares(objective, final.s[[final.best]], STEPS)
     return frequency, 2 * (found.cost - min(np.nanmin(found.cost), best.cost[0]))
 
 
-def _p_value(setup: Setup, problem: Problem, final: Descent) -> float:
+def _p_value(problem: FitProblem, objective: Residuals, final: Minima) -> float:
     """Improvement of chi² by a harmonic of any frequency and strength, against that in spectra that have none.
 
     The model without harmonic is fitted; about it the other parameters are linear (`M` removes what they take up), a
     harmonic adds `ln(1 + g line_k(f) / power_k)` to the log powers, and the improvement is the largest over a grid of f
     and g. The same is done with spectra drawn from that model: scaled chi² bins, correlated as Welch's are.
     """
-    names = setup.coordinates.names
+    names = problem.coordinates.names
     columns = [names.index(name) for name in ("harmonic_amplitude", "harmonic_frequency")]
-    theta = np.array(setup.coordinates.theta(final.s))
-    theta[:, columns[0]] = setup.coordinates.theta_of("harmonic_amplitude", ABSENT)
-    problem = _pinned(problem, columns)
-    without = descend(problem, setup.coordinates.from_theta(theta), STEPS)
-    here = seen_best(problem, without)
-    (residual, _), (jacobian, _) = jax.tree.map(np.asarray, consequences(problem, here))
-    null, theta = here.moments, np.tile(here.theta, (TEMPLATES, 1))
-    frequencies = np.linspace(float(setup.target.frequency[0]), float(setup.target.frequency[-1]), TEMPLATES)
-    theta[:, columns] = np.stack(
-        [np.zeros(TEMPLATES), setup.coordinates.theta_of("harmonic_frequency", frequencies)], axis=1
+    theta = np.array(problem.coordinates.theta(final.s))
+    theta[:, columns[0]] = problem.coordinates.theta_of("harmonic_amplitude", ABSENT)
+    objective = _pinned(objective, columns)
+    without = least_squares(objective, problem.coordinates.from_theta(theta), STEPS)
+    here = seen_best(objective, without)
+    found = consequences(objective, here)
+    null, theta = here.moments[0], np.tile(here.theta, (TEMPLATES, 1))
+    frequencies = np.linspace(
+        float(problem.parts[0].target.frequency[0]), float(problem.parts[0].target.frequency[-1]), TEMPLATES
     )
-    lines = seen_at(problem, theta).moments
-    n, sd = len(setup.target.bins), np.asarray(problem.statistics.sd)
+    theta[:, columns] = np.stack(
+        [np.zeros(TEMPLATES), problem.coordinates.theta_of("harmonic_frequency", frequencies)], axis=1
+    )
+    lines = expand(objective, theta).moments[0]
+    n, sd = len(problem.parts[0].target.bins), np.asarray(objective.parts[0].statistics.sd)
     kept = np.delete(np.arange(len(names)), columns)
-    residual = np.concatenate([residual, np.sqrt(setup.prior[kept]) * here.theta[kept]])
-    jacobian = np.concatenate([jacobian[:, kept], np.diag(np.sqrt(setup.prior[kept]))])
+    residual = np.concatenate([found.residuals, np.sqrt(problem.prior[kept]) * here.theta[kept]])
+    jacobian = np.concatenate([found.jacobian[:, kept], np.diag(np.sqrt(problem.prior[kept]))])
 
     strength = lines.line / null.power
     strength = STRENGTHS[:, None, None] * (strength / strength.max(axis=1, keepdims=True))
     added = np.zeros((STRENGTHS.size * TEMPLATES, len(residual)))
     logs = np.log1p(strength).reshape(-1, n)
     added[:, :n] = -(logs - logs.mean(axis=1, keepdims=True)) / sd
-    if problem.data.extra[0] is not None:
+    if objective.data[0].variation is not None:
         swing = (lines.variance / null.variance - 1) / (lines.line / null.power).max(axis=1)
-        added[:, n] = 0.5 * np.log1p(STRENGTHS[:, None] * swing).reshape(-1) / float(problem.data.extra[0][1])
+        added[:, n] = 0.5 * np.log1p(STRENGTHS[:, None] * swing).reshape(-1) / float(objective.data[0].variation[1])
     basis = np.linalg.svd(jacobian, full_matrices=False)
     u = basis[0][:, basis[1] > 1e-9 * basis[1].max()]
     left = added - (added @ u) @ u.T
@@ -106,22 +111,22 @@ def _p_value(setup: Setup, problem: Problem, final: Descent) -> float:
         return np.max(-2 * rows @ left.T - size, axis=1)
 
     noise = np.zeros((REPLICATES, len(residual)))
-    noise[:, :n] = _scatter(setup, problem, n)
-    if problem.data.extra[0] is not None:
-        noise[:, n] = _generator(setup, 4).normal(size=REPLICATES)
+    noise[:, :n] = _scatter(problem, objective, n)
+    if objective.data[0].variation is not None:
+        noise[:, n] = _generator(problem, 4).normal(size=REPLICATES)
     better = np.sum(improvement(noise) >= improvement(residual[None])[0])
     return float((1 + better) / (1 + REPLICATES))
 
 
-def _generator(setup: Setup, number: int) -> np.random.Generator:
-    return np.random.default_rng(np.asarray(jax.random.key_data(jax.random.fold_in(setup.key, number))))
+def _generator(problem: FitProblem, number: int) -> np.random.Generator:
+    return np.random.default_rng(np.asarray(jax.random.key_data(jax.random.fold_in(problem.key, number))))
 
 
-def _scatter(setup: Setup, problem: Problem, n: int) -> np.ndarray:
+def _scatter(problem: FitProblem, objective: Residuals, n: int) -> np.ndarray:
     """Log residuals of spectra without harmonic, scattering about their expectation."""
-    statistics, nu = problem.statistics, setup.target.degrees_of_freedom
+    statistics, nu = objective.parts[0].statistics, problem.parts[0].target.degrees_of_freedom
     correlation = np.asarray(statistics.correlation)
-    normal = _generator(setup, 3).multivariate_normal(np.zeros(n), correlation, size=REPLICATES, method="cholesky")
+    normal = _generator(problem, 3).multivariate_normal(np.zeros(n), correlation, size=REPLICATES, method="cholesky")
     if nu is None:
         z = normal * np.asarray(statistics.sd)
     else:

@@ -1,5 +1,6 @@
 """Several targets of one person fitted together, with shared parameters."""
 
+import dataclasses
 from collections.abc import Callable, Iterable, Mapping
 from os import PathLike
 from typing import Any
@@ -7,16 +8,26 @@ from typing import Any
 import jax
 from jaxtyping import PRNGKeyArray
 
-from jaxmuscle._common.progress import teller
 from jaxmuscle._common.text import choices
 from jaxmuscle.data._target import Target, load_target
 from jaxmuscle.model._noise import AbstractNoise
 from jaxmuscle.model._tasks import AbstractTask, with_noise
-from jaxmuscle.objective._arguments import base_of, check_shared, free_names, joint_names, planned, target_of, task_for
+from jaxmuscle.objective._arguments import (
+    FitOptions,
+    Plan,
+    base_of,
+    check_shared,
+    free_names,
+    joint_names,
+    planned,
+    settings_of,
+    target_of,
+    task_for,
+)
+from jaxmuscle.objective._problem import FitProblem
 
-from ._joint_problem import JointSetup
-from ._joint_result import JointResult
-from ._joint_search import JointPlan, search_jointly
+from ._result import FitResult
+from ._search import search
 
 Tasks = dict[str, AbstractTask]
 
@@ -32,6 +43,7 @@ def fit_joint(
     noise: str | AbstractNoise | None = None,
     starts: int = 32,
     seeds: int = 32,
+    check_seeds: int = 0,
     key: PRNGKeyArray | int = 0,
     residual: str = "log",
     bounds: Mapping[str, tuple[float, float]] | None = None,
@@ -40,94 +52,79 @@ def fit_joint(
     mean_force: Mapping[str, tuple[float, float]] | None = None,
     max_steps: int = 40,
     progress: bool | Callable[[str, float], None] = False,
-) -> JointResult:
+) -> FitResult:
     """Fit several spectra of the same person with shared parameters: two force levels, or force and displacement.
 
     Minimises `½ Σ_targets Σ_k r_k² + ½ Σ_j θ_j²`, r as in `fit`, in linear response, from many starts; then with the
     nonlinear model's correction to every target's spectrum. A parameter of one name is the same number in all tasks that
     have it; one that only one task has belongs to that. The inputs (`P_w`, `F_ext`, `x_z`) are each task's own.
 
-    **Arguments:** `targets` {name: target, bundled name or path}, two or more; `tasks` {name: task} (`task_for` of each
-    target by default), whose values are the prior's centre and whose spectrum settings the target's replace; `separate`,
-    names of parameters that have a value for each target, then called "c_w@high"; `proportional`, names that keep the ratio
-    which their values have in the tasks (as `at_level` sets them); `free`, names to fit, "P_w@high" for one target's
-    (default as in `fit`); `fix` {name or "name@target": value}; `noise` of all tasks; `starts`; `seeds` of the nonlinear
-    correction (0: none); `bounds`, `priors`, `key`, `residual`, `coefficient_of_variation`, `max_steps`, `progress` as in
-    `fit`; `mean_force` {target: (value, sd)}.
+    **Arguments:** `targets` {name: target, bundled name or path} (of one target: the fit of that); `tasks` {name: task}
+    (`task_for` of each target by default), whose values are the prior's centre and whose spectrum settings the target's
+    replace; `separate`, names of parameters that have a value for each target, then called "c_w@high"; `proportional`, names
+    that keep the ratio which their values have in the tasks (as `at_level` sets them); `free`, names to fit, "P_w@high" for
+    one target's (default as in `fit`); `fix` {name or "name@target": value}; `noise` of all tasks; `starts`; `seeds` of the
+    nonlinear correction (0: none); `check_seeds`, fresh seeds of the nonlinear model for each reported spectrum (0: linear
+    response times the correction); `bounds`, `priors`, `key`, `residual`, `coefficient_of_variation`, `max_steps`,
+    `progress` as in `fit`; `mean_force` {target: (value, sd)}.
 
-    **Returns:** a `JointResult`; a fit that fails is one, too, and says why.
+    **Returns:** a `FitResult` with a part for each target; a fit that fails is one, too, and says why.
 
-    **Raises:** `ValueError` for fewer than two targets, names that no target, task or parameter has, tasks that contradict
+    **Raises:** `ValueError` for no targets, names that no target, task or parameter has, tasks that contradict
     each other in what they share, and what `fit` refuses.
     """
+    options = FitOptions(free=free, fix=fix, residual=residual, starts=starts, seeds=seeds, check_seeds=check_seeds, key=key,
+                         bounds=bounds, priors=priors, coefficient_of_variation=coefficient_of_variation,
+                         max_steps=max_steps, progress=progress)  # fmt: skip
     loaded = _loaded(targets)
+    for argument, named in (("tasks", tasks or {}), ("mean_force", mean_force or {})):
+        for name in named:
+            if name not in loaded:
+                raise ValueError(f"{argument}: no target is called {name!r}: {choices(name, loaded)}")
+    models = _models(loaded, tasks or {}, noise, dict(fix or {}))
     with jax.enable_x64(True):
-        plan = planned_jointly(loaded, tasks=tasks, separate=separate, proportional=proportional, free=free, fix=fix,
-                               noise=noise, starts=starts, seeds=seeds, key=key, residual=residual, bounds=bounds,
-                               priors=priors, coefficient_of_variation=coefficient_of_variation, mean_force=mean_force,
-                               max_steps=max_steps, progress=progress)  # fmt: skip
-        return search_jointly(plan)
+        return search(planned_jointly(models, loaded, options, separate, proportional, mean_force))
 
 
 def planned_jointly(
+    tasks: Tasks,
     targets: dict[str, Target],
-    *,
-    tasks: Mapping[str, AbstractTask] | None = None,
+    options: FitOptions,
     separate: Iterable[str] = (),
     proportional: Iterable[str] = (),
-    free: Iterable[str] | None = None,
-    fix: Mapping[str, float] | None = None,
-    noise: str | AbstractNoise | None = None,
-    starts: int = 32,
-    seeds: int = 32,
-    key: PRNGKeyArray | int = 0,
-    residual: str = "log",
-    bounds: Mapping[str, tuple[float, float]] | None = None,
-    priors: Mapping[str, float | None] | None = None,
-    coefficient_of_variation: bool = True,
     mean_force: Mapping[str, tuple[float, float]] | None = None,
-    max_steps: int = 40,
-    progress: bool | Callable[[str, float], None] = False,
-) -> JointPlan:
-    """The arguments of `fit_joint`, checked (see there). Needs double precision."""
-    separate, proportional, fix = tuple(separate), tuple(proportional), dict(fix or {})
-    for argument, named in (("tasks", tasks or {}), ("mean_force", mean_force or {})):
-        for name in named:
-            if name not in targets:
-                raise ValueError(f"{argument}: no target is called {name!r}: {choices(name, targets)}")
-    if starts < 1 or max_steps < 1 or seeds < 0:
-        raise ValueError(f"starts = {starts} and max_steps = {max_steps} must be at least 1, seeds = {seeds} at least 0")
-    models = _models(targets, tasks or {}, noise, fix)
-    check_shared(models, separate, proportional)
-    local = _local_free(models, targets, None if free is None else tuple(free), fix)
-    names = joint_names(local, models, separate)
+) -> Plan:
+    """The fit of several targets, its arguments checked (see `fit_joint`). Needs double precision."""
+    separate, proportional = tuple(separate), tuple(proportional)
+    bounds, priors, means = dict(options.bounds or {}), dict(options.priors or {}), dict(mean_force or {})
+    check_shared(tasks, separate, proportional)
+    local = _local_free(tasks, targets, None if options.free is None else tuple(options.free), options.fix or ())
+    names = joint_names(local, tasks, separate)
     known = list(dict.fromkeys(joint for of in names.values() for joint in of.values()))
-    _check_known("bounds", bounds or {}, known)
-    _check_known("priors", priors or {}, known)
-    setups = {
-        name: planned(models[name], target, free=local[name], residual=residual, counts=(starts, max(seeds, 1), None),
-                      key=key, bounds=_own(bounds or {}, names[name]), priors=_own(priors or {}, names[name]),
-                      coefficient_of_variation=coefficient_of_variation, mean_force=(mean_force or {}).get(name),
-                      max_steps=max_steps, progress=progress).setup
+    _check_known("bounds", bounds, known)
+    _check_known("priors", priors, known)
+    plans = {
+        name: planned(tasks[name], target, dataclasses.replace(
+            options, free=local[name], fix=None, bounds=_own(bounds, names[name]), priors=_own(priors, names[name]),
+            mean_force=means.get(name)))
         for name, target in targets.items()
     }  # fmt: skip
-    setup = JointSetup.of(setups, names, teller(progress))
-    c = setup.coordinates
-    settings = {
-        "free": list(c.names), "separate": list(separate), "proportional": list(proportional), "residual": residual,
-        "starts": starts, "seeds": seeds, "max_steps": max_steps,
-        "prior_centre": dict(zip(c.names, c.centre.tolist(), strict=True)),
-        "prior_sd": {n: float(sd) if p else None for n, sd, p in zip(c.names, c.sd, setup.prior, strict=True)},
-        "bounds": {n: list(b) for n, b in (bounds or {}).items()},
-        "coefficient_of_variation": {n: s.extra[0] is not None for n, s in setups.items()},
-        "mean_force": {n: list(m) for n, m in (mean_force or {}).items()},
+    first = next(iter(plans.values()))
+    if len(plans) == 1:
+        return first
+    problem = FitProblem.shared({name: plan.problem for name, plan in plans.items()}, names)
+    settings = first.settings | settings_of(problem, bounds) | {
+        "separate": list(separate), "proportional": list(proportional),
+        "coefficient_of_variation": {n: p.settings["coefficient_of_variation"] for n, p in plans.items()},
+        "mean_force": {n: p.settings["mean_force"] for n, p in plans.items()},
+        "spectrum": {n: p.settings["spectrum"] for n, p in plans.items()},
     }  # fmt: skip
-    return JointPlan(setup, starts, seeds, max_steps, settings, key if isinstance(key, int) else None)
+    return first._replace(problem=problem, settings=settings)
 
 
 def _loaded(targets: Mapping[str, Any]) -> dict[str, Target]:
-    if len(targets) < 2:
-        raise ValueError(f"targets: {len(targets)} given, a joint fit needs at least two; fit(task, target) fits one")
+    if not targets:
+        raise ValueError("targets: none given: name at least one")
     for name in targets:
         if not name or "@" in name:
             raise ValueError(f"targets: a name must not be empty nor contain '@', as {name!r} does")

@@ -10,11 +10,13 @@ from jaxtyping import Float
 from jaxmuscle._common.arrays import as_arrays, as_numbers
 from jaxmuscle._common.errors import SimulationError
 from jaxmuscle.ensembles._ensemble import ensemble
+from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.objective._arguments import Plan
 from jaxmuscle.objective._consequences import BATCH
-from jaxmuscle.objective._least_squares import Descent, descend
-from jaxmuscle.objective._problem import Problem, Setup
-from jaxmuscle.objective._starts import contenders, starting_points
+from jaxmuscle.objective._least_squares import Minima, least_squares
+from jaxmuscle.objective._problem import FitProblem, Part
+from jaxmuscle.objective._residuals import Residuals
+from jaxmuscle.objective._starts import contenders, recombined, starting_points
 from jaxmuscle.response._expected import Moments
 from jaxmuscle.response._linearised import settled
 
@@ -39,150 +41,164 @@ class FitInterrupted(KeyboardInterrupt):
 
 def search(plan: Plan) -> FitResult:
     """From the starting points to a result; Ctrl-C ends it with what had been reached."""
-    setup = plan.setup
-    points = starting_points(setup.coordinates, setup.target, plan.starts)
+    problem = plan.problem
     stages: list[Stage] = []
     interrupted = False
     try:
-        setup.tell("compiling", 0.0)
-        (_linear if setup.method == "linear" else _montecarlo)(setup, points, plan.max_steps, stages)
+        problem.tell("compiling", 0.0)
+        (_linear if problem.method == "linear" else _montecarlo)(plan, starting_points(problem, plan.starts), stages)
     except KeyboardInterrupt:
         interrupted = True
     if not stages:
         raise KeyboardInterrupt("fit interrupted before its first step")
-    setup.tell("checking on fresh seeds", 0.8)
-    result = _reported(plan, stages, plan.check_seeds, interrupted=interrupted)
-    setup.tell("done", 1.0)
+    problem.tell("checking on fresh seeds" if plan.check_seeds else "reporting", 0.8)
+    result = report_fit(plan, stages, interrupted=interrupted)
+    problem.tell("done", 1.0)
     if interrupted:
         raise FitInterrupted(result)
     return result
 
 
-def _reported(plan: Plan, stages: list[Stage], check_seeds: int, *, interrupted: bool = False) -> FitResult:
-    return report_fit(plan.setup, stages, check_seeds, plan.settings, plan.seed, plan.max_steps, interrupted=interrupted)
-
-
 def search_together(plans: list[Plan], tell: Callable[[str, float], None]) -> list[FitResult]:
-    """Fits of one model to several targets on the same bins, all starts of all targets in one descent.
+    """Fits of one model to several data on the same bins, all starts of all fits in one minimisation.
 
     Linear response alone: no nonlinear correction, no check on simulated seeds, no profile over the frequency.
     """
-    setups = [plan.setup for plan in plans]
-    points = [starting_points(plan.setup.coordinates, plan.setup.target, plan.starts) for plan in plans]
-    first = _together([setup.linear() for setup in setups], points, plans[0].max_steps, "trying starts", tell, (0.0, 0.7))
-    best = [stage.descent.s[contenders(s.coordinates, s.target, stage.descent, RIVAL_MARGIN)[:BATCH]]
-            for s, stage in zip(setups, first, strict=True)]  # fmt: skip
-    problems = [_known(setup, stage.problem, stage.descent) for setup, stage in zip(setups, first, strict=True)]
-    problems = [setup.linear(share) for setup, share in problems]
-    second = _together(problems, best, plans[0].max_steps, "linear response", tell, (0.7, 0.8))
+    problems = [plan.problem for plan in plans]
+    points = [starting_points(plan.problem, plan.starts) for plan in plans]
+    objectives = [problem.linear() for problem in problems]
+    first = _together(objectives, points, plans[0].max_steps, "trying starts", tell, (0.0, 0.7))
+    best = [stage.minima.s[contenders(p, stage.minima, RIVAL_MARGIN)[:BATCH]]
+            for p, stage in zip(problems, first, strict=True)]  # fmt: skip
+    known = [_known(problem, stage) for problem, stage in zip(problems, first, strict=True)]
+    objectives = [problem.linear(shares) for problem, shares in known]
+    second = _together(objectives, best, plans[0].max_steps, "linear response", tell, (0.7, 0.8))
     results = []
     for plan, *stages in zip(plans, first, second, strict=True):
         unused = plan.settings | {"seeds": 0, "check_seeds": 0}
-        results.append(_reported(plan._replace(settings=unused), stages, 0))
-        tell(f"reporting {plan.setup.target.name}", 0.8 + 0.2 * len(results) / len(plans))
+        results.append(report_fit(plan._replace(settings=unused, check_seeds=0), stages))
+        tell(f"reporting {plan.problem.title}", 0.8 + 0.2 * len(results) / len(plans))
     return results
 
 
 def _together(
-    problems: list[Problem],
+    objectives: list[Residuals],
     points: list[np.ndarray],
     max_steps: int,
     name: str,
     tell: Callable[[str, float], None],
     shares: tuple[float, float],
 ) -> list[Stage]:
-    """One stage of every problem; they differ in their data only."""
+    """One stage of every fit; they differ in their data only."""
     counts = [len(p) for p in points]
-    data = jax.tree.map(lambda *x: np.repeat(np.stack(x), counts, axis=0), *(problem.data for problem in problems))
+    data = jax.tree.map(lambda *x: np.repeat(np.stack(x), counts, axis=0), *(objective.data for objective in objectives))
 
-    def show(descent: Descent) -> None:
-        share = min(1.0, descent.steps.max() / max_steps)
+    def show(minima: Minima) -> None:
+        share = min(1.0, minima.steps.max() / max_steps)
         tell(name, shares[0] + (shares[1] - shares[0]) * share)
 
-    found = descend(problems[0], np.concatenate(points), max_steps, data=data, report=show)
+    found = least_squares(objectives[0], np.concatenate(points), max_steps, data=data, report=show)
     parts = zip(*(np.split(x, np.cumsum(counts)[:-1]) for x in found), strict=True)
-    return [Stage(name, problem, Descent(*part)) for problem, part in zip(problems, parts, strict=True)]
+    return [Stage(name, objective, Minima(*part)) for objective, part in zip(objectives, parts, strict=True)]
 
 
-def _stage(setup: Setup, stages: list[Stage], problem: Problem, name: str, shares: tuple[float, float], most: int) -> Any:
-    """A new stage, and what keeps its newest descent and tells the progress."""
+def _stage(problem: FitProblem, stages: list[Stage], objective: Residuals, name: str, shares: tuple[float, float],
+           most: int) -> Any:  # fmt: skip
+    """A new stage, and what keeps its newest state and tells the progress."""
     number = len(stages)
 
-    def show(descent):
-        stages[number:] = [Stage(name, problem, descent)]
-        share = shares[0] + (shares[1] - shares[0]) * min(1.0, descent.steps.max() / most)
-        setup.tell(f"{name}, cost {descent.cost[descent.best]:.2f}", share)
+    def show(minima: Minima) -> None:
+        stages[number:] = [Stage(name, objective, minima)]
+        share = shares[0] + (shares[1] - shares[0]) * min(1.0, minima.steps.max() / most)
+        problem.tell(f"{name}, cost {minima.cost[minima.best]:.2f}", share)
 
     return show
 
 
-def _linear(setup: Setup, points: np.ndarray, max_steps: int, stages: list[Stage]) -> None:
+def _linear(plan: Plan, points: np.ndarray, stages: list[Stage]) -> None:
     """All starts in linear response, the best of them with the line's share known, then the nonlinear correction."""
-    problem = setup.linear()
-    show = _stage(setup, stages, problem, "trying starts", (0.05, 0.5), max_steps)
-    first = descend(problem, points, max_steps, report=show)
+    problem, max_steps = plan.problem, plan.max_steps
+    objective = problem.linear()
+    show = _stage(problem, stages, objective, "trying starts", (0.05, 0.5), max_steps)
+    first = _with_recombined(plan, objective, least_squares(objective, points, max_steps, report=show))
+    stages[:] = [Stage("trying starts", objective, first)]
     if not np.isfinite(first.cost[first.best]):
         return
-    best = first.s[contenders(setup.coordinates, setup.target, first, RIVAL_MARGIN)[:BATCH]]
-    setup, share = _known(setup, problem, first)
-    problem = setup.linear(share)
-    show = _stage(setup, stages, problem, "linear response", (0.5, 0.6), 15)
-    found = descend(problem, best, max_steps, report=show)
-    correction = None
-    for turn in range(POLISHES):
+    best = first.s[contenders(problem, first, RIVAL_MARGIN)[:BATCH]]
+    problem, shares = _known(problem, stages[0])
+    objective = problem.linear(shares)
+    show = _stage(problem, stages, objective, "linear response", (0.5, 0.6), 15)
+    found = least_squares(objective, best, max_steps, report=show)
+    corrections: list[Moments] | None = None
+    for turn in range(POLISHES if problem.seeds else 0):
         if not np.isfinite(found.cost[found.best]):
             return
-        new = correction_at(setup, np.asarray(setup.coordinates.theta(found.s[found.best])))
-        if new is None:
+        tasks = problem.tasks_at(np.asarray(problem.coordinates.theta(found.s[found.best])))
+        new = [correction_at(problem, part, task) for part, task in zip(problem.parts, tasks, strict=True)]
+        known = [correction for correction in new if correction is not None]
+        if len(known) < len(new):
             return
-        change = np.inf if correction is None else np.max(np.abs(np.log(new.power / correction.power)))
-        if change < STILL:
-            return
-        correction, problem = new, setup.linear(share, new)
-        show = _stage(setup, stages, problem, "polishing", (0.6 + 0.05 * turn, 0.65 + 0.05 * turn), 15)
-        found = descend(problem, found.s, max_steps, report=show)
+        if corrections is not None:
+            changes = [np.max(np.abs(np.log(a.power / b.power))) for a, b in zip(known, corrections, strict=True)]
+            if max(changes) < STILL:
+                return
+        corrections, objective = known, problem.linear(shares, known)
+        show = _stage(problem, stages, objective, "polishing", (0.6 + 0.05 * turn, 0.65 + 0.05 * turn), 15)
+        found = least_squares(objective, found.s, max_steps, report=show)
 
 
-def correction_at(setup: Setup, theta: Float[np.ndarray, " free"]) -> Moments | None:
-    """Moments of the nonlinear model over those of the linear response at θ; None if it cannot be simulated."""
-    task = setup.at(theta)
+def _with_recombined(plan: Plan, objective: Residuals, found: Minima) -> Minima:
+    """Where several harmonic frequencies are free: the best point with each of them in turn at its candidates, too."""
+    problem = plan.problem
+    turns = len(recombined(problem, np.zeros(len(problem.prior)), 1))
+    for turn in range(turns):
+        if not np.isfinite(found.cost[found.best]):
+            break
+        theta = np.asarray(problem.coordinates.theta(found.s[found.best]))
+        more = least_squares(objective, recombined(problem, theta, plan.starts)[turn], plan.max_steps)
+        found = Minima(*map(np.concatenate, zip(found, more, strict=True)))
+    return found
+
+
+def correction_at(problem: FitProblem, part: Part, task: AbstractTask) -> Moments | None:
+    """Moments of the nonlinear model over those of the linear response; None if the task cannot be simulated."""
     try:
-        runs = ensemble(as_numbers(settled(as_arrays(task))), jax.random.fold_in(setup.key, 2), seeds=setup.seeds)
+        runs = ensemble(as_numbers(settled(as_arrays(task))), jax.random.fold_in(problem.key, 2), seeds=problem.seeds)
     except (SimulationError, ValueError):
         return None  # the check on fresh seeds meets the same error and reports it
-    chosen = setup.target.bins - setup.target.settings.first_bin
-    each, expected = controlled_moments(runs, setup.target)
+    each, expected = controlled_moments(runs, part.target)
     if expected is None:
         return None
     mean = jax.tree.map(lambda x: np.asarray(x).mean(axis=0), each)
-    power = mean.power[chosen] / np.asarray(expected.power)[chosen]
-    ratio = Moments(power, np.ones(len(chosen)), mean.mean / expected.mean, mean.variance / expected.variance)
-    return ratio if all(np.all(np.isfinite(x) & (np.asarray(x) > 0)) for x in ratio) else None
+    power = mean.power[part.chosen] / np.asarray(expected.power)[part.chosen]
+    found = power, np.ones(len(power)), mean.mean / expected.mean, mean.variance / expected.variance
+    return Moments(*found, np.ones(())) if all(np.all(np.isfinite(x) & (np.asarray(x) > 0)) for x in found) else None
 
 
-def _montecarlo(setup: Setup, points: np.ndarray, max_steps: int, stages: list[Stage]) -> None:
+def _montecarlo(plan: Plan, points: np.ndarray, stages: list[Stage]) -> None:
     """All starts in linear response, or on few seeds where there is none; then the best few minima on all seeds."""
-    if setup.control:
-        problem = setup.linear()
-        show = _stage(setup, stages, problem, "trying starts", (0.05, 0.4), max_steps)
-        first = descend(problem, points, max_steps, report=show)
+    problem, max_steps = plan.problem, plan.max_steps
+    if problem.control:
+        objective = problem.linear()
+        show = _stage(problem, stages, objective, "trying starts", (0.05, 0.4), max_steps)
+        first = least_squares(objective, points, max_steps, report=show)
     else:
-        problem = setup.montecarlo(max(8, setup.seeds // 3))
-        show = _stage(setup, stages, problem, "trying starts", (0.05, 0.4), FIRST_STEPS)
-        first = descend(problem, points, FIRST_STEPS, prepare=setup.finer, report=show)
+        objective = problem.montecarlo(max(8, problem.seeds // 3))
+        show = _stage(problem, stages, objective, "trying starts", (0.05, 0.4), FIRST_STEPS)
+        first = least_squares(objective, points, FIRST_STEPS, prepare=problem.finer, report=show)
     if not np.isfinite(first.cost[first.best]):
         return
-    best = first.s[contenders(setup.coordinates, setup.target, first, RIVAL_MARGIN)[:MOST_RIVALS]]
-    setup, share = _known(setup, problem, first)
-    problem = setup.finer(setup.montecarlo(setup.seeds, share), best)
-    descend(problem, best, max_steps, prepare=setup.finer,
-            report=_stage(setup, stages, problem, "polishing", (0.4, 0.8), 15))  # fmt: skip
+    best = first.s[contenders(problem, first, RIVAL_MARGIN)[:MOST_RIVALS]]
+    problem, shares = _known(problem, stages[0])
+    objective = problem.finer(problem.montecarlo(problem.seeds, shares), best)
+    least_squares(objective, best, max_steps, prepare=problem.finer,
+                  report=_stage(problem, stages, objective, "polishing", (0.4, 0.8), 15))  # fmt: skip
 
 
-def _known(setup: Setup, problem: Problem, descent: Descent) -> tuple[Setup, Float[np.ndarray, " bins"]]:
-    """What the best point says of how the data scatter: the setup with it, and the line's share of each bin."""
-    moments = seen_best(problem, descent).moments
-    share = np.clip(np.nan_to_num(moments.line / moments.power), 0.0, 1.0)
-    if np.isfinite(descent.cost[descent.best]):
-        setup = setup.scattering_as(setup.at(np.asarray(setup.coordinates.theta(descent.s[descent.best]))))
-    return setup, share
+def _known(problem: FitProblem, stage: Stage) -> tuple[FitProblem, list[Float[np.ndarray, " bins"]]]:
+    """What the best point says of how the data scatter: the problem with it, and the line's share of each bin."""
+    seen = seen_best(stage.objective, stage.minima)
+    shares = [np.clip(np.nan_to_num(moments.line / moments.power), 0.0, 1.0) for moments in seen.moments]
+    if np.isfinite(stage.minima.cost[stage.minima.best]):
+        problem = problem.scattering_as(problem.tasks_at(seen.theta))
+    return problem, shares

@@ -1,8 +1,9 @@
 """The arguments of a fit, checked."""
 
+import dataclasses
 import itertools
 from collections.abc import Callable, Iterable, Mapping
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -19,7 +20,7 @@ from jaxmuscle.response._expected import check_line
 from jaxmuscle.response._linearised import has_response
 
 from ._coordinates import Coordinates
-from ._problem import Setup, target_variation
+from ._problem import FitProblem, Part, target_variation
 
 RESIDUALS = ("log", "linear", "cumulative")
 METHODS = ("linear", "montecarlo")
@@ -60,10 +61,45 @@ def _check_names(argument: str, names: Iterable[str], known: Iterable[str]) -> N
             raise ValueError(f"{argument}: unknown or not free parameter {name!r}: {choices(name, known)}")
 
 
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class FitOptions:
+    """How a fit is done: what `fit` and `fit_joint` are asked for, by the names of their arguments."""
+
+    free: Iterable[str] | None = None
+    fix: Mapping[str, float] | None = None
+    method: str = "linear"
+    residual: str = "log"
+    starts: int | None = None
+    seeds: int | None = None
+    check_seeds: int | None = None
+    key: PRNGKeyArray | int = 0
+    bounds: Mapping[str, tuple[float, float]] | None = None
+    priors: Mapping[str, float | None] | None = None
+    coefficient_of_variation: bool = True
+    mean_force: tuple[float, float] | None = None
+    max_steps: int = 40
+    dt: float = DT
+    progress: bool | Callable[[str, float], None] = False
+
+    def __post_init__(self) -> None:
+        for name, known in (("method", METHODS), ("residual", RESIDUALS)):
+            if getattr(self, name) not in known:
+                raise ValueError(f"{name} = {getattr(self, name)!r}: {choices(getattr(self, name), known)}")
+        for name, least in (("starts", 1), ("seeds", 0), ("check_seeds", 0), ("max_steps", 1)):
+            count = getattr(self, name)
+            if count is not None and count < least:
+                raise ValueError(f"{name} = {count} must be at least {least}")
+
+    @property
+    def seed(self) -> int | None:
+        """The key, if it was given as a number."""
+        return self.key if isinstance(self.key, int) else None
+
+
 class Plan(NamedTuple):
     """A fit to be done."""
 
-    setup: Setup
+    problem: FitProblem
     starts: int
     max_steps: int
     check_seeds: int
@@ -71,58 +107,47 @@ class Plan(NamedTuple):
     seed: int | None
 
 
-def planned(
-    task: AbstractTask,
-    target: Target,
-    *,
-    free: Iterable[str] | None = None,
-    fix: Mapping[str, float] | None = None,
-    method: str = "linear",
-    residual: str = "log",
-    counts: tuple[int | None, int | None, int | None] = (None, None, None),
-    key: PRNGKeyArray | int = 0,
-    bounds: Mapping[str, tuple[float, float]] | None = None,
-    priors: Mapping[str, float | None] | None = None,
-    coefficient_of_variation: bool = True,
-    mean_force: tuple[float, float] | None = None,
-    max_steps: int = 40,
-    dt: float = DT,
-    progress: bool | Callable[[str, float], None] = False,
-) -> Plan:
-    """The arguments of `fit`, checked (see there); `counts` are starts, seeds, check_seeds. Needs double precision."""
-    if method not in METHODS:
-        raise ValueError(f"method = {method!r}: {choices(method, METHODS)}")
-    if residual not in RESIDUALS:
-        raise ValueError(f"residual = {residual!r}: {choices(residual, RESIDUALS)}")
-    for name, count in zip(("starts", "seeds", "check_seeds", "max_steps"), (*counts, max_steps), strict=True):
-        if count is not None and count < 1:
-            raise ValueError(f"{name} = {count} must be at least 1")
-    task = as_numbers(task.with_parts(settings=target.settings).replace(**(fix or {})))
-    names = free_names(task, free, fix or {}, len(target.bins))
-    sds = {n: (priors or {}).get(n, PARAMETERS[n].prior_sd if n in PARAMETERS else 1.0) for n in names}
-    _check_names("priors", priors or {}, names)
-    _check_names("bounds", bounds or {}, names)
+def planned(task: AbstractTask, target: Target, options: FitOptions) -> Plan:
+    """The fit of one target, its arguments checked (see `fit`). Needs double precision."""
+    bounds, priors, fix = dict(options.bounds or {}), dict(options.priors or {}), dict(options.fix or {})
+    task = as_numbers(task.with_parts(settings=target.settings).replace(**fix))
+    names = free_names(task, options.free, fix, len(target.bins))
+    _check_names("priors", priors, names)
+    _check_names("bounds", bounds, names)
     check_line(task, target.settings)
     if not (np.any(np.asarray(task.noise.amplitude) > 0) or float(task.harmonic.amplitude) > 0):
         raise ValueError("the task has neither noise nor a harmonic, so its spectrum is zero: set noise_K_w, say")
-    control = has_response(task, required=method == "linear")
-    usual = (100, 32, 64) if control else (8, 48, 200)
-    starts, seeds, check_seeds = (given or default for given, default in zip(counts, usual, strict=True))
+    control = has_response(task, required=options.method == "linear")
+    usual = {"starts": 100, "seeds": 32, "check_seeds": 64} if control else {"starts": 8, "seeds": 48, "check_seeds": 200}
+    counts = {name: count if getattr(options, name) is None else getattr(options, name) for name, count in usual.items()}
+    if options.method == "montecarlo" and counts["seeds"] < 1:
+        raise ValueError("seeds = 0: a Monte Carlo fit needs at least one")
+    sds = {n: priors.get(n, PARAMETERS[n].prior_sd if n in PARAMETERS else 1.0) for n in names}
+    coordinates = Coordinates.of({n: float(task[n]) for n in names}, bounds, {n: sd or 1.0 for n, sd in sds.items()})
+    variation = target_variation(target) if options.coefficient_of_variation else None
+    part = Part("", task, target, coordinates, tuple(range(len(names))), variation, options.mean_force)
+    key = jax.random.key(options.key) if isinstance(options.key, int) else options.key
+    problem = FitProblem((part,), coordinates, np.array([0.0 if sds[n] is None else 1.0 for n in names]), options.residual,
+                         options.method, options.dt, key, counts["seeds"], control, teller(options.progress))  # fmt: skip
     settings = {
-        "free": list(names), "residual": residual, "starts": starts, "seeds": seeds, "dt": dt, "max_steps": max_steps,
-        "check_seeds": check_seeds, "prior_centre": {n: float(task[n]) for n in names}, "prior_sd": sds,
-        "bounds": {n: list(b) for n, b in (bounds or {}).items()},
-        "coefficient_of_variation": coefficient_of_variation and target.coefficient_of_variation is not None,
-        "mean_force": None if mean_force is None else list(mean_force), "spectrum": target.settings.to_dict(),
+        **settings_of(problem, bounds), **counts, "max_steps": options.max_steps, "dt": options.dt,
+        "coefficient_of_variation": variation is not None,
+        "mean_force": None if options.mean_force is None else list(options.mean_force),
+        "spectrum": target.settings.to_dict(), "steps_per_sample": problem.steps_per_sample,
     }  # fmt: skip
-    coordinates = Coordinates.of({name: float(task[name]) for name in names}, dict(bounds or {}),
-                                 {n: sd or 1.0 for n, sd in sds.items()})  # fmt: skip
-    prior = np.array([0.0 if sds[n] is None else 1.0 for n in names])
-    extra = (target_variation(target) if coefficient_of_variation else None, mean_force)
-    seed, key = (key, jax.random.key(key)) if isinstance(key, int) else (None, key)
-    setup = Setup(task, target, coordinates, prior, extra, residual, method, dt, key, seeds, control, teller(progress))
-    settings["steps_per_sample"] = setup.steps_per_sample
-    return Plan(setup, starts, max_steps, check_seeds, settings, seed)
+    return Plan(problem, counts["starts"], options.max_steps, counts["check_seeds"], settings, options.seed)
+
+
+def settings_of(problem: FitProblem, bounds: Mapping[str, tuple[float, float]]) -> dict[str, Any]:
+    """What a result keeps of the free parameters' prior and bounds, to be taken up again."""
+    c = problem.coordinates
+    return {
+        "free": list(c.names),
+        "residual": problem.residual,
+        "prior_centre": dict(zip(c.names, map(float, c.centre), strict=True)),
+        "prior_sd": {n: float(sd) if p else None for n, sd, p in zip(c.names, c.sd, problem.prior, strict=True)},
+        "bounds": {n: list(b) for n, b in bounds.items()},
+    }
 
 
 INPUTS = ("P_w", "F_ext", "x_z")

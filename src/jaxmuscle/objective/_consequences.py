@@ -1,6 +1,5 @@
 """What follows from a point θ: moments, their slopes, derived quantities."""
 
-import functools
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -11,11 +10,11 @@ from jaxtyping import Array, Float
 
 from jaxmuscle.model._parameters import PARAMETERS, USUALLY_FREE
 from jaxmuscle.model._tasks import AbstractTask
-from jaxmuscle.response._equilibrium import slowest_rate
 from jaxmuscle.response._expected import Moments
 
-from ._coordinates import Coordinates, at
+from ._coordinates import Coordinates, task_at
 from ._moment_models import Linear
+from ._residuals import PartResiduals, Residuals
 
 DERIVED = ("corner_frequency", "harmonic_share", "harmonic_frequency", "high_frequency_floor", "K_w0", "K_z0", "C_w0",
            "C_z0", "coefficient_of_variation", "mean")  # fmt: skip
@@ -38,7 +37,7 @@ def derived(task: Any, moments: Moments) -> dict[str, Any]:
     """
     base, seen = task.muscle.base(), observed(moments)
     return {
-        "corner_frequency": slowest_rate(task) / (2 * jnp.pi),
+        "corner_frequency": moments.rate / (2 * jnp.pi),
         "harmonic_share": seen["harmonic_share"],
         "harmonic_frequency": task.harmonic.frequency * jnp.ones(()),
         "high_frequency_floor": seen["high_frequency_floor"],
@@ -67,36 +66,65 @@ def jackknife(each: Moments) -> dict[str, float]:
     count = len(each.mean)
     if count < 2:
         return {}
-    left_out = [observed(Moments(*((x.sum(axis=0) - x[i]) / (count - 1) for x in each))) for i in range(count)]
+    left_out = [observed(jax.tree.map(lambda x, i=i: (x.sum(axis=0) - x[i]) / (count - 1), each)) for i in range(count)]
     return {name: float(np.std([o[name] for o in left_out]) * np.sqrt(count - 1)) for name in left_out[0]}
 
 
-def unit_of(name: str) -> str:
-    return PARAMETERS[name].unit if name in PARAMETERS else ""
+def unit_of(name: str, output: str = "") -> str:
+    """Unit of a parameter or derived quantity, "name@target" too; `output` is that of the task's output."""
+    base = name.partition("@")[0]
+    if base == "mean":
+        return output
+    if base in DERIVED:
+        return UNITS.get(base, "1")
+    return PARAMETERS[base].unit if base in PARAMETERS else ""
 
 
 BATCH = 32
 
 
-class Seen(NamedTuple):
-    """What a problem's model gives at some θ, and its slopes with respect to θ; a leading axis of points."""
+class Expansion(NamedTuple):
+    """What a fit's model gives at some θ, and its slopes with respect to θ; a leading axis of points.
+
+    Of a part: `Moments`. Of all parts: a tuple of these.
+    """
 
     theta: Any
     moments: Any
     slopes: Any
 
-    def nearby(self, theta: Float[Array, " free"]) -> Any:
+    def near(self, theta: Float[Array, " free"]) -> Any:
         """The moments at another θ to first order (without the leading axis); exact, with exact slopes, at `self.theta`."""
         return jax.tree.map(lambda value, slope: value + slope @ (theta - self.theta), self.moments, self.slopes)
 
+    def row(self, i: int) -> "Expansion":
+        """At one of the points."""
+        return jax.tree.map(lambda x: np.asarray(x)[i], self)
+
+
+def part_of(objective: Residuals, seen: Expansion, i: int) -> Expansion:
+    """What was seen of one part, with slopes with respect to its own coordinates."""
+    slopes = jax.tree.map(lambda slope: objective.own(slope, i), seen.slopes[i])
+    return Expansion(objective.own(seen.theta, i), seen.moments[i], slopes)
+
+
+Tables = tuple[dict[str, np.ndarray], ...]
+
+
+def quantities(objective: Residuals, seen: Expansion) -> tuple[Tables, Tables]:
+    """Derived quantities of every part, rows where the model was seen, and their slopes with respect to θ."""
+    found = [
+        jax.tree.map(np.asarray, _quantities(part, part_of(objective, seen, i))) for i, part in enumerate(objective.parts)
+    ]
+    slopes = tuple({n: objective.spread(g, i) for n, g in slopes.items()} for i, (_, slopes) in enumerate(found))
+    return tuple(values for values, _ in found), slopes
+
 
 @eqx.filter_jit
-def quantities(problem: Any, seen: Seen) -> tuple[dict[str, Array], dict[str, Array]]:
-    """Derived quantities of every row where the model was seen, and their slopes with respect to θ."""
-
+def _quantities(part: PartResiduals, seen: Expansion) -> tuple[dict[str, Array], dict[str, Array]]:
     def one(seen):
         def everything(theta):
-            values = derived(at(problem.task, problem.coordinates, theta), seen.nearby(theta))
+            values = derived(task_at(part.task, part.coordinates, theta), seen.near(theta))
             return values, values
 
         slopes, values = jax.jacfwd(everything, has_aux=True)(seen.theta)
@@ -105,14 +133,32 @@ def quantities(problem: Any, seen: Seen) -> tuple[dict[str, Array], dict[str, Ar
     return jax.vmap(one)(seen)
 
 
-@eqx.filter_jit
-def consequences(problem: Any, seen: Seen) -> tuple[Any, Any]:
-    """Data residuals and derived quantities at the point where the model was seen, and their slopes with respect to θ."""
+class Consequences(NamedTuple):
+    """Data residuals at one θ and their Jacobian; derived quantities of every part with their slopes."""
 
+    residuals: Float[np.ndarray, " residuals"]
+    jacobian: Float[np.ndarray, "residuals free"]
+    values: Tables
+    slopes: Tables
+
+
+def consequences(objective: Residuals, seen: Expansion) -> Consequences:
+    """What follows at the point where the model was seen; slopes with respect to θ."""
+    found = [jax.tree.map(np.asarray, _consequences(part, part_of(objective, seen, i)))
+             for i, part in enumerate(objective.parts)]  # fmt: skip
+    return Consequences(
+        np.concatenate([values[0] for values, _ in found]),
+        np.concatenate([objective.spread(slopes[0], i) for i, (_, slopes) in enumerate(found)]),
+        tuple(values[1] for values, _ in found),
+        tuple({n: objective.spread(g, i) for n, g in slopes[1].items()} for i, (_, slopes) in enumerate(found)),
+    )
+
+
+@eqx.filter_jit
+def _consequences(part: PartResiduals, seen: Expansion) -> tuple[Any, Any]:
     def everything(theta):
-        moments = seen.nearby(theta)
-        task = at(problem.task, problem.coordinates, theta)
-        values = problem.data_residuals(moments, problem.data), derived(task, moments)
+        moments = seen.near(theta)
+        values = part.data_residuals(moments, part.data), derived(task_at(part.task, part.coordinates, theta), moments)
         return values, values
 
     slopes, values = jax.jacfwd(everything, has_aux=True)(seen.theta)
@@ -127,14 +173,14 @@ class _Response(eqx.Module):
     coordinates: Coordinates
 
     def moments(self, theta: Float[Array, " free"]) -> Moments:
-        return self.model.moments(at(self.task, self.coordinates, theta))
+        return self.model.moments(task_at(self.task, self.coordinates, theta))
 
 
 @eqx.filter_jit
-def _moments_and_slopes(problem: Any, theta: Float[Array | np.ndarray, "points free"]) -> tuple[Any, Any]:
+def _moments_and_slopes(part: Any, theta: Float[Array | np.ndarray, "points free"]) -> tuple[Any, Any]:
     def one(theta):
         def twice(theta):
-            moments = problem.moments(theta)
+            moments = part.moments(theta)
             return moments, moments
 
         slopes, moments = jax.jacfwd(twice, has_aux=True)(theta)
@@ -143,24 +189,33 @@ def _moments_and_slopes(problem: Any, theta: Float[Array | np.ndarray, "points f
     return jax.vmap(one)(theta)
 
 
-@functools.singledispatch
-def seen_at(problem: Any, theta: Float[np.ndarray, "points free"]) -> Seen:
-    """The problem's moments and their slopes at every θ, as numbers.
+def expand(objective: Any, theta: Float[np.ndarray, "points free"]) -> Expansion:
+    """The moments of every part and their slopes at every θ, as numbers.
+
+    Part by part: each has the program of a fit alone. (One program of two kinds of task hangs under jaxlib 0.10.2.)
+    """
+    each = [_expanded(part, np.asarray(objective.own(theta, i))) for i, part in enumerate(objective.parts)]
+    slopes = tuple(jax.tree.map(lambda g, i=i: objective.spread(g, i), slopes) for i, (_, slopes) in enumerate(each))
+    return Expansion(theta, tuple(moments for moments, _ in each), slopes)
+
+
+def _expanded(part: Any, theta: Float[np.ndarray, "points own"]) -> tuple[Any, Any]:
+    """Moments of one part and their slopes.
 
     A linear response is computed for `BATCH` points at a time and with slopes also for what a fit usually leaves free, so
     that one compiled program serves any number of points and nearly any choice of free parameters; a Monte Carlo
     simulation for all points together, with the slopes that are asked for.
     """
-    if not isinstance(problem.model, Linear):
-        return Seen(theta, *jax.tree.map(np.asarray, _moments_and_slopes(problem, theta)))
-    count, wide = len(theta), _with_the_usual(problem.coordinates, problem.task)
-    own = np.array([wide.names.index(name) for name in problem.coordinates.names])
+    if not isinstance(part.model, Linear):
+        return jax.tree.map(np.asarray, _moments_and_slopes(part, theta))
+    count, wide = len(theta), _with_the_usual(part.coordinates, part.task)
+    own = np.array([wide.names.index(name) for name in part.coordinates.names], dtype=int)
     padded = np.zeros((-(-count // BATCH) * BATCH, len(wide.names)))
     padded[:, own] = np.concatenate([theta, np.broadcast_to(theta[-1], (len(padded) - count, len(own)))])
-    response = _Response(problem.model, problem.task, wide)
+    response = _Response(part.model, part.task, wide)
     parts = [_moments_and_slopes(response, batch) for batch in np.split(padded, len(padded) // BATCH)]
     moments, slopes = jax.tree.map(lambda *x: np.concatenate(x)[:count], *parts)
-    return Seen(theta, moments, jax.tree.map(lambda slope: slope[..., own], slopes))
+    return moments, jax.tree.map(lambda slope: slope[..., own], slopes)
 
 
 def _with_the_usual(coordinates: Coordinates, task: AbstractTask) -> Coordinates:

@@ -113,6 +113,6 @@ def _both_or_none(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.nda
     return np.where(some, low, -np.inf), np.where(some, high, np.inf)
 
 
-def at(task: AbstractTask, coordinates: Coordinates, theta: Float[Array, " free"]) -> AbstractTask:
+def task_at(task: AbstractTask, coordinates: Coordinates, theta: Float[Array | np.ndarray, " free"]) -> AbstractTask:
     """The task at coordinates θ."""
     return set_parameters(task, coordinates.values(theta))

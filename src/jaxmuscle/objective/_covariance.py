@@ -5,11 +5,12 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
+from jaxmuscle.data._target import Target
 from jaxmuscle.spectra._bin_law import bin_correlation, log_power_moments, shares_map
 from jaxmuscle.spectra._settings import WINDOW
 
 from ._moment_models import MonteCarlo
-from ._problem import Problem, Setup
+from ._residuals import PartResiduals
 
 DETERMINED = 3.0
 SHARE_DETERMINED = 0.99
@@ -94,32 +95,32 @@ def _in_words(names: tuple[str, ...], direction: Float[np.ndarray, " parameters"
     return f"{' and '.join(up)} up" + (f" against {' and '.join(down)} down" if down else " together")
 
 
-def residual_covariance(setup: Setup, problem: Problem, share: np.ndarray) -> np.ndarray:
-    """Covariance of the data residuals: scatter of the target and of the simulated mean."""
-    target = setup.target
+def residual_covariance(target: Target, part: PartResiduals, share: np.ndarray) -> np.ndarray:
+    """Covariance of one target's data residuals: scatter of the target and of the simulated mean."""
     start, stop = WINDOW
     per_seed = target.settings.degrees_of_freedom(target.settings.segments(round((stop - start) * target.settings.rate)))
     # A linear response has no sampling error, and a control variate leaves next to nothing of it.
-    model = problem.model
+    model = part.model
     plain = model if isinstance(model, MonteCarlo) and not model.control else None
     each = 0.0 if plain is None else log_power_moments(per_seed * plain.seeds)[1]
     variance = each * np.maximum(1 - share**2, 0.0)
     correlation = bin_correlation(target.settings, target.bins, (6,))
     simulated = np.sqrt(variance)[:, None] * correlation * np.sqrt(variance)
-    measured = problem.statistics.covariance
+    measured = part.statistics.covariance
     p = np.asarray(target.proportional_power)
-    spread = _spread_map(problem, p)
+    spread = _spread_map(part, p)
     total = spread @ (measured + simulated) @ spread.T
-    rows: list[float] = [1.0 + 0.25 * float(p @ simulated @ p) / float(extra[1]) ** 2 if i == 0 else 1.0
-            for i, extra in enumerate(problem.data.extra) if extra is not None]  # fmt: skip
+    variation, mean = part.data.variation, part.data.mean
+    rows = [] if variation is None else [1.0 + 0.25 * float(p @ simulated @ p) / float(variation[1]) ** 2]
+    rows += [] if mean is None else [1.0]
     return np.block([[total, np.zeros((len(total), len(rows)))], [np.zeros((len(rows), len(total))), np.diag(rows)]])
 
 
-def _spread_map(problem: Problem, p: np.ndarray) -> np.ndarray:
+def _spread_map(part: PartResiduals, p: np.ndarray) -> np.ndarray:
     """How the spectrum's residuals move with the log powers."""
     n = len(p)
-    if problem.residual == "log":
-        return (np.eye(n) - 1 / n) / problem.statistics.sd[:, None]
-    if problem.residual == "linear":
-        return shares_map(p) / problem.data.sigma[:, None]
-    return (np.tril(np.ones((n, n))) @ shares_map(p) / problem.data.sigma[:, None])[:-1]
+    if part.residual == "log":
+        return (np.eye(n) - 1 / n) / part.statistics.sd[:, None]
+    if part.residual == "linear":
+        return shares_map(p) / part.data.sigma[:, None]
+    return (np.tril(np.ones((n, n))) @ shares_map(p) / part.data.sigma[:, None])[:-1]

@@ -9,8 +9,7 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
-from ._consequences import Seen, seen_at
-from ._moment_models import Linear
+from ._consequences import Expansion, expand
 
 SMALL = 1e-3
 STILL = 1e-4
@@ -18,7 +17,7 @@ REFUSALS = 10
 ROWS = 128
 
 
-class Descent(NamedTuple):
+class Minima(NamedTuple):
     """Where each start stands: coordinates, cost `½ Σ r²`, steps tried, and whether its last step gained little."""
 
     s: Float[np.ndarray, "starts free"]
@@ -32,20 +31,20 @@ class Descent(NamedTuple):
         return int(np.argmin(np.where(np.isfinite(self.cost), self.cost, np.inf)))
 
 
-def _residuals(s: Float[Array, " free"], given: tuple[Any, Any, Seen]) -> tuple[Float[Array, " residuals"], None]:
+def _residuals(s: Float[Array, " free"], given: tuple[Any, Any, Expansion]) -> tuple[Float[Array, " residuals"], None]:
     """Residuals with their slopes at the s where the model was seen: all that a Levenberg-Marquardt step asks for."""
-    problem, data, seen = given
-    theta = problem.theta(s)
-    return problem.residuals(theta, seen.nearby(theta), data), None
+    objective, data, seen = given
+    theta = objective.theta(s)
+    return objective.residuals(theta, seen.near(theta), data), None
 
 
 SOLVER = optx.LevenbergMarquardt(rtol=1e-9, atol=1e-9)
 
 
 @eqx.filter_jit
-def _start(problem, data, starts, seen):
+def _start(objective, data, starts, seen):
     def one(data, s, seen):
-        given = (problem, data, seen)
+        given = (objective, data, seen)
         shape = jax.eval_shape(lambda s: _residuals(s, given)[0], s)
         return SOLVER.init(_residuals, s, given, {}, shape, None, frozenset())
 
@@ -53,9 +52,9 @@ def _start(problem, data, starts, seen):
 
 
 @eqx.filter_jit
-def _step(problem, data, s, state, seen):
+def _step(objective, data, s, state, seen):
     def one(data, s, state, seen):
-        s, state, _ = SOLVER.step(_residuals, s, (problem, data, seen), {}, state, frozenset())
+        s, state, _ = SOLVER.step(_residuals, s, (objective, data, seen), {}, state, frozenset())
         return s, state, 0.5 * (state.f_info.residual**2).sum(), state.num_accepted_steps
 
     return eqx.filter_vmap(one)(data, s, state, seen)
@@ -95,51 +94,51 @@ class _Standing(NamedTuple):
             self.active & (still < 2) & (refused < REFUSALS) & np.isfinite(cost),
         )
 
-    def descent(self, count: int) -> Descent:
+    def minima(self, count: int) -> Minima:
         settled = (self.small >= 1) & np.isfinite(self.cost)
-        return Descent(self.s[:count], self.cost[:count], self.steps[:count], settled[:count])
+        return Minima(self.s[:count], self.cost[:count], self.steps[:count], settled[:count])
 
 
-def descend(
-    problem: Any,
+def least_squares(
+    objective: Any,
     starts: Float[np.ndarray, "starts free"],
     max_steps: int,
     *,
     data: Any = None,
-    prepare: Callable[[Any, np.ndarray], Any] = lambda problem, points: problem,
-    report: Callable[[Descent], None] = lambda descent: None,
-) -> Descent:
-    """Minimise `½ Σ r²`, `r = problem.residuals(θ, problem.moments(θ), data)`, from every start.
+    prepare: Callable[[Any, np.ndarray], Any] = lambda objective, points: objective,
+    report: Callable[[Minima], None] = lambda minima: None,
+) -> Minima:
+    """Minimise `½ Σ r²`, `r = objective.residuals(θ, moments at θ, data)`, from every start.
 
-    `data` has a leading axis of starts: each may have a target of its own; without it all have the problem's.
+    `data` has a leading axis of starts: each may have data of its own; without it all have the objective's.
     Steps to where r is not finite are rejected. A start ends when two accepted steps in a row lower its cost by less than
     `STILL` of it, after `REFUSALS` rejected steps in a row, or if it is not finite; what has ended costs nothing more.
-    `prepare(problem, points)` may exchange the problem before each step (sub-steps); `report` sees every step's outcome.
+    `prepare(objective, points)` may exchange the objective before each step (sub-steps); `report` sees every step's outcome.
     """
     count, free = starts.shape
-    batched = isinstance(problem.model, Linear)
+    batched = objective.linear
     fill = -count % ROWS if batched else 0
     s = np.concatenate([starts, np.broadcast_to(starts[-1], (fill, free))])
     none, nothing = np.zeros(len(s), dtype=int), np.full(len(s), np.inf)
     now = _Standing(s, s, nothing, none, none, none, none, none, np.arange(len(s)) < count)
     last = np.minimum(np.arange(count + fill), count - 1)
-    data = jax.tree.map(lambda x: np.asarray(x)[last], _for_all(problem.data, count) if data is None else data)
+    data = jax.tree.map(lambda x: np.asarray(x)[last], _for_all(objective.data, count) if data is None else data)
     seen = state = None
     for _ in range(max_steps):
         rows = np.flatnonzero(now.active) if batched else np.arange(count)
-        problem = prepare(problem, now.ahead[rows])
-        new = seen_at(problem, np.asarray(problem.theta(now.ahead[rows])))
+        objective = prepare(objective, now.ahead[rows])
+        new = expand(objective, np.asarray(objective.theta(now.ahead[rows])))
         if seen is None:
             seen = jax.tree.map(lambda x: x[last], new)
-            state = _start(problem, data, now.s, seen)
+            state = _start(objective, data, now.s, seen)
         else:
             seen = jax.tree.map(lambda old, x, rows=rows: _put(old, rows, x), seen, new)
-        s, state, cost, accepted = _step(problem, data, now.s, state, seen)
+        s, state, cost, accepted = _step(objective, data, now.s, state, seen)
         now = now.advanced(*map(np.asarray, (s, state.y_eval, cost, accepted)))
-        report(now.descent(count))
+        report(now.minima(count))
         if not np.any(now.active):
             break
-    return now.descent(count)
+    return now.minima(count)
 
 
 def _for_all(data: Any, count: int) -> Any:

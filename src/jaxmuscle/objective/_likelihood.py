@@ -1,6 +1,7 @@
 """The likelihood of a Welch spectrum: chi-squared bins with their bias and correlation, and spectra drawn from it."""
 
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -19,14 +20,15 @@ from jaxmuscle.response._expected import Moments, check_line, expected_moments
 from jaxmuscle.spectra._bin_law import bin_statistics, trial_samples, welch_law
 from jaxmuscle.spectra._settings import WINDOW
 
-from ._consequences import Seen, seen_at
-from ._problem import Problem, Setup, target_variation, theta_of
+from ._consequences import Expansion, expand
+from ._problem import FitProblem, target_variation
+from ._residuals import Residuals, further_residuals
 
 
-def repeated(setup: Setup, task: AbstractTask, count: int) -> Moments:
-    """The task's moments in linear response, in `count` rows; for `drawn_spectra`."""
-    seen = seen_at(setup.linear(), theta_of(setup, task)[None])
-    return Moments(*(np.repeat(np.asarray(x), count, axis=0) for x in seen.moments))
+def repeated(problem: FitProblem, tasks: Sequence[AbstractTask], count: int) -> tuple[Moments, ...]:
+    """Moments of every part's task in linear response, in `count` rows; for `drawn_spectra`."""
+    seen = expand(problem.linear(), problem.theta_of(tasks)[None])
+    return jax.tree.map(lambda x: np.repeat(np.asarray(x), count, axis=0), seen.moments)
 
 
 Powers = Float[Array | np.ndarray, " bins"]
@@ -44,6 +46,15 @@ class Bins(NamedTuple):
     precision: Float[Array | np.ndarray, "*rows bins bins"]
     logdet: Float[Array | np.ndarray, "*rows"]
     mask: Float[Array | np.ndarray, "*rows bins"]
+
+
+def check_known(target: Target) -> None:
+    """Raises `ValueError` for a target that states neither segments nor sigma."""
+    if target.segments is None and target.sigma is None:
+        raise ValueError(
+            f"{target.name}: states neither segments nor sigma, so nothing says how much it scatters: give segments, "
+            "the number of Welch segments that were averaged (--segments), or a sigma per bin"
+        )
 
 
 def measured_bins(target: Target, mask: np.ndarray | None = None) -> Bins:
@@ -109,74 +120,86 @@ def log_marginal(bins: Bins, power: Powers, line: Powers) -> Scalar:
     return jax.nn.logsumexp(values) + jnp.log(width * 2 * REACH / (NODES - 1))
 
 
+AllBins = tuple[Bins | None, ...]
+
+
 class Likelihood(eqx.Module):
     """Log likelihood of a fit's data as a function of its model's moments.
 
-    With segments: the gamma law of Welch bins. Without, but with a sigma: Gaussian in the residual of the fit. Further
-    residuals (coefficient of variation, mean force) are Gaussian. `bins` is None in the Gaussian case.
+    Of a target with segments: the gamma law of Welch bins, with an offset of its own. Without, but with a sigma: Gaussian in
+    the residual of the fit (`bins` is None there). Further residuals (coefficient of variation, mean) are Gaussian.
     """
 
-    problem: Problem
-    bins: Bins | None
+    objective: Residuals
+    bins: AllBins
 
     @classmethod
-    def of(cls, setup: Setup) -> "Likelihood":
-        """Of the setup's target. Raises `ValueError` if that states neither segments nor sigma."""
-        target = setup.target
-        if target.segments is None and target.sigma is None:
-            raise ValueError(
-                f"{target.name}: states neither segments nor sigma, so nothing says how much it scatters: give segments, "
-                "the number of Welch segments that were averaged (--segments), or a sigma per bin"
-            )
-        return cls(setup.linear(), None if target.segments is None else as_arrays(measured_bins(target)))
+    def of(cls, problem: FitProblem) -> "Likelihood":
+        """Of the problem's targets. Raises `ValueError` if one states neither segments nor sigma."""
+        for part in problem.parts:
+            check_known(part.target)
+        bins = (None if p.target.segments is None else as_arrays(measured_bins(p.target)) for p in problem.parts)
+        return cls(problem.linear(), tuple(bins))
 
-    def at(self, moments: Moments, offset: Scalar, bins: Bins | None = None) -> Scalar:
-        """Log density of data and offset (which counts in the gamma law only) where the model has these moments."""
-        bins = self.bins if bins is None else bins
-        data = self.problem.data
+    def at(
+        self, moments: tuple[Moments, ...], offsets: Float[Array | np.ndarray, " parts"], bins: AllBins | None = None
+    ) -> Scalar:
+        """Log density of data and offsets (which count in the gamma law only) where the model has these moments."""
+        each = zip(range(len(self.bins)), moments, self.bins if bins is None else bins, strict=True)
+        return sum((self.of_part(i, m, offsets[i], own) for i, m, own in each), start=jnp.zeros(()))
+
+    def of_part(self, i: int, moments: Moments, offset: Scalar, bins: Bins | None) -> Scalar:
+        """Log density of one target's data and offset."""
+        part = self.objective.parts[i]
         if bins is None:
-            return _gaussian(self.problem.data_residuals(moments, data))
-        return log_density(bins, moments.power, moments.line, offset) + self._further(moments)
+            return _gaussian(part.data_residuals(moments, part.data))
+        return log_density(bins, moments.power, moments.line, offset) + _gaussian(further_residuals(moments, part.data))
 
-    def marginal(self, moments: Moments, bins: Bins | None = None) -> Scalar:
-        """The same with the offset integrated out."""
-        bins = self.bins if bins is None else bins
-        if bins is None:
-            return self.at(moments, jnp.zeros(()))
-        return log_marginal(bins, moments.power, moments.line) + self._further(moments)
+    def marginal(self, moments: tuple[Moments, ...], bins: AllBins | None = None) -> Scalar:
+        """The same with the offsets integrated out."""
+        found = jnp.zeros(())
+        for part, m, own in zip(self.objective.parts, moments, self.bins if bins is None else bins, strict=True):
+            if own is None:
+                found += _gaussian(part.data_residuals(m, part.data))
+            else:
+                found += log_marginal(own, m.power, m.line) + _gaussian(further_residuals(m, part.data))
+        return found
 
-    def information(self, seen: Seen, bins: Bins | None = None) -> Float[Array, "all all"]:
-        """Fisher information of (θ, offset), `Jᵀ C⁻¹ J`: C the bins' covariance in the log, 2 R_kl / √(ν_k ν_l).
+    def information(self, seen: Expansion, bins: AllBins | None = None) -> Float[Array, "all all"]:
+        """Fisher information of (θ, offsets), `Jᵀ C⁻¹ J`: C the bins' covariance in the log, 2 R_kl / √(ν_k ν_l).
 
         What the line tells by how little a bin scatters is left out.
         """
-        bins = self.bins if bins is None else bins
-        if bins is None:
-            slope = jax.jacfwd(lambda theta: self.problem.data_residuals(seen.nearby(theta), self.problem.data))(seen.theta)
-            return _bordered(slope.T @ slope)
-        further = jax.jacfwd(lambda theta: self._further_rows(seen.nearby(theta)))(seen.theta)
-        moments, slopes = seen.moments, seen.slopes
-        weight = bins.mask * jnp.sqrt(bins.half / jnp.maximum(1 - jnp.clip(moments.line / moments.power, 0, 1) ** 2, LEAST))
-        total = jnp.sum(moments.power)
-        logs = jnp.sum(slopes.power, axis=0) / total - slopes.power / moments.power[:, None]
-        rows = weight[:, None] * jnp.concatenate([logs, jnp.ones((len(logs), 1))], axis=1)
-        return jnp.asarray(rows.T @ bins.precision @ rows) + _bordered(further.T @ further)
+        parts, bins = self.objective.parts, self.bins if bins is None else bins
+        found = jnp.zeros((len(seen.theta) + len(parts),) * 2)
+        for i, (part, own) in enumerate(zip(parts, bins, strict=True)):
 
-    def _further(self, moments: Moments) -> Scalar:
-        return _gaussian(self._further_rows(moments))
+            def rows(theta, i=i, part=part, own=own):
+                moments = seen.near(theta)[i]
+                return part.data_residuals(moments, part.data) if own is None else further_residuals(moments, part.data)
 
-    def _further_rows(self, moments: Moments) -> Float[Array | np.ndarray, " rows"]:
-        variation, mean = self.problem.data.extra
-        rows = [] if variation is None else [(jnp.log(moments.variation) - variation[0]) / variation[1]]
-        rows += [] if mean is None else [(moments.mean - mean[0]) / mean[1]]
-        return jnp.stack([jnp.asarray(row) for row in rows]) if rows else jnp.zeros(0)
+            gaussian = jnp.pad(jax.jacfwd(rows)(seen.theta), ((0, 0), (0, len(parts))))
+            found += gaussian.T @ gaussian
+            if own is not None:
+                m, slopes = seen.moments[i], seen.slopes[i]
+                weight = own.mask * jnp.sqrt(own.half / jnp.maximum(1 - jnp.clip(m.line / m.power, 0, 1) ** 2, LEAST))
+                logs = jnp.sum(slopes.power, axis=0) / jnp.sum(m.power) - slopes.power / m.power[:, None]
+                offset = jnp.broadcast_to(jnp.eye(len(parts))[i], (len(logs), len(parts)))
+                scaled = weight[:, None] * jnp.concatenate([logs, offset], axis=1)
+                found += scaled.T @ own.precision @ scaled
+        return found
 
 
-def drawn_spectra(likelihood: Likelihood, target: Target, moments: Moments, key: Array) -> Float[np.ndarray, "rows bins"]:
+def without_offsets(information: Float[np.ndarray, "all all"], free: int) -> Float[np.ndarray, "free free"]:
+    """Fisher information of θ where the offsets, the last coordinates, are unknown: its Schur complement."""
+    inner, cross, own = information[:free, :free], information[:free, free:], information[free:, free:]
+    return inner - cross @ np.linalg.pinv(own, hermitian=True) @ cross.T
+
+
+def drawn_spectra(bins: Bins | None, target: Target, moments: Moments, key: Array) -> Float[np.ndarray, "rows bins"]:
     """Proportional powers scattering about the model's: correlated gamma variables, or Gaussian in the log with a sigma."""
     normal = np.asarray(jax.random.normal(key, np.shape(moments.power)))
     power = np.asarray(moments.power)
-    bins: Any = likelihood.bins
     if bins is None:
         drawn = power * np.exp(normal * np.asarray(bin_statistics(target).sd))
     else:
@@ -185,11 +208,6 @@ def drawn_spectra(likelihood: Likelihood, target: Target, moments: Moments, key:
         root = np.linalg.cholesky(np.linalg.inv(np.asarray(bins.precision)))
         drawn = power * gammaincinv(half, ndtr(normal @ root.T)) / half
     return drawn / drawn.sum(axis=-1, keepdims=True)
-
-
-def _bordered(curvature: Float[Array, "free free"]) -> Float[Array, "all all"]:
-    """With a row and column of zeros for the offset."""
-    return jnp.pad(curvature, ((0, 1), (0, 1)))
 
 
 def _gaussian(residuals: Float[Array | np.ndarray, " rows"]) -> Scalar:

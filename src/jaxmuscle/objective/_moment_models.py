@@ -11,6 +11,7 @@ from jaxtyping import Array, Float, Int
 
 from jaxmuscle.model._noise import Realisation
 from jaxmuscle.model._tasks import AbstractTask
+from jaxmuscle.response._equilibrium import slowest_rate
 from jaxmuscle.response._expected import Moments, expected_moments, response
 from jaxmuscle.response._linearised import LinearTask, settled
 from jaxmuscle.simulation._batch import respond
@@ -62,9 +63,8 @@ class Linear(eqx.Module):
 
     def moments(self, task: AbstractTask) -> Moments:
         """Expected moments of the task's output."""
-        found = expected_moments(task, task.settings, self.window, self.samples)[
-            0
-        ]  # compiled apart, so that it is traced once
+        # Compiled apart, so that it is traced once.
+        found = expected_moments(task, task.settings, self.window, self.samples)[0]
         found = found._replace(power=found.power[self.chosen], line=found.line[self.chosen])
         return jax.tree.map(jnp.multiply, found, self.correction)
 
@@ -129,11 +129,11 @@ class MonteCarlo(eqx.Module):
             beside = outputs(LinearTask.of(task, system))
             power = exact.power[self.chosen] + jnp.mean(self._power(seen, settings) - self._power(beside, settings), 0)
             spread = jnp.mean(swing(seen) - swing(beside))
-            return Moments(power, exact.line[self.chosen], mean, exact.variance + spread)
+            return Moments(power, exact.line[self.chosen], mean, exact.variance + spread, exact.rate)
         quiet, noisy = seen[:1], seen[1:] - seen[:1]
         line, random = jnp.mean(self._power(quiet, settings), 0), jnp.mean(self._power(noisy, settings), 0)
         variance = swing(quiet[0]) + jnp.mean(swing(noisy))
-        return Moments(line + random, line, mean, variance)
+        return Moments(line + random, line, mean, variance, slowest_rate(task))
 
     def _power(self, outputs: Float[Array, "seeds samples"], settings: SpectrumSettings) -> Float[Array, "seeds bins"]:
         bins = settings.last_bin - settings.first_bin + 1

@@ -1,17 +1,16 @@
-"""The data of a fit and its residuals; the checked arguments that make it."""
+"""The problem of a fit: its targets with their tasks, the coordinates that they share, and the residuals that follow."""
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
-from jaxmuscle._common.arrays import as_arrays, is_concrete
-from jaxmuscle._common.types import Scalar
+from jaxmuscle._common.arrays import as_arrays, as_numbers, is_concrete
 from jaxmuscle.data._target import Target
 from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.response._equilibrium import fastest_rate
@@ -20,11 +19,14 @@ from jaxmuscle.response._linearised import has_response
 from jaxmuscle.simulation._batch import draw
 from jaxmuscle.simulation._integrator import Grid
 from jaxmuscle.simulation._simulate import DURATION, MAX_RATE_STEP, whole
-from jaxmuscle.spectra._bin_law import BinStatistics, bin_statistics, samples_of, shares_map, trial_samples
+from jaxmuscle.spectra._bin_law import bin_statistics, samples_of, trial_samples
 from jaxmuscle.spectra._settings import WINDOW
 
-from ._coordinates import Coordinates, at
+from ._coordinates import Coordinates, task_at
 from ._moment_models import Linear, MonteCarlo
+from ._residuals import Data, PartResiduals, Residuals, residual_sigma
+
+MOST_SUBSTEPS = 16
 
 
 def target_variation(target: Target, task: AbstractTask | None = None) -> tuple[Any, Any] | None:
@@ -49,86 +51,74 @@ def target_variation(target: Target, task: AbstractTask | None = None) -> tuple[
     return float(logs.mean()), float(sd) if is_concrete(sd) else sd
 
 
-MOST_SUBSTEPS = 16
-
-
-class Data(eqx.Module):
-    """What a fit knows of its target: powers, their spread, further residuals. The model does not depend on it."""
-
-    target: Float[Array | np.ndarray, "*rows bins"]
-    bias: Float[Array | np.ndarray, "*rows bins"]
-    sd: Float[Array | np.ndarray, "*rows bins"]
-    sigma: Float[Array | np.ndarray, "*rows bins"]
-    extra: tuple[tuple[Scalar, Scalar] | None, tuple[Scalar, Scalar] | None]
-
-
-class Problem(eqx.Module):
-    """Everything that the residuals of a fit depend on besides the free coordinates."""
-
-    task: AbstractTask
-    coordinates: Coordinates
-    model: Linear | MonteCarlo
-    data: Data
-    statistics: BinStatistics
-    prior: Float[Array | np.ndarray, " free"]
-    moving: Float[Array | np.ndarray, " free"]
-    residual: str = eqx.field(static=True)
-
-    def theta(self, s: Float[Array | np.ndarray, "*rows free"]) -> Float[Array | np.ndarray, "*rows free"]:
-        """Coordinates in prior standard deviations; what is not `moving` (1, else 0) has no slope."""
-        if not isinstance(s, np.ndarray):
-            s = jnp.where(self.moving > 0, s, jax.lax.stop_gradient(s))
-        return self.coordinates.theta(s)
-
-    def moments(self, theta: Float[Array, " free"]) -> Moments:
-        """Moments of the model at θ."""
-        return self.model.moments(at(self.task, self.coordinates, theta))
-
-    def data_residuals(self, moments: Moments, data: Data) -> Float[Array, " residuals"]:
-        """Residuals in standard deviations of the data: spectrum, then coefficient of variation and mean force."""
-        rows = [jnp.asarray(self._spectrum_residuals(moments, data))]
-        variation, mean = data.extra
-        if variation is not None:
-            rows.append((jnp.log(moments.variation) - variation[0])[None] / variation[1])
-        if mean is not None:
-            rows.append((moments.mean - mean[0])[None] / mean[1])
-        return jnp.concatenate(rows)
-
-    def _spectrum_residuals(self, moments: Moments, data: Data) -> Float[Array | np.ndarray, " bins"]:
-        if self.residual == "log":
-            z = jnp.log(data.target) - data.bias - jnp.log(moments.power)
-            return (z - jnp.mean(z)) / data.sd
-        difference = data.target - moments.proportional
-        if self.residual == "linear":
-            return difference / data.sigma
-        return jnp.cumsum(difference)[:-1] / data.sigma[:-1]
-
-    def residuals(self, theta: Float[Array, " free"], moments: Moments, data: Data) -> Float[Array, " all"]:
-        """Data residuals of the moments at θ, then those of the prior."""
-        return jnp.concatenate([self.data_residuals(moments, data), jnp.sqrt(self.prior) * theta])
-
-
-def residual_sigma(kind: str, target: Target, statistics: BinStatistics) -> Float[np.ndarray, " bins"]:
-    """What the linear and the cumulative residual are divided by: standard deviations of p_k or of its running sum."""
-    p = target.proportional_power
-    if kind == "linear" and target.sigma is not None and target.segments is None:
-        return np.asarray(target.sigma)
-    spread = shares_map(p) @ statistics.covariance @ shares_map(p).T
-    if kind == "cumulative":
-        summed = np.tril(np.ones((len(p), len(p))))
-        spread = summed @ spread @ summed.T
-    return np.sqrt(np.maximum(np.diag(spread), 1e-300))
-
-
 @dataclasses.dataclass(frozen=True)
-class Setup:
-    """The arguments of a fit, checked; makes the problem for a number of seeds."""
+class Part:
+    """One target of a fit: its task, the task's free coordinates, and which `columns` of the fit's coordinates they are.
 
+    `variation` and `mean`: (log) coefficient of variation and mean with their standard deviations, None where not fitted.
+    """
+
+    name: str
     task: AbstractTask
     target: Target
     coordinates: Coordinates
+    columns: tuple[int, ...]
+    variation: tuple[Any, Any] | None
+    mean: tuple[Any, Any] | None
+
+    @property
+    def chosen(self) -> np.ndarray:
+        """Positions of the target's bins among those of its settings."""
+        return self.target.bins - self.target.settings.first_bin
+
+    def own(self, theta: Float[np.ndarray, "*rows free"]) -> Float[np.ndarray, "*rows own"]:
+        """Its own coordinates among those of the fit."""
+        return theta[..., np.array(self.columns, dtype=int)]
+
+    def task_at(self, theta: Float[np.ndarray, " free"]) -> AbstractTask:
+        """Its task at the fit's coordinates θ."""
+        return as_numbers(task_at(self.task, self.coordinates, self.own(theta)))
+
+    def theta_of(self, task: AbstractTask) -> Float[np.ndarray, " own"]:
+        """Its coordinates of a task's values."""
+        c = self.coordinates
+        values = np.array([float(task[name]) for name in c.names])
+        with np.errstate(invalid="ignore", divide="ignore"):
+            return np.where(c.positive, np.log(values / c.centre), values - c.centre) / c.sd
+
+    def scattering_as(self, task: AbstractTask) -> "Part":
+        """The part with a coefficient of variation that scatters as that of this task does."""
+        if self.variation is None or not has_response(task, required=False):
+            return self
+        return dataclasses.replace(self, variation=target_variation(self.target, task))
+
+    def linear(self, residual: str, share: np.ndarray | None = None, correction: Moments | None = None) -> PartResiduals:
+        """Its residuals in linear response, times a correction of its moments."""
+        if correction is None:
+            ones, one = np.ones(len(self.chosen)), np.ones(())
+            correction = Moments(ones, ones, one, one, one)
+        samples = jnp.asarray(trial_samples(self.target))
+        return self.residuals(Linear(self.chosen, jax.tree.map(jnp.asarray, correction), samples, WINDOW), residual, share)
+
+    def residuals(self, model: Linear | MonteCarlo, residual: str, share: np.ndarray | None) -> PartResiduals:
+        """Its residuals with a model of its moments; `share` is what a line holds of each bin."""
+        statistics = bin_statistics(self.target, share)
+        sigma = residual_sigma(residual, self.target, statistics)
+        data = Data(self.target.proportional_power, statistics.bias, statistics.sd, sigma, self.variation, self.mean)
+        given = as_arrays({"data": data, "statistics": statistics})
+        return PartResiduals(as_arrays(self.task), self.coordinates, model, **given, residual=residual)
+
+
+@dataclasses.dataclass(frozen=True)
+class FitProblem:
+    """What a fit is about, its arguments checked: one target, or several of one person with what they share.
+
+    `control`: whether all tasks have a linear response.
+    """
+
+    parts: tuple[Part, ...]
+    coordinates: Coordinates
     prior: np.ndarray
-    extra: tuple
     residual: str
     method: str
     dt: float
@@ -137,78 +127,124 @@ class Setup:
     control: bool
     tell: Callable[[str, float], None]
 
+    @classmethod
+    def shared(cls, problems: "Mapping[str, FitProblem]", names: Mapping[str, Mapping[str, str]]) -> "FitProblem":
+        """From the problems of the targets alone and the joint name of each one's parameters, as `joint_names` gives them.
+
+        A coordinate that is shared is that of the first target: θ = 0 is the task's own value in every one.
+        """
+        places: dict[str, tuple[FitProblem, int]] = {}
+        for target, problem in problems.items():
+            for i, name in enumerate(problem.coordinates.names):
+                places.setdefault(names[target][name], (problem, i))
+        order = {name: i for i, name in enumerate(places)}
+
+        def gathered(field: str) -> np.ndarray:
+            return np.array([getattr(problem.coordinates, field)[i] for problem, i in places.values()])
+
+        fields = (gathered(field) for field in ("centre", "sd", "positive", "low", "high"))
+        parts = tuple(dataclasses.replace(p.parts[0], name=t, columns=tuple(order[names[t][n]] for n in p.coordinates.names))
+                      for t, p in problems.items())  # fmt: skip
+        prior = np.array([problem.prior[i] for problem, i in places.values()])
+        first = next(iter(problems.values()))
+        return dataclasses.replace(first, parts=parts, coordinates=Coordinates(tuple(places), *fields), prior=prior)
+
+    @property
+    def finest(self) -> Target:
+        """The target whose bins are narrowest."""
+        return min((part.target for part in self.parts), key=lambda target: target.settings.resolution)
+
+    @property
+    def title(self) -> str:
+        """Names of the targets."""
+        return ", ".join(part.target.name for part in self.parts)
+
     @property
     def steps_per_sample(self) -> int:
         """Steps of the noise grid per sampling interval. Raises `ValueError` if dt does not divide it."""
-        interval = 1 / self.target.settings.rate
+        interval = 1 / self.parts[0].target.settings.rate
         return whole(interval / self.dt, f"dt = {self.dt} s does not divide the sampling interval {interval} s")
 
-    def at(self, theta: Float[np.ndarray, " free"]) -> AbstractTask:
-        """The task with the values that θ stands for."""
-        return self.task.replace(**{name: float(value) for name, value in self.coordinates.values(theta).items()})
+    def tasks_at(self, theta: Float[np.ndarray, " free"]) -> tuple[AbstractTask, ...]:
+        """Every target's task with the values that θ stands for."""
+        return tuple(part.task_at(theta) for part in self.parts)
 
-    def scattering_as(self, task: AbstractTask) -> "Setup":
-        """The setup with a coefficient of variation that scatters as that of this task does."""
-        if self.extra[0] is None or not has_response(task, required=False):
-            return self
-        return dataclasses.replace(self, extra=(target_variation(self.target, task), self.extra[1]))
+    def theta_of(self, tasks: Sequence[AbstractTask]) -> Float[np.ndarray, " free"]:
+        """Coordinates of the tasks' values; of what is shared, that of the first that has it."""
+        theta = np.zeros(len(self.coordinates.names))
+        for part, task in reversed(list(zip(self.parts, tasks, strict=True))):
+            theta[list(part.columns)] = part.theta_of(task)
+        return theta
 
-    def linear(self, line_share: np.ndarray | None = None, correction: Moments | None = None) -> Problem:
-        """The problem in linear response, times a correction of its moments."""
-        chosen = self.target.bins - self.target.settings.first_bin
-        if correction is None:
-            ones = np.ones(len(chosen))
-            correction = Moments(ones, ones, np.ones(()), np.ones(()))
-        samples = jnp.asarray(trial_samples(self.target))
-        return self._with_model(Linear(chosen, jax.tree.map(jnp.asarray, correction), samples, WINDOW), line_share)
+    def acting(self, name: str) -> tuple[Part, ...]:
+        """The parts that a free parameter belongs to."""
+        column = self.coordinates.names.index(name)
+        return tuple(part for part in self.parts if column in part.columns)
 
-    def montecarlo(self, seeds: int, line_share: np.ndarray | None = None) -> Problem:
-        """The problem on the first `seeds` noise paths."""
-        task, settings, every = as_arrays(self.task), self.target.settings, self.steps_per_sample
-        self.task.noise.check_step(self.dt)
+    def where(self, name: str) -> tuple[int, str]:
+        """Which part a quantity "name@part" is of, and its name there; of one that belongs to all, the first."""
+        base, _, target = name.partition("@")
+        names = [part.name for part in self.parts]
+        return (names.index(target) if target else 0), base
+
+    def by_name(self, tables: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+        """A table of each part as one: with several parts, names become "name@part"."""
+        if len(self.parts) == 1:
+            return dict(tables[0])
+        return {f"{n}@{part.name}": x for part, table in zip(self.parts, tables, strict=True) for n, x in table.items()}
+
+    def scattering_as(self, tasks: Sequence[AbstractTask]) -> "FitProblem":
+        """The problem with coefficients of variation that scatter as those of these tasks do."""
+        parts = tuple(part.scattering_as(task) for part, task in zip(self.parts, tasks, strict=True))
+        return dataclasses.replace(self, parts=parts)
+
+    def linear(
+        self, shares: Sequence[np.ndarray | None] | None = None, corrections: Sequence[Moments | None] | None = None
+    ) -> Residuals:
+        """Its residuals in linear response; of each part the line's share of the bins and a correction, if known."""
+        none = [None] * len(self.parts)
+        given = zip(self.parts, shares or none, corrections or none, strict=True)
+        return self._residuals(part.linear(self.residual, share, correction) for part, share, correction in given)
+
+    def montecarlo(self, seeds: int, shares: Sequence[np.ndarray] | None = None) -> Residuals:
+        """Its residuals on the first `seeds` noise paths."""
+        given = zip(self.parts, shares or [None] * len(self.parts), strict=True)
+        return self._residuals(part.residuals(self._paths(part, seeds), self.residual, share) for part, share in given)
+
+    def _residuals(self, parts: Any) -> Residuals:
+        free = as_arrays({"prior": self.prior, "moving": np.ones(len(self.prior))})
+        return Residuals(tuple(parts), self.coordinates, **free, columns=tuple(part.columns for part in self.parts))
+
+    def _paths(self, part: Part, seeds: int) -> MonteCarlo:
+        task, settings, every = as_arrays(part.task), part.target.settings, self.steps_per_sample
+        part.task.noise.check_step(self.dt)
         grid = Grid(self.dt, every * round(DURATION * settings.rate), every, 1, reverse=False)
         normals = draw(task.noise, jax.random.fold_in(self.key, 0), jnp.arange(seeds), grid.steps)
-        colour = any(name in ("noise_cutoff", "noise_correlation_time") for name in self.coordinates.names)
-        chosen = self.target.bins - settings.first_bin
-        model = MonteCarlo.of(task, normals, grid, chosen, WINDOW, colour_free=colour, control=self.control,
-                              samples=trial_samples(self.target))  # fmt: skip
-        return self._with_model(model, line_share)
+        colour = any(name in ("noise_cutoff", "noise_correlation_time") for name in part.coordinates.names)
+        return MonteCarlo.of(task, normals, grid, part.chosen, WINDOW, colour_free=colour, control=self.control,
+                             samples=trial_samples(part.target))  # fmt: skip
 
-    def _with_model(self, model: Linear | MonteCarlo, line_share: np.ndarray | None) -> Problem:
-        statistics = bin_statistics(self.target, line_share)
-        sigma = residual_sigma(self.residual, self.target, statistics)
-        data = Data(self.target.proportional_power, statistics.bias, statistics.sd, sigma, self.extra)
-        given = as_arrays({"data": data, "statistics": statistics, "prior": self.prior, "moving": np.ones(len(self.prior))})
-        return Problem(as_arrays(self.task), self.coordinates, model, **given, residual=self.residual)
-
-    def finer(self, problem: Problem, points: np.ndarray) -> Problem:
-        """The problem with as many sub-steps as the stiffest of the points asks for; never fewer than it has."""
-        if isinstance(problem.model, Linear):
-            return problem
-        fastest = 0.0
-        for s in points:
-            theta = np.asarray(self.coordinates.theta(s))
-            rate = _rate(problem.task, self.coordinates, theta)
-            fastest = max(fastest, rate if np.isfinite(rate) else 0.0)
-        needed = 2 ** int(np.ceil(np.log2(max(fastest * self.dt / MAX_RATE_STEP, 1.0))))
-        needed = min(needed, MOST_SUBSTEPS)
-        grid = problem.model.grid
-        if needed <= grid.substeps:
-            return problem
-        grid = Grid(grid.dt, grid.steps, grid.every, needed, reverse=False)
-        return eqx.tree_at(lambda p: p.model.grid, problem, grid, is_leaf=lambda x: isinstance(x, Grid))
+    def finer(self, objective: Residuals, points: Float[np.ndarray, "points free"]) -> Residuals:
+        """The residuals with as many sub-steps as the stiffest of the points asks for; never fewer than they have."""
+        if objective.linear:
+            return objective
+        theta = np.asarray(self.coordinates.theta(points))
+        for i, part in enumerate(self.parts):
+            rates = [_rate(part, row) for row in theta]
+            fastest = max((rate for rate in rates if np.isfinite(rate)), default=0.0)
+            needed = min(2 ** int(np.ceil(np.log2(max(fastest * self.dt / MAX_RATE_STEP, 1.0)))), MOST_SUBSTEPS)
+            model = objective.parts[i].model
+            assert isinstance(model, MonteCarlo)
+            grid = model.grid
+            if needed > grid.substeps:
+                grid = Grid(grid.dt, grid.steps, grid.every, needed, reverse=False)
+                objective = eqx.tree_at(lambda o, i=i: o.parts[i].model.grid, objective, grid,
+                                        is_leaf=lambda x: isinstance(x, Grid))  # fmt: skip
+        return objective
 
 
-def _rate(task: AbstractTask, coordinates: Coordinates, theta: np.ndarray) -> float:
+def _rate(part: Part, theta: Float[np.ndarray, " free"]) -> float:
     try:
-        return fastest_rate(at(task, coordinates, jnp.asarray(theta)), DURATION)
+        return fastest_rate(task_at(as_arrays(part.task), part.coordinates, jnp.asarray(part.own(theta))), DURATION)
     except ValueError:
         return np.nan
-
-
-def theta_of(setup: Setup, task: Any) -> np.ndarray:
-    """Coordinates of a task's values."""
-    c = setup.coordinates
-    values = np.array([float(task[name]) for name in c.names])
-    with np.errstate(invalid="ignore", divide="ignore"):
-        return np.where(c.positive, np.log(values / c.centre), values - c.centre) / c.sd

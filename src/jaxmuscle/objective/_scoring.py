@@ -8,10 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from ._consequences import Seen, quantities, seen_at
+from ._consequences import Expansion, expand, quantities
 from ._coordinates import Coordinates
-from ._likelihood import Bins, Likelihood
-from ._problem import Setup
+from ._likelihood import AllBins, Likelihood
+from ._problem import FitProblem
+from ._residuals import Residuals
 from ._starts import points_about
 
 STEPS = 60
@@ -19,14 +20,14 @@ GAIN = 1e-5
 HARDEST = 1e9
 
 
-class Peak(NamedTuple):
-    """Where each row ended: θ, offset, log likelihood (with the offset maximised), what was minimised, and its curvature.
+class Maximum(NamedTuple):
+    """Where each row ended: θ, offsets, log likelihood (with these maximised), what was minimised, and its curvature.
 
-    `curvature` is the Fisher information of θ and the offset, with the prior's precision on its diagonal.
+    `curvature` is the Fisher information of θ and the offsets, with the prior's precision on its diagonal.
     """
 
     theta: Float[np.ndarray, "rows free"]
-    offset: Float[np.ndarray, " rows"]
+    offset: Float[np.ndarray, "rows parts"]
     log_likelihood: Float[np.ndarray, " rows"]
     cost: Float[np.ndarray, " rows"]
     curvature: Float[np.ndarray, "rows all all"]
@@ -37,67 +38,74 @@ class Peak(NamedTuple):
         """The finite row of lowest cost."""
         return int(np.argmin(np.where(np.isfinite(self.cost), self.cost, np.inf)))
 
-    def row(self, i: int) -> "Peak":
+    def row(self, i: int) -> "Maximum":
         """One row, as rows of one."""
-        return Peak(*(x[[i]] for x in self))
+        return Maximum(*(x[[i]] for x in self))
 
     def covariance(self, i: int) -> Float[np.ndarray, "free free"]:
-        """Covariance of θ by the curvature at one row, the offset integrated out."""
-        return np.linalg.pinv(self.curvature[i], hermitian=True)[:-1, :-1]
+        """Covariance of θ by the curvature at one row, the offsets integrated out."""
+        free = self.theta.shape[1]
+        return np.linalg.pinv(self.curvature[i], hermitian=True)[:free, :free]
 
 
 class Pin(NamedTuple):
-    """A derived quantity q (with `log` its logarithm) held near `value` by `½ ((q - value) / width)²`; a value per row."""
+    """A derived quantity q of one part (with `log` its logarithm) held near `value` by `½ ((q - value) / width)²`.
 
+    A value per row.
+    """
+
+    part: int
     name: str
     value: Float[np.ndarray, " rows"]
     width: float
     log: bool
 
-    def seen(self, problem: Any, seen: Seen) -> tuple[Float[np.ndarray, " rows"], Float[np.ndarray, "rows free"]]:
+    def seen(
+        self, objective: Residuals, seen: Expansion
+    ) -> tuple[Float[np.ndarray, " rows"], Float[np.ndarray, "rows free"]]:
         """q and its slopes."""
-        values, slopes = (np.asarray(x[self.name]) for x in quantities(problem, seen))
+        values, slopes = (tables[self.part][self.name] for tables in quantities(objective, seen))
         return (np.log(values), slopes / values[:, None]) if self.log else (values, slopes)
 
 
 @eqx.filter_jit
-def _local(likelihood: Likelihood, bins: Bins | None, seen: Seen, offset: Array) -> tuple[Array, Array, Array]:
-    """Log likelihood, its gradient and its Fisher information with respect to (θ, offset), for every row."""
+def _local(likelihood: Likelihood, bins: AllBins, seen: Expansion, offset: Array) -> tuple[Array, Array, Array]:
+    """Log likelihood, its gradient and its Fisher information with respect to (θ, offsets), for every row."""
+    free = seen.theta.shape[-1]
 
     def one(bins, seen, offset):
         def value(both):
-            return likelihood.at(seen.nearby(both[:-1]), both[-1], bins)
+            return likelihood.at(seen.near(both[:free]), both[free:], bins)
 
-        both = jnp.append(seen.theta, offset)
+        both = jnp.concatenate([seen.theta, offset])
         height, slope = jax.value_and_grad(value)(both)
         return height, slope, likelihood.information(seen, bins)
 
     return jax.vmap(one)(bins, seen, offset)
 
 
-def climb(
+def maximise(
     likelihood: Likelihood,
     theta: Float[np.ndarray, "rows free"],
     precision: Float[np.ndarray, " free"],
     *,
-    bins: Bins | None = None,
+    bins: AllBins | None = None,
     moving: Float[np.ndarray, "rows free"] | None = None,
     pin: Pin | None = None,
     max_steps: int = STEPS,
-) -> Peak:
-    """Minimise `-ln L(θ, u) + ½ Σ precision θ²` from every row; `moving` is 0 where a coordinate stays.
+) -> Maximum:
+    """Minimise `-ln L(θ, u) + ½ Σ precision θ²` from every row, u the offsets; `moving` is 0 where a coordinate stays.
 
     `bins` has a leading axis of rows: each may have data of its own. Steps `-(F + λ diag F)⁻¹ g` in the unbounded
     coordinates, F the Fisher information, λ lowered after accepted steps and raised after rejected ones. A row has settled
     when an accepted step gains less than 1e-5.
     """
-    coordinates, rows = likelihood.problem.coordinates, len(theta)
+    coordinates, rows = likelihood.objective.coordinates, len(theta)
     moving = np.ones_like(theta) if moving is None else moving
-    data = likelihood.bins if bins is None else bins
-    if bins is None and data is not None:
-        data = jax.tree.map(lambda x: np.broadcast_to(x, (rows, *np.shape(x))), data)
-    s, u, damping = coordinates.from_theta(theta), np.zeros(rows), np.full(rows, 1e-2)
-    here = _look(likelihood, data, s, u, precision, pin)
+    if bins is None:
+        bins = tuple(jax.tree.map(lambda x: np.broadcast_to(x, (rows, *np.shape(x))), likelihood.bins))
+    s, u, damping = coordinates.from_theta(theta), np.zeros((rows, len(bins))), np.full(rows, 1e-2)
+    here = _look(likelihood, bins, s, u, precision, pin)
     settled, active = np.zeros(rows, dtype=bool), np.isfinite(here.cost)
     for _ in range(max_steps):
         which = np.flatnonzero(active)
@@ -105,9 +113,9 @@ def climb(
             break
         step = _steps(here, coordinates, s, moving, damping, which)
         ahead, above = s.copy(), u.copy()
-        ahead[which] += step[:, :-1]
-        above[which] += step[:, -1]
-        part = None if data is None else jax.tree.map(lambda x, which=which: x[which], data)
+        ahead[which] += step[:, : s.shape[1]]
+        above[which] += step[:, s.shape[1] :]
+        part = jax.tree.map(lambda x, which=which: x[which], bins)
         near = None if pin is None else pin._replace(value=pin.value[which])
         there = _look(likelihood, part, ahead[which], above[which], precision, near)
         better = there.cost < here.cost[which]
@@ -120,7 +128,7 @@ def climb(
         # Refused although the step was short: at the maximum to rounding.
         settled[which] |= ~better & (np.max(np.abs(step), axis=1) < 1e-7)
         active[which] = ~settled[which] & (damping[which] < HARDEST)
-    return Peak(np.asarray(coordinates.theta(s)), u, here.height, here.cost, here.information, settled)
+    return Maximum(np.asarray(coordinates.theta(s)), u, here.height, here.cost, here.information, settled)
 
 
 class _Look(NamedTuple):
@@ -130,29 +138,30 @@ class _Look(NamedTuple):
     information: np.ndarray
 
 
-def _look(likelihood: Likelihood, bins: Bins | None, s: np.ndarray, u: np.ndarray, precision: np.ndarray,
+def _look(likelihood: Likelihood, bins: AllBins, s: np.ndarray, u: np.ndarray, precision: np.ndarray,
           pin: Pin | None) -> _Look:  # fmt: skip
     """Cost, its slope and curvature with respect to (θ, u), where it is finite."""
-    theta = np.asarray(likelihood.problem.coordinates.theta(s))
-    seen = seen_at(likelihood.problem, theta)
+    theta = np.asarray(likelihood.objective.coordinates.theta(s))
+    seen = expand(likelihood.objective, theta)
     height, slope, information = (np.array(x) for x in _local(*_padded(likelihood, bins, seen, u)))
     height, slope, information = height[: len(s)], -slope[: len(s)], information[: len(s)]
-    weight = np.append(precision, 0.0)
+    free = s.shape[1]
+    weight = np.append(precision, np.zeros(u.shape[1]))
     cost = -height + 0.5 * np.sum(precision * theta**2, axis=1)
-    slope[:, :-1] += precision * theta
+    slope[:, :free] += precision * theta
     information += np.diag(weight)
     if pin is not None:
-        values, slopes = pin.seen(likelihood.problem, _filled(seen, len(s)))
+        values, slopes = pin.seen(likelihood.objective, _filled(seen, len(s)))
         values, slopes = values[: len(s)], slopes[: len(s)]
         off, rise = (values - pin.value) / pin.width, slopes / pin.width
         cost = cost + 0.5 * off**2
-        slope[:, :-1] += off[:, None] * rise
-        information[:, :-1, :-1] += rise[:, :, None] * rise[:, None, :]
+        slope[:, :free] += off[:, None] * rise
+        information[:, :free, :free] += rise[:, :, None] * rise[:, None, :]
     cost = np.where(np.isfinite(cost) & np.all(np.isfinite(slope), axis=1), cost, np.inf)
     return _Look(height, cost, slope, information)
 
 
-def _padded(likelihood: Likelihood, bins: Bins | None, seen: Seen, u: np.ndarray) -> tuple[Any, ...]:
+def _padded(likelihood: Likelihood, bins: AllBins, seen: Expansion, u: np.ndarray) -> tuple[Any, ...]:
     return (likelihood, *_filled((bins, seen, u), len(u)))
 
 
@@ -165,8 +174,9 @@ def _filled(tree: Any, rows: int) -> Any:
 
 def _steps(here: _Look, coordinates: Coordinates, s: np.ndarray, moving: np.ndarray, damping: np.ndarray,
            which: np.ndarray) -> np.ndarray:  # fmt: skip
-    """Damped Newton steps in the unbounded coordinates and the offset."""
-    stretch = np.concatenate([coordinates.stretch(s[which]) * moving[which], np.ones((len(which), 1))], axis=1)
+    """Damped Newton steps in the unbounded coordinates and the offsets."""
+    offsets = here.slope.shape[1] - s.shape[1]
+    stretch = np.concatenate([coordinates.stretch(s[which]) * moving[which], np.ones((len(which), offsets))], axis=1)
     slope = here.slope[which] * stretch
     curvature = here.information[which] * stretch[:, :, None] * stretch[:, None, :]
     size = np.maximum(np.diagonal(curvature, axis1=1, axis2=2), 1e-8)
@@ -177,9 +187,9 @@ def _steps(here: _Look, coordinates: Coordinates, s: np.ndarray, moving: np.ndar
     return step * np.minimum(1.0, 2.0 / np.maximum(longest, 1e-300))
 
 
-def highest(setup: Setup, likelihood: Likelihood, theta: np.ndarray, precision: np.ndarray) -> tuple[Peak, int]:
+def highest(problem: FitProblem, likelihood: Likelihood, theta: np.ndarray, precision: np.ndarray) -> tuple[Maximum, int]:
     """Maxima climbed to from `points_about`, and which of them is the highest."""
-    peak = climb(likelihood, points_about(setup, theta), precision)
+    peak = maximise(likelihood, points_about(problem, theta), precision)
     if not np.isfinite(peak.cost[peak.best]):
-        raise ValueError(f"{setup.target.name}: the likelihood is not finite anywhere near the fit")
+        raise ValueError(f"{problem.title}: the likelihood is not finite anywhere near the fit")
     return peak, peak.best

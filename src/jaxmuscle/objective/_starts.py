@@ -8,19 +8,50 @@ from scipy.stats import qmc
 from jaxmuscle.data._target import Target
 
 from ._coordinates import Coordinates
-from ._least_squares import Descent
-from ._problem import Setup
+from ._least_squares import Minima
+from ._problem import FitProblem
 
 
-def starting_points(coordinates: Coordinates, target: Target, count: int) -> Float[np.ndarray, "starts free"]:
-    """Starts: harmonic frequencies at the target's local maxima and spread over its band, the rest space-filling.
+def starting_points(problem: FitProblem, count: int) -> Float[np.ndarray, "starts free"]:
+    """Starts: harmonic frequencies at the targets' local maxima and spread over their band, the rest space-filling.
 
-    The first start has all other parameters at their default, the others at half a prior standard deviation about it.
+    The first start has all other parameters at their default, the others at half a prior standard deviation about it. With
+    several frequencies which of their candidates meet is left to chance; `recombined` tries the rest.
     """
+    coordinates = problem.coordinates
     theta = space_filling(len(coordinates.names), count)
-    for name in frequency_names(coordinates):
-        theta[:, coordinates.names.index(name)] = coordinates.theta_of(name, candidate_frequencies(target, count))
+    for number, name in enumerate(frequency_names(coordinates)):
+        frequencies = frequencies_for(problem, name, count)
+        if number:
+            frequencies = np.random.default_rng(number).permutation(frequencies)
+        theta[:, coordinates.names.index(name)] = coordinates.theta_of(name, frequencies)
     return coordinates.from_theta(theta)
+
+
+def frequencies_for(problem: FitProblem, name: str, count: int) -> Float[np.ndarray, " starts"]:
+    """Candidates of the target that a harmonic frequency acts on; of several targets in turn, then over their band."""
+    targets = [part.target for part in problem.acting(name)]
+    if len(problem.parts) == 1:
+        return candidate_frequencies(targets[0], count)
+    each = [candidate_frequencies(target, -(-count // len(targets))) for target in targets]
+    low, high = (edge(target.frequency[i] for target in targets) for edge, i in ((min, 0), (max, -1)))
+    found = np.concatenate([np.stack(each, axis=1).ravel(), np.geomspace(low, high, 2 * count)])
+    _, first = np.unique(np.round(np.log(found), 3), return_index=True)
+    return found[np.sort(first)[:count]]
+
+
+def recombined(problem: FitProblem, theta: Float[np.ndarray, " free"], count: int) -> list[Float[np.ndarray, "starts free"]]:
+    """Where several harmonic frequencies are free: further starts, a point with each of them in turn at its candidates."""
+    coordinates = problem.coordinates
+    names, found = frequency_names(coordinates), []
+    for name in names if len(names) > 1 else ():
+        points = np.tile(theta, (count, 1))
+        points[:, coordinates.names.index(name)] = coordinates.theta_of(name, frequencies_for(problem, name, count))
+        strength = f"harmonic_amplitude@{name.partition('@')[2]}"
+        if strength in coordinates.names:  # else a harmonic that had vanished would stay so
+            points[:, coordinates.names.index(strength)] = 0.0
+        found.append(coordinates.from_theta(points))
+    return found
 
 
 def space_filling(size: int, count: int) -> Float[np.ndarray, "count size"]:
@@ -36,33 +67,48 @@ def frequency_names(coordinates: Coordinates) -> list[str]:
     return [name for name in coordinates.names if name.partition("@")[0] == "harmonic_frequency"]
 
 
-def contenders(coordinates: Coordinates, target: Target, descent: Descent, margin: float) -> list[int]:
+def contenders(problem: FitProblem, minima: Minima, margin: float) -> list[int]:
     """The best start, then those whose cost is at most `margin` above it at another harmonic frequency, best first.
 
     Frequencies differ when no nearer than one bin: a Welch peak is two bins wide, so these are different minima. Where
     several are free, one that differs is enough.
     """
-    costs = np.where(np.isfinite(descent.cost), descent.cost, np.inf)
-    chosen = [descent.best]
-    names = frequency_names(coordinates)
+    theta = np.asarray(problem.coordinates.theta(minima.s))
+    return distinct(problem, minima.cost, theta, problem.finest.settings.resolution, margin)
+
+
+def distinct(
+    problem: FitProblem,
+    cost: Float[np.ndarray, " rows"],
+    theta: Float[np.ndarray, "rows free"],
+    width: float,
+    margin: float,
+    most: int | None = None,
+    names: list[str] | None = None,
+) -> list[int]:
+    """The lowest row, then those at most `margin` above it and, in a harmonic frequency, at least `width` from all others.
+
+    `names` of the frequencies, all that are free unless given.
+    """
+    cost = np.where(np.isfinite(cost), cost, np.inf)
+    chosen = [int(np.argmin(cost))]
+    names = frequency_names(problem.coordinates) if names is None else names
     if not names:
         return chosen
-    frequency = np.stack([harmonic_frequencies(coordinates, descent, name) for name in names], axis=1)
-    width = target.settings.rate / target.settings.length
-    for i in np.argsort(costs, kind="stable"):
+    frequency = np.stack([harmonic_frequencies(problem, theta, name) for name in names], axis=1)
+    for i in np.argsort(cost, kind="stable"):
         near = np.min(np.max(np.abs(frequency[i] - frequency[chosen]), axis=1)) < width
-        if costs[i] <= costs[descent.best] + margin and not near:
+        if cost[i] <= cost[chosen[0]] + margin and not near and (most is None or len(chosen) < most):
             chosen.append(int(i))
     return chosen
 
 
 def harmonic_frequencies(
-    coordinates: Coordinates, descent: Descent, name: str = "harmonic_frequency"
-) -> Float[np.ndarray, " starts"]:
-    """Harmonic frequency that each start reached [Hz]."""
-    theta = np.asarray(coordinates.theta(descent.s))
-    column = coordinates.names.index(name)
-    return coordinates.centre[column] * np.exp(coordinates.sd[column] * theta[:, column])
+    problem: FitProblem, theta: Float[np.ndarray, "rows free"], name: str = "harmonic_frequency"
+) -> Float[np.ndarray, " rows"]:
+    """Harmonic frequency of every row [Hz]."""
+    column = problem.coordinates.names.index(name)
+    return problem.coordinates.values_of(theta)[:, column]
 
 
 def candidate_frequencies(target: Target, count: int) -> Float[np.ndarray, " starts"]:
@@ -86,14 +132,13 @@ def candidate_frequencies(target: Target, count: int) -> Float[np.ndarray, " sta
 FREQUENCIES = 32
 
 
-def points_about(setup: Setup, theta: np.ndarray) -> np.ndarray:
-    """A point with the harmonic's frequency as it is and at the target's local maxima and over the band, amplitude free."""
-    names = setup.coordinates.names
-    if "harmonic_frequency" not in names:
-        return theta[None]
-    points = np.tile(theta, (FREQUENCIES, 1))
-    frequencies = candidate_frequencies(setup.target, FREQUENCIES - 1)
-    points[1:, names.index("harmonic_frequency")] = setup.coordinates.theta_of("harmonic_frequency", frequencies)
-    if "harmonic_amplitude" in names:
-        points[1::2, names.index("harmonic_amplitude")] = 0.0
-    return points
+def points_about(problem: FitProblem, theta: np.ndarray) -> np.ndarray:
+    """A point with each harmonic frequency as it is and at its targets' local maxima and over the band, amplitude free."""
+    names, found = problem.coordinates.names, [theta[None]]
+    for name in frequency_names(problem.coordinates):
+        points = np.tile(theta, (FREQUENCIES - 1, 1))
+        points[:, names.index(name)] = problem.coordinates.theta_of(name, frequencies_for(problem, name, FREQUENCIES - 1))
+        amplitudes = [i for i, n in enumerate(names) if n in ("harmonic_amplitude", name.replace("frequency", "amplitude"))]
+        points[np.ix_(range(0, len(points), 2), amplitudes)] = 0.0
+        found.append(points)
+    return np.concatenate(found)

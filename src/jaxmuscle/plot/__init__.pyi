@@ -7,7 +7,6 @@ from ._cohort import cohort as cohort
 from ._comparison import comparison as comparison
 from ._fit import fit as fit
 from ._identifiability import identifiability as identifiability
-from ._joint import joint as joint
 from ._moments import moments as moments
 from ._posterior import chains as chains
 from ._posterior import posterior as posterior

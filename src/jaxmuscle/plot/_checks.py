@@ -19,7 +19,14 @@ PALE = "0.80"
 @styled
 def goodness(found: Any, ax: Axes | None = None) -> Figure | SubFigure:
     """Draws residuals with what is usual in each bin, and the three checks with their reference distributions."""
-    fig = canvas(ax, (7.2, 4.6))
+    fig = canvas(ax, (7.2, 4.6 * len(found.parts)))
+    places = fig.subfigures(len(found.parts), 1, squeeze=False)[:, 0] if len(found.parts) > 1 else [fig]
+    for place, part in zip(places, found.parts.values(), strict=True):
+        _goodness(place, part)
+    return fig
+
+
+def _goodness(fig: Any, found: Any) -> None:
     grid = fig.add_gridspec(2, 3, height_ratios=(1.15, 1.0))
     _residuals(fig.add_subplot(grid[0, :]), found)
     for column, name in enumerate(TITLES):
@@ -27,7 +34,6 @@ def goodness(found: Any, ax: Axes | None = None) -> Figure | SubFigure:
     kind = "Foretold" if found.foretold else "Fitted"
     title = f"{kind}: {found.target.name}, all three checks together p = {found.p_values['all']:.2g}"
     fig.suptitle(title, x=0.01, ha="left", fontsize=9, fontweight="bold", parse_math=False)
-    return fig
 
 
 def _residuals(ax: Axes, found: Any) -> None:
@@ -84,7 +90,7 @@ def bootstrap(found: Any, ax: Axes | None = None) -> Figure | SubFigure:
     """
     names = list(found.quantities)
     if not names:
-        raise ValueError(f"{found.target.name}: fewer than two refits succeeded, so there is nothing to draw")
+        raise ValueError(f"{found.target}: fewer than two refits succeeded, so there is nothing to draw")
     across = min(ACROSS, len(names))
     down = -(-len(names) // across)
     fig = canvas(ax, (WIDTH * across + 0.2, HEIGHT * down + 0.6))
@@ -96,7 +102,7 @@ def bootstrap(found: Any, ax: Axes | None = None) -> Figure | SubFigure:
     handles, labels = axes.flat[0].get_legend_handles_labels()
     fig.legend(handles, labels, loc="outside lower center", ncols=4, frameon=False)
     lost = f", {len(found.failed)} failed" if found.failed else ""
-    fig.suptitle(f"{found.target.name}: {found.replicates - len(found.failed)} refits of data made from the fit{lost}",
+    fig.suptitle(f"{found.target}: {found.replicates - len(found.failed)} refits of data made from the fit{lost}",
                  x=0.01, ha="left", fontsize=9, fontweight="bold", parse_math=False)  # fmt: skip
     return fig
 

@@ -3,7 +3,8 @@
 import math
 import re
 import textwrap
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -36,64 +37,91 @@ def fit(result: Any, ax: Axes | None = None) -> Figure | SubFigure:
     header, notes = _header(result), _notes(result)
     free = {name: estimate for name, estimate in result.parameters.items() if estimate.free}
     rows = 1 + max(len(free), len(result.derived), 1)
-    profile = result.profile is not None
-    heights = [
-        LINE * (len(header) + 0.7),
-        2.35,
-        1.75,
-        *[1.35] * profile,
-        LINE * (rows + 1),
-        *[LINE * len(notes)] * bool(notes),
-    ]
+    panels = _panels(result)
+    text = [LINE * (rows + 1), *[LINE * len(notes)] * bool(notes)]
+    heights = [LINE * (len(header) + 0.7), *(height for height, _ in panels), *text]
     fig = canvas(ax, (WIDTH, sum(heights) + 1.25), w_pad=0.08, h_pad=0.05)
     grid = fig.add_gridspec(len(heights), 2, height_ratios=heights)
     _lines(fig.add_subplot(grid[0, :]), header)
-    _spectra(fig.add_subplot(grid[1, 0]), result, log=False)
-    _spectra(fig.add_subplot(grid[1, 1]), result, log=True)
-    _residuals(fig.add_subplot(grid[2, 0]), result)
-    _stretch(fig.add_subplot(grid[2, 1]), result)
-    _table(fig.add_subplot(grid[3 + profile, 0]), "Fitted parameters", free, rows)
-    _table(fig.add_subplot(grid[3 + profile, 1]), "Derived quantities", result.derived, rows)
+    for row, (_, draw) in enumerate(panels, start=1):
+        for column, panel in enumerate(draw):
+            panel(fig.add_subplot(grid[row, column] if len(draw) > 1 else grid[row, :]))
+    below = 1 + len(panels)
+    _table(fig.add_subplot(grid[below, 0]), "Fitted parameters", free, rows)
+    _table(fig.add_subplot(grid[below, 1]), "Derived quantities", result.derived, rows)
     if notes:
-        _lines(fig.add_subplot(grid[4 + profile, :]), notes)
-    if profile:
-        _profile(fig.add_subplot(grid[3, :]), result)
+        _lines(fig.add_subplot(grid[below + 1, :]), notes)
     return fig
 
 
+Panel = Callable[[Axes], None]
+
+
+def _panels(result: Any) -> list[tuple[float, tuple[Panel, ...]]]:
+    """Rows of panels with their heights: of one target in full, of several one row each."""
+    if len(result.parts) > 1:
+        return [(1.9, (partial(_spectra, part=part, log=True, title=f"{name}: {type(part.task).__name__}"),
+                       partial(_residuals, part=part))) for name, part in result.parts.items()]  # fmt: skip
+    part = result.only
+    rows: list[tuple[float, tuple[Panel, ...]]] = [
+        (2.35, (partial(_spectra, part=part, log=False), partial(_spectra, part=part, log=True))),
+        (1.75, (partial(_residuals, part=part), partial(_stretch, part=part))),
+    ]
+    return rows if result.profile is None else [*rows, (1.35, (partial(_profile, result=result),))]
+
+
 def _header(result: Any) -> list[_Line]:
-    aim = result.target
-    facts = [f"{type(result.task).__name__} ({type(result.task.noise).__name__})", result.method]
-    if result.chi2_per_bin is not None:
-        facts.append(f"χ² per bin {result.chi2_per_bin:.2f}")
-    elif result.rms_log_error is not None:
-        facts.append("no χ² (spread unknown)")
-    if result.rms_log_error is not None:
-        facts.append(f"rms log error {result.rms_log_error:.2f}")
-    facts.append(f"{len(result.starts)} starts" + ("" if result.seed is None else f", seed {result.seed}"))
+    several = len(result.parts) > 1
+    title = ", ".join(result.parts) if several else result.target.name
+    lines = [(title if len(title) <= 60 else f"{title[:59]}…", {"size": 11, "weight": "bold"})]
+    for name, part in result.parts.items():
+        lines += _about(name if several else "", part)
+    facts = [*_closeness(result.only)] if not several else []
+    facts += [f"{len(result.starts)} starts" + ("" if result.seed is None else f", seed {result.seed}")]
+    model = [] if several else [f"{type(result.task).__name__} ({type(result.task.noise).__name__})", result.method]
+    lines += _wrapped("  ·  ".join([*model, *facts]))
     verdict, colour = ("Converged", DARK_GREEN) if result.success else ("Did not converge", VERMILLION)
-    lines = [(aim.name if len(aim.name) <= 60 else f"{aim.name[:59]}…", {"size": 11, "weight": "bold"})]
-    if aim.provenance == "reconstructed":
-        told = f"RECONSTRUCTED, not measured: {aim.reason}"
-        lines += _wrapped(told, color=VERMILLION, weight="bold")
-    else:
-        lines += _wrapped(f"{_ORIGIN[aim.provenance]} {aim.quantity}: {aim.source}", most=2, color=GREY)
-    lines += _wrapped("  ·  ".join(facts))
     lines += _wrapped(f"{verdict}: {result.message}", color=colour)
+    reasons = [part.target.reason for part in result.parts.values() if part.target.provenance == "reconstructed"]
     for notice in result.notices:
-        if not (aim.provenance == "reconstructed" and aim.reason in notice):
+        if not any(reason in notice for reason in reasons):
             lines += _wrapped(f"Note: {notice}", most=3)
     return lines
+
+
+def _about(name: str, part: Any) -> list[_Line]:
+    """Where a target comes from; of several (each with its `name`) also its model and how close the fit is."""
+    aim = part.target
+    if name:
+        model = f"{type(part.task).__name__} ({type(part.task.noise).__name__})"
+        known = f"{name}: {aim.name} ({aim.provenance} {aim.quantity})"
+        lines = _wrapped("  ·  ".join([known, model, *_closeness(part)]))
+    else:
+        lines = _wrapped(f"{_ORIGIN.get(aim.provenance, '')} {aim.quantity}: {aim.source}", most=2, color=GREY)
+    if aim.provenance != "reconstructed":
+        return lines
+    told = _wrapped(f"RECONSTRUCTED, not measured: {aim.reason}", color=VERMILLION, weight="bold")
+    return [*told, *(lines if name else [])]
+
+
+def _closeness(part: Any) -> list[str]:
+    facts = []
+    if part.chi2_per_bin is not None:
+        facts.append(f"χ² per bin {part.chi2_per_bin:.2f}")
+    elif part.rms_log_error is not None:
+        facts.append("no χ² (spread unknown)")
+    return facts + ([] if part.rms_log_error is None else [f"rms log error {part.rms_log_error:.2f}"])
 
 
 def _notes(result: Any) -> list[_Line]:
     """What was checked, and what the data do not determine, one bullet for each direction."""
     lines: list[_Line] = []
     for sentence in result.remarks:
-        lines += _wrapped(sentence[0].upper() + sentence[1:])
+        lines += _wrapped(sentence[0].upper() + sentence[1:] if len(result.parts) == 1 else sentence)
     if not result.undetermined:
         return lines
-    lines += [("What the data do not determine", {"weight": "bold"})]
+    whose = "the data" if len(result.parts) == 1 else "all targets together"
+    lines += [(f"What {whose} do not determine", {"weight": "bold"})]
     for sentence in result.undetermined:
         lines += _wrapped(sentence, first="•  ", rest="    ")
     return lines
@@ -123,36 +151,39 @@ def _text(ax: Axes, x: float, y: float, text: str, **style: Any) -> None:
     ax.text(x, y, text, va="center", parse_math=False, **style).set_in_layout(False)
 
 
-def _spectra(ax: Axes, result: Any, *, log: bool) -> None:
-    frequency, fitted = np.asarray(result.frequency_hz), np.asarray(result.fitted)
-    target(result.target, ax, log=log)
+def _spectra(ax: Axes, part: Any, *, log: bool, title: str = "") -> None:
+    frequency, fitted = np.asarray(part.frequency_hz), np.asarray(part.fitted)
+    target(part.target, ax, log=log)
     dots = ax.lines[0]
-    dots.set_label("target, reconstructed" if result.target.provenance == "reconstructed" else "target")
+    dots.set_label("target, reconstructed" if part.target.provenance == "reconstructed" else "target")
     if np.isfinite(fitted).any():
         dots.set_linewidth(0.0)
         ax.plot(frequency, fitted, color=BLUE, label="fit", zorder=4)
-        _harmonic(ax, result, frequency, fitted)
-    ax.set_title("Logarithmic" if log else "Linear")
+        _harmonic(ax, part, frequency, fitted)
+    ax.set_title(title or ("Logarithmic" if log else "Linear"), parse_math=False)
     if log:
         ax.set_xlim(frequency[frequency > 0][0] / 1.15, frequency[-1] * 1.15)
-        _log_limits(ax, result, fitted)
-        ax.legend().remove()  # the other panel's says it
+        _log_limits(ax, part, fitted)
+        if title:
+            legend(ax, "lower left")
+        else:
+            ax.legend().remove()  # the other panel's says it
     else:
         ax.set(xlim=(0, frequency[-1] + frequency[0]), ylim=(0, None))
         legend(ax, "upper right")
 
 
-def _log_limits(ax: Axes, result: Any, fitted: Any) -> None:
-    band = result.target.sampling_band()
-    seen = np.concatenate([result.target.proportional_power, fitted, *(band or ())])
+def _log_limits(ax: Axes, part: Any, fitted: Any) -> None:
+    band = part.target.sampling_band()
+    seen = np.concatenate([part.target.proportional_power, fitted, *(band or ())])
     seen = seen[np.isfinite(seen) & (seen > 0)]
     ax.set_ylim(seen.min() / 1.4, seen.max() * 1.4)
 
 
-def _harmonic(ax: Axes, result: Any, frequency: Any, fitted: Any) -> None:
+def _harmonic(ax: Axes, part: Any, frequency: Any, fitted: Any) -> None:
     """The harmonic's part of the fitted power, and its frequency."""
-    share = np.asarray(result.harmonic_share)
-    total, where = float(np.sum(fitted * share)), float(result.task["harmonic_frequency"])
+    share = np.asarray(part.harmonic_share)
+    total, where = float(np.sum(fitted * share)), float(part.task["harmonic_frequency"])
     if not (math.isfinite(total) and total > 0):
         return
     percent = "<0.1" if total < 1e-3 else f"{100 * total:.2g}"
@@ -167,10 +198,10 @@ def _harmonic(ax: Axes, result: Any, frequency: Any, fitted: Any) -> None:
         ax.axvline(where, color=ORANGE, lw=0.8, ls=(0, (4, 2)), zorder=0)
 
 
-def _residuals(ax: Axes, result: Any) -> None:
+def _residuals(ax: Axes, part: Any) -> None:
     """Bars, with the range that one and two standard deviations cover if these are known."""
-    frequency, residual = np.asarray(result.frequency_hz), np.asarray(result.residual)
-    known = result.deviation is not None
+    frequency, residual = np.asarray(part.frequency_hz), np.asarray(part.residual)
+    known = part.deviation is not None
     outside = np.abs(residual) > 2 if known else np.zeros(residual.shape, bool)
     width = 0.7 * np.min(np.diff(frequency), initial=math.inf)
     bars = {"width": width if math.isfinite(width) else 0.1, "zorder": 3}
@@ -187,13 +218,13 @@ def _residuals(ax: Axes, result: Any) -> None:
     ax.axhline(0, color=BLACK, lw=0.6, zorder=4)
 
 
-def _stretch(ax: Axes, result: Any) -> None:
-    task = result.task
-    time, output = map(np.asarray, result.stretch or ((), ()))
+def _stretch(ax: Axes, part: Any) -> None:
+    task = part.task
+    time, output = map(np.asarray, part.stretch or ((), ()))
     ax.set(xlabel="Time (s)", ylabel=output_label(task.output_name, task.output_unit))
     ax.set_title("Simulated output, one noise path")
-    if result.settings.get("check_seeds") == 0:
-        _say(ax, "not simulated: fitted together with others", color=GREY)
+    if not output.size and np.isfinite(part.fitted).all():
+        _say(ax, "not simulated", color=GREY)
         return
     if output.size < 2 or not np.isfinite(output).all():
         _say(ax, "no finite simulation")
@@ -233,7 +264,7 @@ def _table(ax: Axes, title: str, estimates: Mapping[str, Any], rows: int) -> Non
         _text(ax, 0.0, 1.6, "none", color=GREY, size=FONT)
     for i, (name, estimate) in enumerate(estimates.items()):
         style = {"size": FONT - 0.5, "color": BLACK if estimate.identifiable else GREY}
-        _text(ax, 0.0, 1.6 + i, name if len(name) <= 24 else f"{name[:12]}…{name[-8:]}", **style)
+        _text(ax, 0.0, 1.6 + i, name if len(name) <= 24 else f"{name[:11]}…{name[-9:]}", **style)
         _row(ax, 1.6 + i, quantity(estimate), **style)
 
 

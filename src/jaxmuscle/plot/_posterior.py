@@ -19,7 +19,10 @@ MASS = (0.95, 0.8, 0.5)
 
 def chosen(found: Any) -> list[str]:
     """What a corner figure shows: the quantities that the data determine, and the harmonic's frequency."""
-    names = [n for n in ORDER if n in found.quantities and (n in found.determined or n == "harmonic_frequency")]
+    told = {n: n.partition("@")[0] for n in found.quantities}
+    free = {n for n in found.samples if told[n] == "harmonic_frequency"}
+    names = [n for n, base in told.items() if base in ORDER and (n in found.determined or n in free)]
+    names.sort(key=lambda n: ORDER.index(told[n]))
     more = [n for n in found.quantities if n in found.determined and n not in names]
     return (names + more)[:MOST]
 
@@ -31,10 +34,10 @@ def posterior(found: Any, ax: Axes | None = None) -> Figure | SubFigure:
     **Raises:** `NotMixedError` if the chains did not mix; `ValueError` if the data determine nothing.
     """
     if not found.success:
-        raise NotMixedError(f"{found.target.name}: {found.message}")
+        raise NotMixedError(f"{found.title}: {found.message}")
     names = chosen(found)
     if not names:
-        raise ValueError(f"{found.target.name}: the data determine no quantity, so there is nothing to draw")
+        raise ValueError(f"{found.title}: the data determine no quantity, so there is nothing to draw")
     count = len(names)
     draws = [found.quantities[name].ravel() for name in names]
     limits = [np.quantile(x, CUT) for x in draws]
@@ -60,8 +63,7 @@ def posterior(found: Any, ax: Axes | None = None) -> Figure | SubFigure:
             if j == 0 and i > 0:
                 panel.set_ylabel(_label(found, names[i]))
     fig.align_labels()
-    kind = f"{type(found.task).__name__}, {type(found.task.noise).__name__}"
-    fig.suptitle(f"Posterior: {found.target.name} ({kind})", x=0.01, ha="left", fontsize=9, fontweight="bold")
+    fig.suptitle(f"Posterior: {found.title} ({found.model})", x=0.01, ha="left", fontsize=9, fontweight="bold")
     return fig
 
 
@@ -96,22 +98,26 @@ def _pair(ax: Axes, x: np.ndarray, y: np.ndarray, wide: np.ndarray, high: np.nda
 
 
 @styled
-def predictive(found: Any, ax: Axes | None = None) -> Axes:
-    """Draws the target among spectra that the posterior `found` predicts. **Raises:** `NotMixedError`."""
+def predictive(found: Any, ax: Axes | None = None, target: str | None = None) -> Axes:
+    """Draws the target among spectra that the posterior `found` predicts; of several, the named one.
+
+    **Raises:** `NotMixedError`.
+    """
     if not found.success:
-        raise NotMixedError(f"{found.target.name}: {found.message}")
+        raise NotMixedError(f"{found.title}: {found.message}")
+    part = found.only if target is None else found.parts[target]
     ax = axes_or_new(ax)
-    f = np.asarray(found.target.frequency)
-    power = found.replicates.power.reshape(-1, len(f))
-    expected = found.replicates.expected.reshape(-1, len(f))
+    f = np.asarray(part.target.frequency)
+    power = part.replicates.power.reshape(-1, len(f))
+    expected = part.replicates.expected.reshape(-1, len(f))
     for low, high, alpha in BANDS:
         label = f"predicted, {100 * (high - low):.0f} %"
         ax.fill_between(f, *np.quantile(power, (low, high), axis=0), color=SKY, alpha=alpha + 0.1, lw=0, label=label)
     ax.plot(f, np.median(expected, axis=0), color=BLUE, lw=1.2, label="model, median")
-    ax.plot(f, np.asarray(found.target.proportional_power), color=VERMILLION, marker="o", ms=3, lw=0, label="target")
+    ax.plot(f, np.asarray(part.target.proportional_power), color=VERMILLION, marker="o", ms=3, lw=0, label="target")
     ax.set_yscale("log")
     ax.set(xlabel="Frequency (Hz)", ylabel=PROPORTIONAL, xlim=(0, f[-1] + f[0]))
-    ax.set_title(f"{found.target.name}: posterior-predictive χ², p = {found.replicates.p_value:.2g}")
+    ax.set_title(f"{part.target.name}: posterior-predictive χ², p = {part.replicates.p_value:.2g}")
     ax.legend(frameon=False, ncols=2)
     return ax
 
@@ -136,5 +142,5 @@ def chains(found: Any, ax: Axes | None = None) -> Figure | SubFigure:
     if not found.success:
         fig.suptitle(f"NOT MIXED: {found.message}", x=0.01, ha="left", fontsize=7.5, color=VERMILLION, wrap=True)
     else:
-        fig.suptitle(f"{found.target.name}: chains", x=0.01, ha="left", fontsize=9, fontweight="bold")
+        fig.suptitle(f"{found.title}: chains", x=0.01, ha="left", fontsize=9, fontweight="bold")
     return fig

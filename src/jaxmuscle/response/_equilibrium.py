@@ -58,8 +58,12 @@ def jacobian(task: AbstractTask, y: Float[Array, " states"], time: float = HOLD)
 
 def slowest_rate(task: AbstractTask, time: float = HOLD) -> Float[Array, ""]:
     """Smallest |eigenvalue| [1/s] at the operating point; differentiable."""
-    eigenvalues = jnp.linalg.eigvals(jacobian(task, equilibrium(task, time), time))
-    return jnp.min(jnp.abs(eigenvalues))
+    return slowest(jacobian(task, equilibrium(task, time), time))
+
+
+def slowest(system: Float[Array, "states states"]) -> Float[Array, ""]:
+    """Smallest |eigenvalue| of a Jacobian."""
+    return jnp.min(jnp.abs(jnp.linalg.eigvals(system)))
 
 
 def operating_point(task: AbstractTask, time: float = HOLD) -> tuple[np.ndarray, np.ndarray]:

@@ -18,6 +18,7 @@ from jaxmuscle.spectra._bin_law import bin_rows
 from jaxmuscle.spectra._settings import LONGEST, WINDOW, SpectrumSettings, samples_in
 from jaxmuscle.spectra._welch import Spectrum
 
+from ._equilibrium import slowest
 from ._harmonic_line import harmonic_line
 from ._linearised import Linearisation, check_equilibrium, linearise
 
@@ -27,13 +28,15 @@ TAIL = 1e-13
 class Moments(NamedTuple):
     """What a fit compares: Welch power per bin, that of the harmonic alone, mean and variance of a recording.
 
-    The variance is that of the low-passed output, as a recording's: what lies above the low-pass is not in it.
+    The variance is that of the low-passed output, as a recording's: what lies above the low-pass is not in it. `rate` is
+    the slowest of the operating point [1/s], where that was computed.
     """
 
     power: Float[Array | np.ndarray, " bins"]
     line: Float[Array | np.ndarray, " bins"]
     mean: Float[Array | np.ndarray, ""]
     variance: Float[Array | np.ndarray, ""]
+    rate: Float[Array | np.ndarray, ""] | float = np.nan
 
     @property
     def proportional(self) -> Float[Array | np.ndarray, " bins"]:
@@ -220,7 +223,7 @@ def response(
     system = linearise(task)
     noise, variance = noise_response(task, system, settings, samples)
     line, swing = harmonic_line(task, system, settings, window, samples)
-    return Moments(noise + line, line, system.rest, variance + swing), system
+    return Moments(noise + line, line, system.rest, variance + swing, slowest(system.A)), system
 
 
 _compiled_response = eqx.filter_jit(response)

@@ -49,14 +49,14 @@ def _strong(tree: Any) -> Any:
 
 
 @eqx.filter_jit
-def _first(marginal: Density, positions: Array) -> Any:
+def _first(density: Density, positions: Array) -> Any:
     nuts, (start, _, _) = _tools()
-    made = _State(jax.vmap(lambda x: nuts.init(x, marginal.log_density))(positions), start(jnp.asarray(0.5)))
+    made = _State(jax.vmap(lambda x: nuts.init(x, density.log_density))(positions), start(jnp.asarray(0.5)))
     return _strong(made)
 
 
 @eqx.filter_jit
-def _block(marginal: Density, key: Array, state: Any, adapting: Array) -> tuple[Any, Any]:
+def _block(density: Density, key: Array, state: Any, adapting: Array) -> tuple[Any, Any]:
     """`BLOCK` draws of every chain; while `adapting` the step size follows the mean acceptance of all chains."""
     nuts, (_, update, final) = _tools()
     kernel = nuts.build_kernel()
@@ -65,9 +65,9 @@ def _block(marginal: Density, key: Array, state: Any, adapting: Array) -> tuple[
     def one(state, key):
         size = jnp.where(adapting, jnp.exp(state.adaptation.log_step_size), settled)
         keys = jax.random.split(key, len(state.chains.logdensity))
-        metric = jnp.ones(marginal.size)
+        metric = jnp.ones(density.size)
         chains, info = jax.vmap(
-            lambda key, chain: kernel(key, chain, marginal.log_density, size, metric, max_num_doublings=DOUBLINGS)
+            lambda key, chain: kernel(key, chain, density.log_density, size, metric, max_num_doublings=DOUBLINGS)
         )(keys, state.chains)
         learnt = update(state.adaptation, jnp.mean(info.acceptance_rate))
         adaptation = jax.tree.map(lambda new, old: jnp.where(adapting, new, old), learnt, state.adaptation)
@@ -78,13 +78,13 @@ def _block(marginal: Density, key: Array, state: Any, adapting: Array) -> tuple[
     return _strong(state), made
 
 
-def _learnt(marginal: Density, white: np.ndarray) -> Density:
+def _learnt(density: Density, white: np.ndarray) -> Density:
     """Whitened anew by the covariance of draws, the old metric counting as `SHRINK` of them."""
     count = len(white)
     covariance = (count * np.cov(white.T, bias=True) + SHRINK * np.eye(white.shape[1])) / (count + SHRINK)
-    scale = np.asarray(marginal.scale) @ np.linalg.cholesky(covariance)
-    centre = np.asarray(marginal.centre) + np.asarray(marginal.scale) @ white.mean(axis=0)
-    return eqx.tree_at(lambda m: (m.centre, m.scale), marginal, (centre, scale))
+    scale = np.asarray(density.scale) @ np.linalg.cholesky(covariance)
+    centre = np.asarray(density.centre) + np.asarray(density.scale) @ white.mean(axis=0)
+    return eqx.tree_at(lambda m: (m.centre, m.scale), density, (centre, scale))
 
 
 def _moved(old: Density, new: Density, white: Array) -> np.ndarray:
@@ -93,53 +93,53 @@ def _moved(old: Density, new: Density, white: Array) -> np.ndarray:
 
 
 def sample(
-    marginal: Density, key: Array, chains: int, draws: int, warmup: int, tell: Callable[[str, float], None]
+    density: Density, key: Array, chains: int, draws: int, warmup: int, tell: Callable[[str, float], None]
 ) -> tuple[Chains, Density]:
     """Chains from dispersed starts, and the density whitened as they were drawn.
 
     `warmup` is rounded up to blocks. Needs double precision. Raises `ValueError` if no start has a finite density.
     """
     with jax.numpy_dtype_promotion("standard"):
-        return _sample(marginal, key, chains, draws, warmup, tell)
+        return _sample(density, key, chains, draws, warmup, tell)
 
 
 def _sample(
-    marginal: Density, key: Array, chains: int, draws: int, warmup: int, tell: Callable[[str, float], None]
+    density: Density, key: Array, chains: int, draws: int, warmup: int, tell: Callable[[str, float], None]
 ) -> tuple[Chains, Density]:
     tell("compiling the sampler", 0.0)
     blocks = max(len(ADAPTATIONS), -(-warmup // BLOCK))
     shares = np.cumsum(ADAPTATIONS) / sum(ADAPTATIONS)
     renewals = {max(1, round(blocks * share)) for share in shares[:-1]}
     total = blocks + -(-draws // BLOCK)
-    state = _first(marginal, _dispersed(marginal, jax.random.fold_in(key, 0), chains))
+    state = _first(density, _dispersed(density, jax.random.fold_in(key, 0), chains))
     recent: list[np.ndarray] = []
     kept: list[Any] = []
     for number in range(total):
         adapting = number < blocks
-        state, made = _block(marginal, jax.random.fold_in(key, number + 1), state, jnp.asarray(adapting))
+        state, made = _block(density, jax.random.fold_in(key, number + 1), state, jnp.asarray(adapting))
         white = np.asarray(made[0])
         if not adapting:
-            both = np.asarray(marginal.centre) + white @ np.asarray(marginal.scale).T
+            both = np.asarray(density.centre) + white @ np.asarray(density.scale).T
             kept.append((both, *map(np.asarray, made[1:])))
         elif number + 1 in renewals:
             recent.append(white)
-            new = _learnt(marginal, np.concatenate(recent[-2:]).reshape(-1, white.shape[-1]))
-            state = _first(new, jnp.asarray(_moved(marginal, new, state.chains.position)))
-            marginal, recent = new, []
+            new = _learnt(density, np.concatenate(recent[-2:]).reshape(-1, white.shape[-1]))
+            state = _first(new, jnp.asarray(_moved(density, new, state.chains.position)))
+            density, recent = new, []
         else:
             recent.append(white)
         text = "warming up" if adapting else f"drawing, block {number + 1 - blocks} of {total - blocks}"
         tell(text, (number + 1) / total)
     parts = [np.concatenate([part[i] for part in kept])[:draws] for i in range(6)]
-    s, density, acceptance, steps, diverging = (np.swapaxes(part, 0, 1) for part in parts[:5])
-    return Chains(s, density, acceptance, steps, diverging, float(parts[5][-1])), marginal
+    s, height, acceptance, steps, diverging = (np.swapaxes(part, 0, 1) for part in parts[:5])
+    return Chains(s, height, acceptance, steps, diverging, float(parts[5][-1])), density
 
 
-def _dispersed(marginal: Density, key: Array, chains: int) -> Array:
+def _dispersed(density: Density, key: Array, chains: int) -> Array:
     """Starts about the maximum, wider than the posterior; nearer where the density is not finite."""
-    away = SPREAD * jax.random.normal(key, (chains, marginal.size))
+    away = SPREAD * jax.random.normal(key, (chains, density.size))
     for _ in range(6):
-        height = _first(marginal, away).chains.logdensity
+        height = _first(density, away).chains.logdensity
         if bool(jnp.all(jnp.isfinite(height))):
             return away
         away = jnp.where(jnp.isfinite(height)[:, None], away, 0.5 * away)

@@ -4,16 +4,17 @@ import dataclasses
 from typing import Any
 
 import equinox as eqx
-import jax
 import numpy as np
 from jaxtyping import Float
 
+from jaxmuscle._common.text import choices
 from jaxmuscle.data._target import Target
 from jaxmuscle.model._tasks import AbstractTask, Isometric, PrescribedForce
-from jaxmuscle.objective._consequences import Seen, seen_at
+from jaxmuscle.objective._consequences import Expansion, expand
 from jaxmuscle.objective._coordinates import Coordinates
-from jaxmuscle.objective._likelihood import Likelihood
-from jaxmuscle.objective._problem import Setup, target_variation
+from jaxmuscle.objective._likelihood import Likelihood, check_known, without_offsets
+from jaxmuscle.objective._problem import FitProblem, Part, target_variation
+from jaxmuscle.response._expected import Moments
 from jaxmuscle.response._linearised import has_response
 from jaxmuscle.spectra._settings import SpectrumSettings
 
@@ -21,6 +22,7 @@ AMPLITUDES = ("noise_K_w", "noise_K_z", "noise_C_w", "noise_C_z", "harmonic_ampl
 MEAN_ERROR = 0.02
 LEVELS = (2.0, 0.5)
 INPUTS = ("P_w", "F_ext", "x_z")
+FORCES = ("P_w", "F_ext")
 LONGER = 10
 MOST_VARIATION = 1e3
 VAGUE = 1e-6  # prior precision of what is separate
@@ -42,6 +44,7 @@ class Design(eqx.Module):
     - `coefficient_of_variation`: whether that of its output is measured.
     - `mean`: relative standard error with which the mean output is measured, 0.02 say; None if it is not.
     - `separate`: names of free parameters that have another value in this measurement, of which nothing is known before.
+    - `target`: of a fit with several targets, the one whose task, segments and settings it takes over; the first by default.
 
     **Raises:** `ValueError` for a measurement of nothing, segments below 0, a `mean` that is not positive.
     """
@@ -53,6 +56,7 @@ class Design(eqx.Module):
     coefficient_of_variation: bool = eqx.field(static=True, default=False, kw_only=True)
     mean: float | None = eqx.field(static=True, default=None, kw_only=True)
     separate: tuple[str, ...] = eqx.field(static=True, default=(), kw_only=True)
+    target: str | None = eqx.field(static=True, default=None, kw_only=True)
 
     def __check_init__(self):
         if any(k < 0 for k in self.counts):
@@ -72,24 +76,34 @@ class Design(eqx.Module):
         """Whether it gives a spectrum."""
         return self.segments is None or sum(self.counts) > 0
 
-    def told(self, setup: Setup) -> tuple[str, str]:
+    def told(self, problem: FitProblem) -> tuple[str, str]:
         """Task and data in words."""
-        data = []
+        data, like = [], self.like(problem)
         if self.spectral:
-            data.append(_spectrum_in_words(self.counts or segments_of(setup.target)))
+            data.append(_spectrum_in_words(self.counts or segments_of(like.target)))
         data += ["coefficient of variation"] if self.coefficient_of_variation else []
         data += [] if self.mean is None else [f"mean to {100 * self.mean:.2g} %"]
-        return _task_in_words(setup.task if self.task is None else self.task), ", ".join(data)
+        return _task_in_words(like.task if self.task is None else self.task), ", ".join(data)
+
+    def like(self, problem: FitProblem) -> Part:
+        """The part of a fit that it resembles. Raises `ValueError` for an unknown target."""
+        names = [part.name for part in problem.parts]
+        if self.target is not None and self.target not in names:
+            raise ValueError(f"{self.name}: target: the fit has none called {self.target!r}: {choices(self.target, names)}")
+        return problem.parts[0 if self.target is None else names.index(self.target)]
 
 
-def told_data(setup: Setup) -> tuple[str, str]:
-    """Task and data of a fit in words."""
-    target, (variation, mean) = setup.target, setup.extra
-    data = [
-        f"{len(target.bins)} bins with a stated sigma" if target.segments is None else _spectrum_in_words(target.segments)
-    ]
-    data += ["coefficient of variation"] * (variation is not None) + ["mean"] * (mean is not None)
-    return _task_in_words(setup.task), ", ".join(data)
+def told_data(problem: FitProblem) -> tuple[str, str]:
+    """Tasks and data of a fit in words."""
+    tasks, told = [], []
+    for part in problem.parts:
+        segments = part.target.segments
+        data = [f"{len(part.target.bins)} bins with a stated sigma" if segments is None else _spectrum_in_words(segments)]
+        data += ["coefficient of variation"] * (part.variation is not None) + ["mean"] * (part.mean is not None)
+        whose = f"{part.name}: " if len(problem.parts) > 1 else ""
+        tasks.append(whose + _task_in_words(part.task))
+        told.append(whose + ", ".join(data))
+    return "; ".join(tasks), "; ".join(told)
 
 
 def _task_in_words(task: AbstractTask) -> str:
@@ -108,27 +122,53 @@ def segments_of(target: Target) -> tuple[int, ...]:
     """A target's segments; where it states only a sigma, as many as scatter like its median bin."""
     if target.segments is not None:
         return target.segments
-    if target.sigma is None:
-        raise ValueError(f"{target.name}: states neither segments nor sigma, so nothing says how much it scatters: give "
-                         "segments, the number of Welch segments that were averaged")  # fmt: skip
+    check_known(target)
     relative = float(np.median(target.sigma / target.proportional_power))
     one = target.settings.degrees_of_freedom(1000) / 1000
     return (max(1, round(2 / relative**2 / one)),)
 
 
-def designs_for(setup: Setup, mean: float) -> tuple[Design, ...]:
-    """What else could be measured of the person whose fit has this setup, its task being the fitted one.
+def designs_for(problem: FitProblem, seen: Expansion) -> tuple[Design, ...]:
+    """What else could be measured of the person whose fit this is, its tasks being the fitted ones.
 
-    `mean` is the expected output. At another force level the amplitudes of noise and harmonic have values of their own
-    (people's variation is not proportional to force), all else of the muscle is as before. The displacement is that under
-    the load which the sensor had held, so that the operating point stays, and the perturbations with it.
+    At another force level the amplitudes of noise and harmonic have values of their own (people's variation is not
+    proportional to force), all else of the muscle is as before: twice the highest and half the lowest of the fit's. The
+    displacement is that under the load which the sensor had held, so that the operating point stays, and the perturbations
+    with it.
     """
-    task, own = setup.task, setup.extra
-    varying = own[0] is not None
+    levels = [_level_of(part.task) for part in problem.parts]
+    factors = [
+        tuple(f for f, extreme in zip(LEVELS, (max, min), strict=True) if level == extreme(levels)) for level in levels
+    ]
     designs = []
-    if not varying and abs(mean) > 0:
+    for part, moments, own in zip(problem.parts, seen.moments, factors, strict=True):
+        made = _designs_for(part, moments, own, _amplitudes(problem, part))
+        if len(problem.parts) > 1:
+            made = [dataclasses.replace(d, name=f"{d.name} ({part.name})", target=part.name) for d in made]
+        designs += made
+    return tuple(designs)
+
+
+def _level_of(task: AbstractTask) -> float:
+    """The first force that moves a task, 0 without one."""
+    return next((abs(float(task[n])) for n in FORCES if n in task.parameter_names and float(task[n]) != 0), 0.0)
+
+
+def _amplitudes(problem: FitProblem, part: Part) -> tuple[str, ...]:
+    """Free amplitudes of a part's noise and harmonic, by their names in the fit."""
+    own = dict(zip(part.coordinates.names, part.columns, strict=True))
+    return tuple(problem.coordinates.names[own[name]] for name in AMPLITUDES if name in own)
+
+
+def _designs_for(part: Part, moments: Moments, factors: tuple[float, ...], separate: tuple[str, ...]) -> list[Design]:
+    """Of one target: what it does not state, the other output, other force levels, a longer recording."""
+    task, mean = part.task, float(moments.mean)
+    steady = float(np.sqrt(moments.variance)) < MOST_VARIATION * abs(mean)
+    varying = part.variation is not None
+    designs = []
+    if not varying and steady:
         designs.append(Design("the coefficient of variation", segments=0, coefficient_of_variation=True))
-    if own[1] is None and abs(mean) > 0:
+    if part.mean is None and steady:
         what = "displacement" if task.output_unit == "m" else "force"
         designs.append(Design(f"the mean {what}, known to {100 * MEAN_ERROR:g} %", segments=0, mean=MEAN_ERROR))
     if isinstance(task, Isometric):
@@ -137,54 +177,56 @@ def designs_for(setup: Setup, mean: float) -> tuple[Design, ...]:
     if isinstance(task, PrescribedForce):
         fixed = task.as_task(Isometric, P_w=task.P_w)
         designs.append(Design("the force with the insertion held", fixed, coefficient_of_variation=True))
-    forces = {n: float(task[n]) for n in ("P_w", "F_ext") if n in task.parameter_names and float(task[n]) != 0}
+    forces = {n: float(task[n]) for n in FORCES if n in task.parameter_names and float(task[n]) != 0}
     if forces:
         first, level = next(iter(forces.items()))
-        for factor in LEVELS:
+        for factor in factors:
             name = f"a second force level at {first} = {factor * level:.3g} N"
             moved = task.replace(**{n: factor * v for n, v in forces.items()})
-            amplitudes = tuple(n for n in AMPLITUDES if n in setup.coordinates.names)
-            designs.append(Design(name, moved, coefficient_of_variation=varying, separate=amplitudes))
-    more = tuple((LONGER - 1) * k for k in segments_of(setup.target))
-    longer = Design(f"a recording {LONGER} times as long", segments=more, coefficient_of_variation=varying)
-    return (*designs, longer)
+            designs.append(Design(name, moved, coefficient_of_variation=varying, separate=separate))
+    more = tuple((LONGER - 1) * k for k in segments_of(part.target))
+    designs.append(Design(f"a recording {LONGER} times as long", segments=more, coefficient_of_variation=varying))
+    return designs
 
 
-def seen_here(setup: Setup, theta: Float[np.ndarray, " free"]) -> Seen:
-    """The model's moments at θ and their slopes; without further residuals, so that designs of a task share a program."""
-    problem = dataclasses.replace(setup, extra=(None, None)).linear()
-    return jax.tree.map(lambda x: np.asarray(x)[0], seen_at(problem, theta[None]))
+def without_further(problem: FitProblem) -> FitProblem:
+    """The problem without coefficients of variation and means as data."""
+    parts = tuple(dataclasses.replace(part, variation=None, mean=None) for part in problem.parts)
+    return dataclasses.replace(problem, parts=parts)
 
 
-def without_offset(information: Float[np.ndarray, "all all"]) -> Float[np.ndarray, "free free"]:
-    """Fisher information of θ where the offset, the last coordinate, is unknown: its Schur complement."""
-    inner, cross, own = information[:-1, :-1], information[:-1, -1], information[-1, -1]
-    return inner - np.outer(cross, cross) / own if own > 0 else inner
+def seen_here(problem: FitProblem, theta: Float[np.ndarray, " free"]) -> Expansion:
+    """What the model gives at θ, and its slopes."""
+    return expand(without_further(problem).linear(), theta[None]).row(0)
 
 
-def information_of(setup: Setup, seen: Seen) -> Float[np.ndarray, "free free"]:
-    """Fisher information of θ in a setup's data, at the θ where its model was seen."""
-    return without_offset(np.asarray(Likelihood.of(setup).information(seen)))
+def information_of(problem: FitProblem, seen: Expansion) -> Float[np.ndarray, "free free"]:
+    """Fisher information of θ in a fit's data, at the θ where its model was seen."""
+    return without_offsets(np.asarray(Likelihood.of(problem).information(seen)), len(seen.theta))
 
 
-def design_information(setup: Setup, theta: Float[np.ndarray, " free"], design: Design) -> Float[np.ndarray, "free free"]:
+def design_information(
+    problem: FitProblem, theta: Float[np.ndarray, " free"], design: Design
+) -> Float[np.ndarray, "free free"]:
     """Fisher information about a fit's θ in a design; what is separate in it is eliminated, without a prior of its own.
 
     Raises `ValueError` for a task without linear response, unknown names in `separate`, and a coefficient of variation or
     mean of an output that is zero.
     """
-    names, given = setup.coordinates.names, setup.task if design.task is None else design.task
+    names, like = problem.coordinates.names, design.like(problem)
+    given = like.task if design.task is None else design.task
     for name in design.separate:
         if name not in names:
             raise ValueError(f"{design.name}: separate: {name!r} is not free in the fit; free are {', '.join(names)}")
-    settings = setup.target.settings if design.settings is None else design.settings
+    settings = like.target.settings if design.settings is None else design.settings
     task = given.with_parts(settings=settings)
     has_response(task, required=True)
-    own, coordinates = _coordinates(setup, theta, task)
-    local = _local_setup(setup, own, coordinates, task, design)
-    seen = seen_here(local, theta[own])
-    local = _with_data(local, design, seen.moments)
-    found = _information(local, design, seen)
+    own, coordinates = _coordinates(like, theta, task)
+    local = _local(like, coordinates, task, design)
+    here = dataclasses.replace(problem, parts=(local,), coordinates=coordinates, prior=problem.prior[own])
+    seen = seen_here(here, theta[own])
+    (moments,) = seen.moments
+    found = _information(dataclasses.replace(here, parts=(_with_data(local, design, moments),)), design, seen)
     kept = np.array([names[i] not in design.separate for i in own])
     whole = np.zeros((len(names), len(names)))
     if not np.all(kept):
@@ -194,47 +236,46 @@ def design_information(setup: Setup, theta: Float[np.ndarray, " free"], design: 
     return whole
 
 
-def _coordinates(setup: Setup, theta: np.ndarray, task: Any) -> tuple[np.ndarray, Coordinates]:
+def _coordinates(like: Part, theta: np.ndarray, task: Any) -> tuple[np.ndarray, Coordinates]:
     """Which of the fit's coordinates the task has, and these: the same θ stands for the task's own values."""
-    c = setup.coordinates
-    own = np.array([i for i, n in enumerate(c.names)
-                    if n in task.parameter_names and (float(task[n]) > 0 or not c.positive[i])], dtype=int)  # fmt: skip
-    values, step = np.array([float(task[c.names[i]]) for i in own]), c.sd[own] * theta[own]
-    centre = np.where(c.positive[own], values * np.exp(-step), values - step)
+    c = like.coordinates
+    has = [i for i, n in enumerate(c.names) if n in task.parameter_names and (float(task[n]) > 0 or not c.positive[i])]
+    own, sd, positive = np.array(like.columns, dtype=int)[has], c.sd[has], c.positive[has]
+    values, step = np.array([float(task[c.names[i]]) for i in has]), sd * theta[own]
+    centre = np.where(positive, values * np.exp(-step), values - step)
     unbounded = np.full(len(own), np.inf)
-    return own, Coordinates(tuple(c.names[i] for i in own), centre, c.sd[own], c.positive[own], -unbounded, unbounded)
+    return own, Coordinates(tuple(c.names[i] for i in has), centre, sd, positive, -unbounded, unbounded)
 
 
-def _local_setup(setup: Setup, own: np.ndarray, coordinates: Coordinates, task: Any, design: Design) -> Setup:
-    present, settings = setup.target, task.settings
+def _local(like: Part, coordinates: Coordinates, task: Any, design: Design) -> Part:
+    """The design's target with its task, without data."""
+    present, settings = like.target, task.settings
     bins = present.bins if settings == present.settings else np.arange(settings.first_bin, settings.last_bin + 1)
     counts = design.counts if design.counts and design.spectral else segments_of(present)
     quantity = "displacement" if task.output_unit == "m" else "force"
     target = Target(design.name, np.ones(len(bins)), bins=bins, quantity=quantity, segments=counts, settings=settings)
-    return dataclasses.replace(
-        setup, task=task, target=target, coordinates=coordinates, prior=setup.prior[own], extra=(None, None)
-    )
+    return Part("", task, target, coordinates, tuple(range(len(coordinates.names))), None, None)
 
 
-def _with_data(setup: Setup, design: Design, moments: Any) -> Setup:
-    """The setup with the data that the design is expected to give."""
+def _with_data(part: Part, design: Design, moments: Moments) -> Part:
+    """The part with the data that the design is expected to give."""
     mean, sd = float(moments.mean), float(np.sqrt(moments.variance))
     if (design.coefficient_of_variation or design.mean is not None) and not sd < MOST_VARIATION * abs(mean):
         raise ValueError(f"{design.name}: the mean of its output is zero, so neither it nor a coefficient of variation "
                          "can be stated relatively: leave both out")  # fmt: skip
-    old = setup.target
+    old = part.target
     target = Target(
         design.name, moments.proportional, bins=old.bins, quantity=old.quantity, segments=old.segments,
         coefficient_of_variation=sd / abs(mean) if design.coefficient_of_variation else None, settings=old.settings,
     )  # fmt: skip
-    further = target_variation(target, setup.task), None if design.mean is None else (mean, design.mean * abs(mean))
-    return dataclasses.replace(setup, target=target, extra=further)
+    stated = None if design.mean is None else (mean, design.mean * abs(mean))
+    return dataclasses.replace(part, target=target, variation=target_variation(target, part.task), mean=stated)
 
 
-def _information(setup: Setup, design: Design, seen: Seen) -> Float[np.ndarray, "own own"]:
-    likelihood = Likelihood.of(setup)
-    bins = likelihood.bins
+def _information(problem: FitProblem, design: Design, seen: Expansion) -> Float[np.ndarray, "own own"]:
+    likelihood = Likelihood.of(problem)
+    (bins,) = likelihood.bins
     assert bins is not None
     if not design.spectral:
-        bins = bins._replace(mask=np.zeros(len(setup.target.bins)))
-    return without_offset(np.asarray(likelihood.information(seen, bins)))
+        bins = bins._replace(mask=np.zeros(len(bins.mask)))
+    return without_offsets(np.asarray(likelihood.information(seen, (bins,))), len(seen.theta))

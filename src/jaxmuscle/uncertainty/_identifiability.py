@@ -11,14 +11,14 @@ from jaxtyping import Float
 
 from jaxmuscle._common.errors import OperatingPointError
 from jaxmuscle.data._target import Target
-from jaxmuscle.fits._reopened import taken_up
+from jaxmuscle.fits._reopened import reopened
 from jaxmuscle.fits._report import REDUCED
 from jaxmuscle.fits._result import FitResult
-from jaxmuscle.objective._consequences import UNITS, Seen, quantities, unit_of
+from jaxmuscle.objective._consequences import Expansion, quantities, unit_of
 from jaxmuscle.objective._covariance import DETERMINED, Identifiability, undetermined_directions
-from jaxmuscle.objective._problem import Setup, theta_of
+from jaxmuscle.objective._problem import FitProblem
 
-from ._designs import Design, design_information, designs_for, information_of, seen_here, told_data
+from ._designs import Design, design_information, designs_for, information_of, seen_here, told_data, without_further
 from ._identifiability_report import TOGETHER, IdentifiabilityReport, Known, Outlook
 
 LEAST_PRIOR = 1e-6
@@ -43,25 +43,25 @@ def identifiability(
     a design that names unknown parameters. A design without stable equilibrium is reported as impossible.
     """
     with jax.enable_x64(True):
-        setup, theta = _fitted(result, target)
-        seen = seen_here(setup, theta)
-        tried = designs_for(setup, float(seen.moments.mean)) if designs is None else tuple(designs)
+        problem, theta = _fitted(result, target)
+        seen = seen_here(problem, theta)
+        tried = designs_for(problem, seen) if designs is None else tuple(designs)
         names = [design.name for design in tried]
         if len(set(names)) < len(names):
             raise ValueError(f"designs: two are called {next(n for n in names if names.count(n) > 1)!r}: rename one")
-        here = _Here.of(setup, seen)
-        added = [_added(setup, theta, design) for design in tried]
-    present = here.outlook("the present data", here.information, *told_data(setup))
+        here = _Here.of(problem, seen, result)
+        added = [_added(problem, theta, design) for design in tried]
+    present = here.outlook("the present data", here.information, *told_data(problem))
     alone = tuple(
-        here.outlook(d.name, here.information + more, *d.told(setup), d.separate, failed, present)
+        here.outlook(d.name, here.information + more, *d.told(problem), d.separate, failed, present)
         for d, (more, failed) in zip(tried, added, strict=True)
     )
     possible = [(d.name, more) for d, (more, failed) in zip(tried, added, strict=True) if failed is None]
     pairs = [here.outlook(a + TOGETHER + b, here.information + x + y, present=present)
              for (a, x), (b, y) in itertools.combinations(possible, 2)]  # fmt: skip
     pairs.sort(key=lambda pair: (-len(pair.gained), sum(np.log(k.left) for k in pair.quantities.values())))
-    notices = tuple(n for n in result.notices if n.startswith("harmonic_frequency is ambiguous"))
-    return IdentifiabilityReport(setup.target.name, setup.coordinates.names, present, alone, tuple(pairs), notices)
+    notices = tuple(n for n in result.notices if " ambiguous: " in n)
+    return IdentifiabilityReport(problem.title, problem.coordinates.names, present, alone, tuple(pairs), notices)
 
 
 def standard_designs(result: FitResult, target: Target | None = None) -> tuple[Design, ...]:
@@ -73,20 +73,21 @@ def standard_designs(result: FitResult, target: Target | None = None) -> tuple[D
     harmonic have other, unknown amplitudes and the muscle is as before; a recording ten times as long.
     """
     with jax.enable_x64(True):
-        setup, theta = _fitted(result, target)
-        return designs_for(setup, float(seen_here(setup, theta).moments.mean))
+        problem, theta = _fitted(result, target)
+        return designs_for(problem, seen_here(problem, theta))
 
 
-def _fitted(result: FitResult, target: Target | None) -> tuple[Setup, Float[np.ndarray, " free"]]:
-    """The fit's setup with the fitted task in it, and θ."""
-    setup = taken_up(result, target)
-    return dataclasses.replace(setup, task=result.task), theta_of(setup, result.task)
+def _fitted(result: FitResult, target: Target | None) -> tuple[FitProblem, Float[np.ndarray, " free"]]:
+    """The fit's problem with the fitted tasks in it, and θ."""
+    problem, tasks = reopened(result, target), tuple(result.tasks.values())
+    parts = (dataclasses.replace(part, task=task) for part, task in zip(problem.parts, tasks, strict=True))
+    return dataclasses.replace(problem, parts=tuple(parts)), problem.theta_of(tasks)
 
 
-def _added(setup: Setup, theta: np.ndarray, design: Design) -> tuple[np.ndarray, str | None]:
+def _added(problem: FitProblem, theta: np.ndarray, design: Design) -> tuple[np.ndarray, str | None]:
     """What a design tells, or why it is impossible."""
     try:
-        return design_information(setup, theta, design), None
+        return design_information(problem, theta, design), None
     except OperatingPointError as error:
         return np.zeros((len(theta), len(theta))), str(error)
 
@@ -101,19 +102,19 @@ class _Here(NamedTuple):
     gradients: dict[str, np.ndarray]
 
     @classmethod
-    def of(cls, setup: Setup, seen: Seen) -> "_Here":
-        c = setup.coordinates
-        natural = np.array([float(setup.task[name]) for name in c.names])
+    def of(cls, problem: FitProblem, seen: Expansion, result: FitResult) -> "_Here":
+        c = problem.coordinates
+        natural = c.values_of(np.asarray(seen.theta)[None])[0]
         values = {n: (float(v), unit_of(n)) for n, v in zip(c.names, natural, strict=True)}
         gradients = dict(zip(c.names, np.diag(c.slope(natural)), strict=True))
-        problem = dataclasses.replace(setup, extra=(None, None)).linear()
-        found, slopes = jax.tree.map(lambda x: np.asarray(x)[0],
-                                     quantities(problem, jax.tree.map(lambda x: np.asarray(x)[None], seen)))  # fmt: skip
-        for name, g in slopes.items():
-            if name not in values and np.all(np.isfinite(g)) and np.any(g != 0) and np.isfinite(found[name]):
-                unit = setup.task.output_unit if name == "mean" else UNITS.get(name, "1")
-                values[name], gradients[name] = (float(found[name]), unit), g
-        return cls(c.names, information_of(setup, seen), setup.prior, values, gradients)
+        tables = quantities(without_further(problem).linear(), jax.tree.map(lambda x: np.asarray(x)[None], seen))
+        for name in result.derived_names:
+            part, quantity = problem.where(name)
+            value, g = (table[part][quantity][0] for table in tables)
+            if name not in values and np.all(np.isfinite(g)) and np.any(g != 0) and np.isfinite(value):
+                unit = unit_of(name, problem.parts[part].task.output_unit)
+                values[name], gradients[name] = (float(value), unit), g
+        return cls(c.names, information_of(problem, seen), problem.prior, values, gradients)
 
     def outlook(
         self,

@@ -195,16 +195,17 @@ def _table(report: IdentifiabilityReport) -> list[str]:
     """Standard errors of every quantity by the prior, now, and with each design; those of open quantities in brackets."""
     names = told(report.present.quantities)
     possible = [(letter(i), d) for i, d in enumerate(report.designs) if d.failed is None]
+    wide = max(24, *(1 + len(name) for name in names))
     lines = ["  standard error by data and prior, in percent; in brackets: not determined"]
     for start in range(0, max(len(possible), 1), COLUMNS):
         block = possible[start : start + COLUMNS]
         heads = ["value", "prior", "now", *(label for label, _ in block)]
-        lines.append(f"  {'':<24}{heads[0]:>9}" + "".join(f"{head:>6}" for head in heads[1:]))
+        lines.append(f"  {'':<{wide}}{heads[0]:>9}" + "".join(f"{head:>6}" for head in heads[1:]))
         for name in names:
             now = report.present.quantities[name]
             cells = [f"({_cell(now, now.prior_sd)})", *(_shown(o.quantities[name]) for o in
                                                         (report.present, *(d for _, d in block)))]  # fmt: skip
-            lines.append(f"  {name:<24}{now.value:>9.3g}" + "".join(f"{cell:>6}" for cell in cells))
+            lines.append(f"  {name:<{wide}}{now.value:>9.3g}" + "".join(f"{cell:>6}" for cell in cells))
     return lines
 
 

@@ -12,16 +12,18 @@ from jaxtyping import Array
 from jaxmuscle._common.environment import versions
 from jaxmuscle._common.progress import teller
 from jaxmuscle.data._target import Target
-from jaxmuscle.fits._reopened import taken_up
+from jaxmuscle.fits._reopened import reopened
 from jaxmuscle.fits._result import FitResult
-from jaxmuscle.objective._consequences import DERIVED, quantities, seen_at
+from jaxmuscle.objective._arguments import settings_of
+from jaxmuscle.objective._consequences import Tables, expand, quantities
 from jaxmuscle.objective._likelihood import Likelihood
-from jaxmuscle.objective._problem import Setup, theta_of
+from jaxmuscle.objective._problem import FitProblem
+from jaxmuscle.objective._residuals import Residuals
 
 from ._chains import Chains, sample
 from ._posterior_checks import diagnosed, modes_of, replicates, verdict
-from ._posterior_density import Marginal, edges_of, marginal_of
-from ._posterior_result import Posterior
+from ._posterior_density import PosteriorDensity, density_about, edges_of
+from ._posterior_result import Posterior, PosteriorPart
 
 ROWS = 256
 
@@ -65,80 +67,83 @@ def posterior(
             raise ValueError(f"{name} = {count} must be at least {least}")
     tell = teller(progress)
     with jax.enable_x64(True):
-        setup = taken_up(result, target, free=free, priors=priors, bounds=bounds, key=key)
-        likelihood = Likelihood.of(setup)
+        problem = reopened(result, target, free=free, priors=priors, bounds=bounds, key=key)
+        likelihood = Likelihood.of(problem)
         tell("climbing to the maximum", 0.0)
-        marginal, _, _ = marginal_of(setup, likelihood, theta_of(setup, result.task))
-        found, marginal = sample(marginal, jax.random.fold_in(setup.key, 5), chains, draws, warmup, tell)
-        return _reported(setup, marginal, found, result, key, warmup)
+        density, _, _ = density_about(problem, likelihood, problem.theta_of(tuple(result.tasks.values())))
+        found, density = sample(density, jax.random.fold_in(problem.key, 5), chains, draws, warmup, tell)
+        return _reported(problem, density, found, result, key, warmup)
 
 
 def _reported(
-    setup: Setup, marginal: Marginal, found: Chains, result: FitResult, key: Array | int, warmup: int
+    problem: FitProblem, density: PosteriorDensity, found: Chains, result: FitResult, key: Array | int, warmup: int
 ) -> Posterior:
-    shape = found.log_density.shape
-    theta, s = _thetas(setup, marginal, found)
+    shape, names = found.log_density.shape, problem.coordinates.names
+    theta, s = _thetas(problem, density, found)
     found = found._replace(s=s)
     flat = theta.reshape(-1, theta.shape[-1])
-    derived, moments = _consequences(marginal.likelihood.problem, flat)
-    values = setup.coordinates.values_of(flat)
-    samples = {name: values[:, i].reshape(shape) for i, name in enumerate(setup.coordinates.names)}
-    known = {name: derived[name].reshape(shape) for name in DERIVED if name not in samples}
-    determined = tuple(name for name in (*samples, *known)
-                       if (name in result.derived and result.derived[name].stderr is not None)
-                       or (name in result.parameters and result.parameters[name].stderr is not None
-                           and result.parameters[name].free))  # fmt: skip
+    derived, moments = _consequences(density.likelihood.objective, flat)
+    values = problem.coordinates.values_of(flat)
+    samples = {name: values[:, i].reshape(shape) for i, name in enumerate(names)}
+    places = {name: problem.where(name) for name in result.derived_names if name not in samples}
+    known = {name: derived[i][base].reshape(shape) for name, (i, base) in places.items()}
+    determined = tuple(name for name in (*samples, *known) if name in result.determined)
     diagnostics = {name: diagnosed(x) for name, x in (samples | known).items()}
     success, message = verdict(found, diagnostics, determined)
-    settings = {
-        "free": list(setup.coordinates.names), "chains": shape[0], "draws": shape[1], "warmup": warmup,
-        "prior_centre": dict(zip(setup.coordinates.names, map(float, setup.coordinates.centre), strict=True)),
-        "prior_sd": {n: float(sd) if p else None for n, sd, p in
-                     zip(setup.coordinates.names, setup.coordinates.sd, setup.prior, strict=True)},
-        "frequencies": len(np.unique(marginal.frequency)), "step_size": found.step_size,
-        "residual": setup.residual, "spectrum": setup.target.settings.to_dict(),
+    settings = settings_of(problem, {}) | {
+        "chains": shape[0], "draws": shape[1], "warmup": warmup, "step_size": found.step_size,
+        "frequencies": max(1, sum(len(np.unique(band.frequency)) for band in density.bands)),
+        "spectrum": {part.target.name: part.target.settings.to_dict() for part in problem.parts},
     }  # fmt: skip
-    modes = modes_of(samples["harmonic_frequency"].ravel()) if "harmonic_frequency" in samples else ()
-    drawn = replicates(marginal.likelihood, setup.target, moments, shape, jax.random.fold_in(setup.key, 7))
-    task = setup.task.replace(**{name: float(np.median(x)) for name, x in samples.items()})
-    return Posterior(success, message, task, setup.target, samples, known, diagnostics, determined, modes, drawn, found,
-                     settings, key if isinstance(key, int) else None, versions())  # fmt: skip
+    modes = {band.name: modes_of(samples[band.name].ravel()) for band in density.bands}
+    parts = {}
+    for i, (name, part) in enumerate(zip(result.parts, problem.parts, strict=True)):
+        drawing = jax.random.fold_in(problem.key, 7)
+        drawing = jax.random.fold_in(drawing, i) if i else drawing
+        drawn = replicates(density.likelihood.bins[i], part.target, moments[i], shape, drawing)
+        own = part.coordinates.values_of(part.own(flat))
+        task = part.task.replace(**{n: float(np.median(own[:, j])) for j, n in enumerate(part.coordinates.names)})
+        shared = {n: names[c] for n, c in zip(part.coordinates.names, part.columns, strict=True)}
+        parts[name] = PosteriorPart(part.target, task, drawn, shared)
+    return Posterior(success, message, parts, samples, known, diagnostics, determined, modes, found, settings,
+                     key if isinstance(key, int) else None, versions())  # fmt: skip
 
 
-def _thetas(setup: Setup, marginal: Marginal, found: Chains) -> tuple[np.ndarray, np.ndarray]:
-    """θ of every draw, the harmonic's frequency drawn from its grid given the rest, anywhere in its cell; s and offset."""
-    coordinates, names = setup.coordinates, setup.coordinates.names
+def _thetas(problem: FitProblem, density: PosteriorDensity, found: Chains) -> tuple[np.ndarray, np.ndarray]:
+    """θ of every draw, each harmonic's frequency drawn from its grid given the rest, anywhere in its cell; s and offsets."""
+    coordinates, names = problem.coordinates, problem.coordinates.names
     both = found.s.reshape(-1, found.s.shape[-1])
-    parts = [np.asarray(_placed(marginal, jnp.asarray(part))) for part in _filled(both)]
+    parts = [np.asarray(_placed(density, jnp.asarray(part))) for part in _filled(both)]
     s = np.concatenate(parts)[: len(both)]
     theta = np.asarray(coordinates.theta(s))
-    if marginal.table is not None:
-        white = np.linalg.solve(np.asarray(marginal.scale), (both - np.asarray(marginal.centre)).T).T
-        heights = _heights(marginal, white)
-        keys = jax.random.split(jax.random.fold_in(setup.key, 6))
-        chosen = np.asarray(jax.random.categorical(keys[0], jnp.asarray(heights)))
-        place = np.asarray(jax.random.uniform(keys[1], (len(both),)))
-        edges = edges_of(np.asarray(marginal.frequency))
-        frequency = edges[chosen] + place * (edges[chosen + 1] - edges[chosen])
-        theta[:, names.index("harmonic_frequency")] = coordinates.theta_of("harmonic_frequency", frequency)
+    if density.bands:
+        white = np.linalg.solve(np.asarray(density.scale), (both - np.asarray(density.centre)).T).T
+        for number, (band, heights) in enumerate(zip(density.bands, _heights(density, white), strict=True)):
+            key = jax.random.fold_in(problem.key, 6)
+            keys = jax.random.split(jax.random.fold_in(key, number) if number else key)
+            chosen = np.asarray(jax.random.categorical(keys[0], jnp.asarray(heights)))
+            place = np.asarray(jax.random.uniform(keys[1], (len(both),)))
+            edges = edges_of(np.asarray(band.frequency))
+            frequency = edges[chosen] + place * (edges[chosen + 1] - edges[chosen])
+            theta[:, names.index(band.name)] = coordinates.theta_of(band.name, frequency)
     shape = found.log_density.shape
-    sampled = np.concatenate([s[:, list(marginal.columns)], both[:, len(marginal.columns) :]], axis=1)
+    sampled = np.concatenate([s[:, list(density.columns)], both[:, len(density.columns) :]], axis=1)
     return theta.reshape(*shape, -1), sampled.reshape(*shape, -1)
 
 
 @eqx.filter_jit
-def _placed(marginal: Marginal, both: Array) -> Array:
-    return jax.lax.map(lambda row: marginal.placed(row)[0], both, batch_size=16)
+def _placed(density: PosteriorDensity, both: Array) -> Array:
+    return jax.lax.map(lambda row: density.placed(row)[0], both, batch_size=16)
 
 
 @eqx.filter_jit
-def _frequencies(marginal: Marginal, white: Array) -> Array:
-    return jax.lax.map(marginal.at_frequencies, white, batch_size=16)
+def _frequencies(density: PosteriorDensity, white: Array) -> tuple[Array, ...]:
+    return jax.lax.map(density.at_frequencies, white, batch_size=16)
 
 
-def _heights(marginal: Marginal, white: np.ndarray) -> np.ndarray:
-    parts = [_frequencies(marginal, jnp.asarray(part)) for part in _filled(white)]
-    return np.concatenate(parts)[: len(white)]
+def _heights(density: PosteriorDensity, white: np.ndarray) -> tuple[np.ndarray, ...]:
+    parts = [_frequencies(density, jnp.asarray(part)) for part in _filled(white)]
+    return tuple(np.concatenate(x)[: len(white)] for x in zip(*parts, strict=True))
 
 
 def _filled(rows: np.ndarray) -> list[np.ndarray]:
@@ -148,10 +153,10 @@ def _filled(rows: np.ndarray) -> list[np.ndarray]:
     return np.split(whole, len(whole) // ROWS)
 
 
-def _consequences(problem: Any, theta: np.ndarray) -> tuple[dict[str, np.ndarray], Any]:
-    """Derived quantities and moments at every θ."""
+def _consequences(objective: Residuals, theta: np.ndarray) -> tuple[Tables, Any]:
+    """Derived quantities and moments of every part at every θ."""
     parts = []
     for part in _filled(theta):
-        seen = seen_at(problem, part)
-        parts.append((quantities(problem, seen)[0], seen.moments))
+        seen = expand(objective, part)
+        parts.append((quantities(objective, seen)[0], seen.moments))
     return jax.tree.map(lambda *x: np.concatenate(x)[: len(theta)], *parts)

@@ -8,7 +8,7 @@ from jax import Array
 from jaxtyping import Float
 
 from jaxmuscle.data._target import Target
-from jaxmuscle.objective._likelihood import Likelihood, drawn_spectra
+from jaxmuscle.objective._likelihood import Bins, drawn_spectra
 from jaxmuscle.response._expected import Moments
 from jaxmuscle.spectra._bin_law import BinStatistics, bin_statistics, standardised
 
@@ -40,9 +40,9 @@ def chi2_of(
     return np.sum(z**2, axis=1) / (z.shape[1] - 1)
 
 
-def replicates(likelihood: Likelihood, target: Target, moments: Moments, shape: tuple[int, ...], key: Array) -> Replicates:
+def replicates(bins: Bins | None, target: Target, moments: Moments, shape: tuple[int, ...], key: Array) -> Replicates:
     """One spectrum drawn for every row of moments; results have the given leading shape."""
-    drawn = drawn_spectra(likelihood, target, moments, key)
+    drawn = drawn_spectra(bins, target, moments, key)
     statistics = bin_statistics(target)
     measured = np.broadcast_to(target.proportional_power, drawn.shape)
     power = np.asarray(moments.power)

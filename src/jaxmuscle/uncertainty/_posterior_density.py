@@ -1,6 +1,7 @@
 """The posterior density with the harmonic's frequency, where it has many modes, summed over a grid."""
 
-from typing import Any, NamedTuple
+import dataclasses
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -11,10 +12,13 @@ from jaxtyping import Array, Complex, Float
 from jaxmuscle._common.types import Scalar
 from jaxmuscle.model._parameters import CHANNELS
 from jaxmuscle.model._signals import Constant
-from jaxmuscle.objective._coordinates import at
+from jaxmuscle.model._tasks import AbstractTask
+from jaxmuscle.objective._coordinates import task_at
 from jaxmuscle.objective._likelihood import Likelihood
-from jaxmuscle.objective._problem import Setup
-from jaxmuscle.objective._scoring import Peak, highest
+from jaxmuscle.objective._moment_models import Linear
+from jaxmuscle.objective._problem import FitProblem
+from jaxmuscle.objective._scoring import Maximum, highest
+from jaxmuscle.objective._starts import distinct, frequency_names
 from jaxmuscle.response._expected import Moments, noise_response, noise_variance
 from jaxmuscle.response._harmonic_line import LineTable, harmonic_size, line_table
 from jaxmuscle.response._linearised import Linearisation, linearise
@@ -50,7 +54,7 @@ class Features(NamedTuple):
         reply = jax.lax.complex(*self.size) * _polynomial(self.numerator, s) / _polynomial(self.denominator, s)
         line = table.power(reply)
         return Moments(self.power + line, line, jnp.broadcast_to(self.mean, frequency.shape),
-                       self.variance + table.variance(reply))  # fmt: skip
+                       self.variance + table.variance(reply), jnp.full(frequency.shape, jnp.nan))  # fmt: skip
 
 
 def _polynomial(coefficients: Float[Array, " powers"], s: Complex[Array, " grid"]) -> Complex[Array, " grid"]:
@@ -75,221 +79,262 @@ def _rational(A: Array, b: Array, c: Array, d: Array, e: Array) -> tuple[Array, 
     return inside + through + jnp.concatenate([e * denominator, jnp.zeros(1, A.dtype)]), denominator
 
 
-class Level(NamedTuple):
+class Band(eqx.Module):
+    """A harmonic frequency that is summed over: its grid f_j, weights w_j (prior density times the width of the cell).
+
+    `parts` are those that it acts on, each with the `tables` of its lines.
+    """
+
+    frequency: Float[Array | np.ndarray, " grid"]
+    log_weight: Float[Array | np.ndarray, " grid"]
+    tables: tuple[LineTable, ...]
+    name: str = eqx.field(static=True)
+    parts: tuple[int, ...] = eqx.field(static=True)
+
+
+class Level(eqx.Module):
     """The common scale of the amplitudes, as the coordinate of one of them, counted from a fixed coefficient of variation.
 
     Only the coefficient of variation shows that scale, and narrowly: in the amplitudes themselves the posterior is a thin
     curved sheet that chains hardly follow; counted from there the scale is all but a normal variable of its own. `column`
     is the coordinate of one amplitude, `start` its value at the maximum, `sd` its prior standard deviation,
-    `log_variation` that at the maximum, `along` what a common factor does to all coordinates, `weight` of the harmonic's
-    frequencies.
+    `log_variation` that of the `part` at the maximum, `along` what a common factor does to all coordinates, `weight` of the
+    part's harmonic frequencies.
     """
 
-    column: int
     start: Float[Array | np.ndarray, ""]
     sd: Float[Array | np.ndarray, ""]
     log_variation: Float[Array | np.ndarray, ""]
     along: Float[Array | np.ndarray, " free"]
     weight: Float[Array | np.ndarray, " grid"]
+    column: int = eqx.field(static=True)
+    part: int = eqx.field(static=True)
 
 
-class Marginal(eqx.Module):
-    """Log posterior density of the unbounded coordinates s (without the harmonic's frequency) and the offset.
+Systems = dict[int, Linearisation]
 
-        ln p(s, u) = ln Σ_j w_j L(θ(s), f_j, u) - ½ Σ θ² + ln |dθ/ds|
 
-    over the grid f_j of the harmonic's frequency, w_j its prior density times the width of the cell. Without a free
-    frequency there is one f_j. `columns` are the sampled coordinates among the free ones, `centre` and `scale` whiten them,
-    one of them being counted from a `level` (the Jacobian of which is constant).
+class PosteriorDensity(eqx.Module):
+    """Log posterior density of the unbounded coordinates s (without the harmonics' frequencies) and the offsets u.
+
+        ln p(s, u) = Σ_b ln Σ_j w_bj Π_i L_i(θ(s), f_bj, u_i) + Σ_i ln L_i(θ(s), u_i) - ½ Σ θ² + ln |dθ/ds|
+
+    over the `bands` b, each a grid of a harmonic's frequency with the targets i that it acts on, and over the other targets.
+    `columns` are the sampled coordinates among the free ones, `offsets` the targets whose u is sampled, `centre` and `scale`
+    whiten both, some of the coordinates being counted from `levels` (the Jacobian of which is 1).
     """
 
     likelihood: Likelihood
-    frequency: Float[Array | np.ndarray, " grid"]
-    log_weight: Float[Array | np.ndarray, " grid"]
-    table: LineTable | None
+    bands: tuple[Band, ...]
     point: Float[Array | np.ndarray, " free"]
     centre: Float[Array | np.ndarray, " sampled"]
     scale: Float[Array | np.ndarray, "sampled sampled"]
+    levels: tuple[Level, ...]
     columns: tuple[int, ...] = eqx.field(static=True)
-    offset: bool = eqx.field(static=True)
-    level: Level | None = None
+    offsets: tuple[int, ...] = eqx.field(static=True)
 
     @property
     def size(self) -> int:
         """How many numbers are sampled."""
-        return len(self.columns) + self.offset
+        return len(self.columns) + len(self.offsets)
 
-    def split(self, white: Float[Array, " sampled"]) -> tuple[Float[Array, " free"], Scalar]:
-        """Unbounded coordinates (with the point's own where not sampled) and the offset of whitened ones."""
+    def split(self, white: Float[Array, " sampled"]) -> tuple[Float[Array, " free"], Float[Array, " parts"]]:
+        """Unbounded coordinates (with the point's own where not sampled) and the offsets of whitened ones."""
         return self.placed(self.centre + self.scale @ white)[:2]
 
     def placed(
         self, both: Float[Array | np.ndarray, " sampled"]
-    ) -> tuple[Float[Array, " free"], Scalar, Linearisation | None]:
-        """The same of sampled coordinates, with the linearised task if that was needed."""
+    ) -> tuple[Float[Array, " free"], Float[Array, " parts"], Systems]:
+        """The same of sampled coordinates, with the linearised tasks as far as they were needed."""
         s = jnp.asarray(self.point).at[jnp.asarray(self.columns)].set(both[: len(self.columns)])
-        s, system = self.levelled(s)
-        return s, both[-1] if self.offset else jnp.zeros(()), system
+        offsets = jnp.zeros(len(self.likelihood.bins))
+        offsets = offsets.at[jnp.asarray(self.offsets, dtype=int)].set(both[len(self.columns) :])
+        s, systems = self.levelled(s)
+        return s, offsets, systems
 
-    def levelled(self, s: Float[Array, " free"]) -> tuple[Float[Array, " free"], Linearisation | None]:
-        """Coordinates s of which one is counted from the level, as they are."""
-        level = self.level
-        if level is None:
-            return s, None
-        s, above = s.at[level.column].set(level.start), level.sd * (s[level.column] - level.start)
-        found, system = self.log_variation(s, level.weight)
-        return s + (level.log_variation + above - found) * level.along, system
+    def levelled(self, s: Float[Array, " free"]) -> tuple[Float[Array, " free"], Systems]:
+        """Coordinates s of which some are counted from a level, as they are."""
+        systems: Systems = {}
+        for level in self.levels:
+            s, above = s.at[level.column].set(level.start), level.sd * (s[level.column] - level.start)
+            found, systems[level.part] = self.log_variation(s, level.part, level.weight)
+            s = s + (level.log_variation + above - found) * level.along
+        return s, systems
+
+    def band_of(self, part: int) -> Band | None:
+        """The band that acts on a part."""
+        return next((band for band in self.bands if part in band.parts), None)
+
+    def task(self, s: Float[Array, " free"], part: int) -> AbstractTask:
+        """One part's task at s."""
+        objective = self.likelihood.objective
+        own = objective.parts[part]
+        return task_at(own.task, own.coordinates, objective.own(objective.coordinates.theta(s), part))
 
     def log_variation(
-        self, s: Float[Array, " free"], weight: Float[Array | np.ndarray, " grid"]
+        self, s: Float[Array, " free"], part: int, weight: Float[Array | np.ndarray, " grid"]
     ) -> tuple[Scalar, Linearisation]:
         """Log coefficient of variation of a long recording, the harmonic's frequencies weighted; the linearised task."""
-        problem = self.likelihood.problem
-        task = at(problem.task, problem.coordinates, problem.coordinates.theta(s))
+        task, band = self.task(s, part), self.band_of(part)
         system = linearise(task)
         variance, base = noise_variance(task, system), task.harmonic_base()
         top, below = _rational(system.A, system.B @ base, system.C, system.D @ base, system.E @ base)
-        frequency = jnp.asarray(self.frequency) if self.table is not None else task.harmonic.frequency
+        frequency = jnp.atleast_1d(task.harmonic.frequency if band is None else jnp.asarray(band.frequency))
         s = jax.lax.complex(jnp.zeros_like(frequency), 2 * jnp.pi * frequency)
         reply = harmonic_size(task, system.A.dtype) * _polynomial(top, s) / _polynomial(below, s)
         line = 0.5 * jnp.sum(weight * (jnp.real(reply) ** 2 + jnp.imag(reply) ** 2))
         return 0.5 * jnp.log(variance + line) - jnp.log(jnp.abs(system.rest)), system
 
-    def features(self, s: Float[Array, " free"], system: Linearisation | None = None) -> Features | Moments:
-        """Of the model at s (linearised already); the moments themselves where there is no grid."""
-        problem = self.likelihood.problem
-        theta = problem.coordinates.theta(s)
-        if self.table is None:
-            return problem.moments(theta)
-        task = at(problem.task, problem.coordinates, theta)
-        model: Any = problem.model
-        chosen, correction = model.chosen, model.correction
-        system = linearise(task) if system is None else system
+    def features(self, s: Float[Array, " free"], part: int, systems: Systems) -> Features:
+        """Of a part's model at s (linearised already, perhaps)."""
+        task, model = self.task(s, part), self.likelihood.objective.parts[part].model
+        assert isinstance(model, Linear)
+        system = systems[part] if part in systems else linearise(task)
         power, variance = noise_response(task, system, task.settings, model.samples)
         base = task.harmonic_base()
         top, below = _rational(system.A, system.B @ base, system.C, system.D @ base, system.E @ base)
         size = harmonic_size(task, system.A.dtype)
         size = jnp.stack([jnp.real(size), jnp.imag(size)])
-        return Features(power[chosen] * correction.power, system.rest, variance, size, top, below)
+        return Features(power[model.chosen] * model.correction.power, system.rest, variance, size, top, below)
 
-    def heights(self, features: Any, offset: Scalar) -> Float[Array, " grid"]:
-        """Log likelihood at every frequency, with the weights of the grid."""
-        if self.table is None:
-            return self.likelihood.at(features, offset)[None]
-        moments = features.moments(jnp.asarray(self.frequency), self.table)
-        return jax.vmap(lambda m: self.likelihood.at(m, offset))(moments) + self.log_weight
+    def heights(
+        self, band: Band, s: Float[Array, " free"], offsets: Float[Array, " parts"], systems: Systems
+    ) -> Float[Array, " grid"]:
+        """Log likelihood of a band's targets at every frequency, with the weights of the grid."""
+        found = jnp.asarray(band.log_weight)
+        for part, table in zip(band.parts, band.tables, strict=True):
+            moments = self.features(s, part, systems).moments(jnp.asarray(band.frequency), table)
+            bins, u = self.likelihood.bins[part], offsets[part]
+            found += jax.vmap(lambda m, part=part, u=u, bins=bins: self.likelihood.of_part(part, m, u, bins))(moments)
+        return found
 
     def log_prior(self, s: Float[Array, " free"]) -> Scalar:
         """Log prior density of the sampled coordinates, up to a constant."""
-        c, columns = self.likelihood.problem.coordinates, jnp.asarray(self.columns)
+        c, columns = self.likelihood.objective.coordinates, jnp.asarray(self.columns)
         theta = c.theta(s)
         bounded = jnp.isfinite(jnp.asarray(c.low))
         stretch = jnp.where(bounded, jax.nn.log_sigmoid(s) + jax.nn.log_sigmoid(-s), 0.0)
-        each = -0.5 * jnp.asarray(self.likelihood.problem.prior) * theta**2 + stretch
+        each = -0.5 * jnp.asarray(self.likelihood.objective.prior) * theta**2 + stretch
         return jnp.sum(each[columns])
 
     def log_density(self, white: Float[Array, " sampled"]) -> Scalar:
-        """The density; minus infinity where the task has no stable equilibrium."""
-        s, offset, system = self.placed(self.centre + self.scale @ white)
-        found = jax.nn.logsumexp(self.heights(self.features(s, system), offset)) + self.log_prior(s)
+        """The density; minus infinity where a task has no stable equilibrium."""
+        s, offsets, systems = self.placed(self.centre + self.scale @ white)
+        found = self.log_prior(s)
+        for band in self.bands:
+            found += jax.nn.logsumexp(self.heights(band, s, offsets, systems))
+        for part, bins in enumerate(self.likelihood.bins):
+            if self.band_of(part) is None:
+                objective = self.likelihood.objective
+                moments = objective.parts[part].moments(jnp.asarray(objective.own(objective.coordinates.theta(s), part)))
+                found += self.likelihood.of_part(part, moments, offsets[part], bins)
         return jnp.where(jnp.isfinite(found), found, -jnp.inf)
 
-    def at_frequencies(self, white: Float[Array, " sampled"]) -> Float[Array, " grid"]:
-        """Log density at every frequency of the grid (up to a constant), given the rest."""
-        s, offset = self.split(white)
-        return self.heights(self.features(s), offset)
+    def at_frequencies(self, white: Float[Array, " sampled"]) -> tuple[Float[Array, " grid"], ...]:
+        """Log density at every frequency of each band (up to a constant), given the rest."""
+        s, offsets, systems = self.placed(self.centre + self.scale @ white)
+        return tuple(self.heights(band, s, offsets, systems) for band in self.bands)
 
 
-def marginal_of(setup: Setup, likelihood: Likelihood, theta: Float[np.ndarray, " free"]) -> tuple[Marginal, Peak, int]:
+def density_about(
+    problem: FitProblem, likelihood: Likelihood, theta: Float[np.ndarray, " free"]
+) -> tuple[PosteriorDensity, Maximum, int]:
     """The density about the highest of the maxima climbed to from θ, and these.
 
     Raises `ValueError` for a prior that is not proper and for a frequency that cannot be summed over.
     """
-    coordinates, names = setup.coordinates, setup.coordinates.names
-    for name, precision, low in zip(names, setup.prior, coordinates.low, strict=True):
+    coordinates, names = problem.coordinates, problem.coordinates.names
+    for name, precision, low in zip(names, problem.prior, coordinates.low, strict=True):
         if precision == 0 and not np.isfinite(low):
             raise ValueError(f"the prior of {name} is flat and without bounds, so there is no posterior: give it a prior "
                              f"(priors={{{name!r}: sd}}) or bounds ({name!r}: (low, high))")  # fmt: skip
-    peak, best = highest(setup, likelihood, theta, setup.prior)
-    summed = "harmonic_frequency" in names
-    if summed and not isinstance(setup.task.harmonic.envelope, Constant):
-        raise ValueError("harmonic_frequency: with an envelope that changes its posterior cannot be summed over a grid: fix "
-                         "it (free= without harmonic_frequency)")  # fmt: skip
-    columns = tuple(i for i, name in enumerate(names) if name != "harmonic_frequency")
-    frequency, log_weight, table = np.zeros(1), np.zeros(1), None
-    if summed:
-        frequency = _grid(setup, peak)
-        log_weight = _log_weight(setup, frequency)
-        settings = setup.target.settings
-        chosen = setup.target.bins - settings.first_bin
-        samples = jnp.asarray(trial_samples(setup.target))
-        table = jax.jit(jax.vmap(lambda f: line_table(settings, WINDOW, f, samples)))(jnp.asarray(frequency))
-        table = jax.tree.map(np.asarray, table._replace(level=table.level[:, chosen], turning=table.turning[:, chosen]))
-    s, offset = coordinates.from_theta(peak.theta[best]), likelihood.bins is not None
-    stretch = np.append(coordinates.stretch(s), 1.0)
-    kept = [*columns, len(names)] if offset else list(columns)
+    peak, best = highest(problem, likelihood, theta, problem.prior)
+    summed = frequency_names(coordinates)
+    bands = tuple(_band(problem, peak, name) for name in summed)
+    columns = tuple(i for i, name in enumerate(names) if name not in summed)
+    s, offsets = coordinates.from_theta(peak.theta[best]), tuple(i for i, b in enumerate(likelihood.bins) if b is not None)
+    stretch = np.append(coordinates.stretch(s), np.ones(len(likelihood.bins)))
+    kept = [*columns, *(len(names) + i for i in offsets)]
     covariance = np.linalg.pinv(peak.curvature[best] * stretch[:, None] * stretch, hermitian=True)[np.ix_(kept, kept)]
     scale = np.linalg.cholesky(covariance + 1e-10 * np.diag(np.diag(covariance)))
-    centre = np.append(s[list(columns)], peak.offset[best])[: len(kept)]
-    made = Marginal(likelihood, frequency, log_weight, table, s, centre, scale, columns, offset)
-    level = _level(setup, made, peak.offset[best])
-    if level is not None:
-        made = eqx.tree_at(lambda m: m.level, made, level, is_leaf=lambda x: x is None)
+    centre = np.append(s, peak.offset[best])[kept]
+    made = PosteriorDensity(likelihood, bands, s, centre, scale, (), columns, offsets)
+    levels = _levels(problem, made, peak.offset[best])
+    if levels:
+        made = dataclasses.replace(made, levels=levels)
         turn = np.eye(len(kept))
         inner = np.ix_(range(len(columns)), range(len(columns)))
-        turn[inner] = np.asarray(jax.jit(jax.jacfwd(lambda s: made.levelled(s)[0]))(jnp.asarray(s)))[
-            np.ix_(columns, columns)
-        ]
-        made = eqx.tree_at(lambda m: m.scale, made, np.linalg.solve(turn, scale))
+        slope = np.asarray(jax.jit(jax.jacfwd(lambda s: made.levelled(s)[0]))(jnp.asarray(s)))
+        turn[inner] = slope[np.ix_(columns, columns)]
+        made = dataclasses.replace(made, scale=np.linalg.solve(turn, scale))
     return made, peak, best
 
 
-def _level(setup: Setup, made: Marginal, offset: float) -> Level | None:
-    """The level, where a coefficient of variation is known and an amplitude is free and without bounds."""
-    names, c = setup.coordinates.names, setup.coordinates
-    free = [(n.startswith("noise_") and n.removeprefix("noise_") in CHANNELS) or n == "harmonic_amplitude" for n in names]
-    loose = np.array(free) & c.positive & ~np.isfinite(c.low)
-    if setup.extra[0] is None or not loose.any() or not isinstance(setup.task.harmonic.envelope, Constant):
-        return None
-    s = jnp.asarray(made.point)
+def _levels(problem: FitProblem, made: PosteriorDensity, offsets: np.ndarray) -> tuple[Level, ...]:
+    """A level for every coefficient of variation that is known, where amplitudes of its own are free and without bounds."""
+    c = problem.coordinates
+    base = [name.partition("@")[0] for name in c.names]
+    amplitude = [
+        (n.startswith("noise_") and n.removeprefix("noise_") in CHANNELS) or n == "harmonic_amplitude" for n in base
+    ]
+    open_now = np.array(amplitude) & c.positive & ~np.isfinite(c.low)
+    s, levels = jnp.asarray(made.point), []
+    for i, part in enumerate(problem.parts):
+        loose = open_now & np.isin(np.arange(len(base)), part.columns)
+        if part.variation is None or not loose.any() or not isinstance(part.task.harmonic.envelope, Constant):
+            continue
+        band = made.band_of(i)
 
-    @jax.jit
-    def seen(s: Array) -> tuple[Array, Array]:
-        weight = jax.nn.softmax(made.heights(made.features(s), jnp.asarray(offset)))
-        return weight, made.log_variation(s, weight)[0]
+        @jax.jit
+        def seen(s: Array, i: int = i, band: Band | None = band) -> tuple[Array, Array]:
+            weight = jnp.ones(1) if band is None else jax.nn.softmax(made.heights(band, s, jnp.asarray(offsets), {}))
+            return weight, made.log_variation(s, i, weight)[0]
 
-    weight, variation = map(np.asarray, seen(s))
-    column = int(np.argmax(np.where(loose, [n != "harmonic_amplitude" for n in names], -1.0)))
-    return Level(column, np.asarray(s[column]), c.sd[column], variation, np.where(loose, 1 / c.sd, 0.0), weight)
+        weight, variation = map(np.asarray, seen(s))
+        column = int(np.argmax(np.where(loose, [n != "harmonic_amplitude" for n in base], -1.0)))
+        along = np.where(loose, 1 / c.sd, 0.0)
+        levels.append(Level(np.asarray(s[column]), np.asarray(c.sd[column]), variation, along, weight, column, i))
+        open_now = open_now & ~loose
+    return tuple(levels)
 
 
-def _grid(setup: Setup, peak: Peak) -> Float[np.ndarray, " grid"]:
+def _band(problem: FitProblem, peak: Maximum, name: str) -> Band:
+    """The grid of one frequency, and the tables of its lines in the spectra of the parts that it acts on."""
+    column = problem.coordinates.names.index(name)
+    acting = [i for i, part in enumerate(problem.parts) if column in part.columns]
+    for i in acting:
+        if not isinstance(problem.parts[i].task.harmonic.envelope, Constant):
+            raise ValueError(f"{name}: with an envelope that changes its posterior cannot be summed over a grid: fix it "
+                             f"(free= without {name})")  # fmt: skip
+    frequency = _grid(problem, peak, name)
+    tables = []
+    for part in (problem.parts[i] for i in acting):
+        settings, samples = part.target.settings, jnp.asarray(trial_samples(part.target))
+        compiled = jax.jit(jax.vmap(lambda f, settings=settings, n=samples: line_table(settings, WINDOW, f, n)))
+        table = compiled(jnp.asarray(frequency))
+        table = table._replace(level=table.level[:, part.chosen], turning=table.turning[:, part.chosen])
+        tables.append(jax.tree.map(np.asarray, table))
+    return Band(frequency, _log_weight(problem, frequency, name), tuple(tables), name, tuple(acting))
+
+
+def _grid(problem: FitProblem, peak: Maximum, name: str) -> Float[np.ndarray, " grid"]:
     """Frequencies three to a bin over the band, fewer beyond it, and close about every maximum that counts.
 
     The last is repeated, so that few sizes are compiled.
     """
-    names, settings, coordinates = setup.coordinates.names, setup.target.settings, setup.coordinates
-    column = names.index("harmonic_frequency")
-    theta = np.array([coordinates.low[column], coordinates.high[column]])
-    low, high = coordinates.centre[column] * np.exp(coordinates.sd[column] * theta)
-    high = min(high, HIGHEST * settings.rate)
-    edge = setup.target.frequency[-1] + 2 * settings.resolution
-    parts = [
-        np.arange(low, min(edge, high), settings.resolution / PER_BIN),
-        np.arange(edge, high, BEYOND * settings.resolution),
-        [high],
-    ]
-    found: list[float] = []
-    for i in np.argsort(peak.cost, kind="stable"):
-        f = float(coordinates.centre[column] * np.exp(coordinates.sd[column] * peak.theta[i, column]))
-        near = any(abs(f - g) < 0.5 * settings.resolution for g in found)
-        if near or len(found) >= MODES or not peak.cost[i] < peak.cost[peak.best] + FADED:
-            continue
-        found.append(f)
-        sd = f * coordinates.sd[column] * np.sqrt(peak.covariance(int(i))[column, column])
-        parts.append(f + min(sd, settings.resolution) * AROUND)
+    c, targets = problem.coordinates, [part.target for part in problem.acting(name)]
+    column, width = c.names.index(name), min(target.settings.resolution for target in targets)
+    theta = np.array([c.low[column], c.high[column]])
+    low, high = c.centre[column] * np.exp(c.sd[column] * theta)
+    high = min(high, HIGHEST * min(target.settings.rate for target in targets))
+    edge = max(target.frequency[-1] for target in targets) + 2 * width
+    parts = [np.arange(low, min(edge, high), width / PER_BIN), np.arange(edge, high, BEYOND * width), [high]]
+    for i in distinct(problem, peak.cost, peak.theta, 0.5 * width, FADED, MODES, [name]):
+        f = float(c.centre[column] * np.exp(c.sd[column] * peak.theta[i, column]))
+        sd = f * c.sd[column] * np.sqrt(peak.covariance(i)[column, column])
+        parts.append(f + min(sd, width) * AROUND)
     grid = np.unique(np.clip(np.concatenate(parts), low, high))
-    grid = grid[np.append(True, np.diff(grid) > 1e-3 * settings.resolution)]
+    grid = grid[np.append(True, np.diff(grid) > 1e-3 * width)]
     return np.append(grid, np.full(-len(grid) % FILLED, grid[-1]))
 
 
@@ -298,9 +343,9 @@ def edges_of(frequency: Float[np.ndarray, " grid"]) -> Float[np.ndarray, " edges
     return np.concatenate([frequency[:1], 0.5 * (frequency[1:] + frequency[:-1]), frequency[-1:]])
 
 
-def _log_weight(setup: Setup, frequency: Float[np.ndarray, " grid"]) -> Float[np.ndarray, " grid"]:
+def _log_weight(problem: FitProblem, frequency: Float[np.ndarray, " grid"], name: str) -> Float[np.ndarray, " grid"]:
     """Prior density of every frequency times the width of its cell."""
-    column = setup.coordinates.names.index("harmonic_frequency")
-    theta = setup.coordinates.theta_of("harmonic_frequency", frequency)
+    column = problem.coordinates.names.index(name)
+    theta = problem.coordinates.theta_of(name, frequency)
     with np.errstate(divide="ignore"):  # what is repeated has no width
-        return -0.5 * setup.prior[column] * theta**2 - np.log(frequency) + np.log(np.diff(edges_of(frequency)))
+        return -0.5 * problem.prior[column] * theta**2 - np.log(frequency) + np.log(np.diff(edges_of(frequency)))

@@ -10,10 +10,11 @@ from jaxtyping import Float
 from jaxmuscle import plot
 from jaxmuscle._common.errors import NotMixedError
 from jaxmuscle._common.files import replacing, write_json
+from jaxmuscle._common.parts import of_only, only
 from jaxmuscle._common.text import folded
 from jaxmuscle.data._target import Target
 from jaxmuscle.model._tasks import AbstractTask
-from jaxmuscle.objective._consequences import UNITS, unit_of
+from jaxmuscle.objective._consequences import unit_of
 
 from ._chains import Chains
 from ._posterior_checks import Replicates
@@ -27,29 +28,69 @@ if TYPE_CHECKING:
 CREDIBLE = (0.025, 0.975)
 
 
-class Posterior(eqx.Module):
-    """Draws from the posterior of a fit; arrays have leading axes (chain, draw).
+Modes = tuple[tuple[float, float, float, float], ...]
 
-    `success` and `message`: whether the chains mixed, or why not; `samples` of the free parameters and `derived` quantities
-    in natural units; `diagnostics` {name: (R-hat, effective size of the bulk, of the tails)}; `determined`, the names that
-    the data determine; `replicates`, what spectra the posterior predicts; `chains`, how it was drawn; `modes` of the
-    harmonic's frequency [(Hz, Hz, Hz, probability)] as (from, median, to, share).
+
+class PosteriorPart(eqx.Module):
+    """One target of a posterior: its `task` at the medians, `replicates`, what spectra the posterior predicts.
+
+    `names` {parameter of the task: name among the samples}.
+    """
+
+    target: Target
+    task: AbstractTask
+    replicates: Replicates
+    names: dict[str, str]
+
+
+class Posterior(eqx.Module):
+    """Draws from the posterior of a fit, of one target or of several; arrays have leading axes (chain, draw).
+
+    `success` and `message`: whether the chains mixed, or why not; `parts`, a `PosteriorPart` for each target by name;
+    `samples` of the free parameters and `derived` quantities in natural units; `diagnostics` {name: (R-hat, effective size
+    of the bulk, of the tails)}; `determined`, the names that the data determine; `frequency_modes` {harmonic frequency:
+    ((from, median, to, probability), ...)} [Hz]; `chains`, how it was drawn.
+
+    A posterior of one target has `target`, `task` and `replicates` of its own.
     """
 
     success: bool
     message: str
-    task: AbstractTask
-    target: Target
+    parts: dict[str, PosteriorPart]
     samples: dict[str, Float[np.ndarray, "chains draws"]]
     derived: dict[str, Float[np.ndarray, "chains draws"]]
     diagnostics: dict[str, tuple[float, float, float]]
     determined: tuple[str, ...]
-    modes: tuple[tuple[float, float, float, float], ...]
-    replicates: Replicates
+    frequency_modes: dict[str, Modes]
     chains: Chains
     settings: dict[str, Any]
     seed: int | None
     versions: dict[str, str]
+
+    @property
+    def only(self) -> PosteriorPart:
+        """The part of a posterior of one target. Raises `AttributeError` where there are several."""
+        return only(self.parts, "posterior")
+
+    target = of_only("target", "The target.")
+    task = of_only("task", "The task with the medians of the parameters.")
+    replicates = of_only("replicates", "What spectra the posterior predicts.")
+
+    @property
+    def modes(self) -> Modes:
+        """Modes of the harmonic's frequency: (from, median, to, probability). Of the first where several are free."""
+        return next(iter(self.frequency_modes.values()), ())
+
+    @property
+    def title(self) -> str:
+        """Names of the targets."""
+        return ", ".join(part.target.name for part in self.parts.values())
+
+    @property
+    def model(self) -> str:
+        """Tasks and noises in words."""
+        kinds = (f"{type(p.task).__name__}, {type(p.task.noise).__name__}" for p in self.parts.values())
+        return "; ".join(dict.fromkeys(kinds))
 
     @property
     def divergences(self) -> int:
@@ -64,7 +105,7 @@ class Posterior(eqx.Module):
     def summary(self) -> "Summary":
         """Mean, sd, median and 95 % interval of every quantity. Raises `NotMixedError` if the chains did not mix."""
         if not self.success:
-            raise NotMixedError(f"{self.target.name}: {self.message}")
+            raise NotMixedError(f"{self.title}: {self.message}")
         rows = {}
         for name, draws in self.quantities.items():
             low, middle, high = np.quantile(draws, (CREDIBLE[0], 0.5, CREDIBLE[1]))
@@ -73,11 +114,20 @@ class Posterior(eqx.Module):
 
     def unit(self, name: str) -> str:
         """Unit of a parameter or derived quantity."""
-        return self.task.output_unit if name == "mean" else UNITS.get(name, unit_of(name) or "1")
+        own = name.partition("@")[2]
+        part = self.parts[own] if own else next(iter(self.parts.values()))
+        return unit_of(name, part.task.output_unit) or "1"
 
-    def task_of(self, chain: int, draw: int) -> AbstractTask:
-        """The task with the parameters of one draw."""
-        return self.task.replace(**{name: float(draws[chain, draw]) for name, draws in self.samples.items()})
+    def task_of(self, chain: int, draw: int, target: str | None = None) -> AbstractTask:
+        """The task with the parameters of one draw; of several targets, the named one's."""
+        part = self.only if target is None else self.parts[target]
+        values = {}
+        for name, shared in part.names.items():
+            draws = self.samples[shared]
+            value, middle, own = float(draws[chain, draw]), float(np.median(draws)), float(part.task[name])
+            # A proportional parameter keeps its ratio to the first target's.
+            values[name] = value if middle == own else value * own / middle
+        return part.task.replace(**values)
 
     def to_datatree(self) -> "xarray.DataTree":
         """ArviZ's groups posterior, posterior_predictive, sample_stats, observed_data, over chain, draw, frequency."""
@@ -98,20 +148,22 @@ class Posterior(eqx.Module):
         """Traces of the chains, also of those that did not mix."""
         return plot.chains(self, ax)
 
-    def plot_predictive(self, ax: "Axes | None" = None) -> "Axes":
-        """The target among the spectra that the posterior predicts. Returns the axes."""
-        return plot.predictive(self, ax)
+    def plot_predictive(self, ax: "Axes | None" = None, target: str | None = None) -> "Axes":
+        """The target (of several, the named one) among the spectra that the posterior predicts. Returns the axes."""
+        return plot.predictive(self, ax, target)
 
     def __str__(self) -> str:
         count, draws = self.chains.log_density.shape
-        lines = [f"{'posterior' if self.success else 'NO POSTERIOR'}: {self.target.name}, {type(self.task).__name__}, "
-                 f"{type(self.task.noise).__name__}", f"  {self.message}",
+        lines = [f"{'posterior' if self.success else 'NO POSTERIOR'}: {self.title}, {self.model}", f"  {self.message}",
                  f"  {count} chains of {draws} draws, {self.divergences} divergences"]  # fmt: skip
         if self.success:
-            lines.append(f"  posterior-predictive chi2: p = {self.replicates.p_value:.2g}")
-            if len(self.modes) > 1:
-                told = ", ".join(f"{middle:.2f} Hz ({100 * share:.0f} %)" for _, middle, _, share in self.modes)
-                lines.append(f"  harmonic_frequency has several modes: {told}")
+            for name, part in self.parts.items():
+                whose = f"{name}: " if len(self.parts) > 1 else ""
+                lines.append(f"  {whose}posterior-predictive chi2: p = {part.replicates.p_value:.2g}")
+            for name, modes in self.frequency_modes.items():
+                if len(modes) > 1:
+                    told = ", ".join(f"{middle:.2f} Hz ({100 * share:.0f} %)" for _, middle, _, share in modes)
+                    lines.append(f"  {name} has several modes: {told}")
         return folded(lines)
 
 
@@ -145,26 +197,35 @@ KEYS = ("r_hat", "ess_bulk", "ess_tail")
 
 
 def datatree(found: Any) -> "xarray.DataTree":
-    """Groups posterior, posterior_predictive, sample_stats, observed_data."""
+    """Groups posterior, posterior_predictive, sample_stats, observed_data.
+
+    With several targets the spectra are called "expected@target" and so on, over "frequency@target".
+    """
     import xarray
 
     chains, draws = found.chains.log_density.shape
     axes = {"chain": np.arange(chains), "draw": np.arange(draws)}
-    bins = axes | {"frequency": ("frequency", np.asarray(found.target.frequency), {"units": "Hz"})}
-    pair, spectrum = ("chain", "draw"), ("chain", "draw", "frequency")
-    measured = np.asarray(found.target.proportional_power)
+    pair = ("chain", "draw")
     named = {name: (pair, x, {"units": found.unit(name), "determined": int(name in found.determined)})
              for name, x in found.quantities.items()}  # fmt: skip
     made = found.chains
     stats = {"lp": made.log_density, "acceptance_rate": made.acceptance, "n_steps": made.steps, "diverging": made.diverging}
-    told = {"success": int(found.success), "message": found.message, "target": found.target.name, "seed": str(found.seed)}
+    told = {"success": int(found.success), "message": found.message, "target": found.title, "seed": str(found.seed)}
     told |= {f"version_{name}": number for name, number in found.versions.items()}
+    bins, expected, drawn, measured = {}, {}, {}, {}
+    for name, part in found.parts.items():
+        end = f"@{name}" if len(found.parts) > 1 else ""
+        bin_axis, power = f"frequency{end}", np.asarray(part.target.proportional_power)
+        bins[bin_axis] = (bin_axis, np.asarray(part.target.frequency), {"units": "Hz"})
+        expected[f"expected{end}"] = (*pair, bin_axis), part.replicates.expected
+        drawn[f"proportional_power{end}"] = (*pair, bin_axis), part.replicates.power
+        measured[f"proportional_power{end}"] = bin_axis, power
     groups = {
         "/": xarray.Dataset(attrs=told),
-        "/posterior": xarray.Dataset(named | {"expected": (spectrum, found.replicates.expected)}, bins),
-        "/posterior_predictive": xarray.Dataset({"proportional_power": (spectrum, found.replicates.power)}, bins),
+        "/posterior": xarray.Dataset(named | expected, axes | bins),
+        "/posterior_predictive": xarray.Dataset(drawn, axes | bins),
         "/sample_stats": xarray.Dataset({name: (pair, x) for name, x in stats.items()}, axes, {"step_size": made.step_size}),
-        "/observed_data": xarray.Dataset({"proportional_power": ("frequency", measured)}, {"frequency": bins["frequency"]}),
+        "/observed_data": xarray.Dataset(measured, bins),
     }
     return xarray.DataTree.from_dict(groups)
 
@@ -181,18 +242,22 @@ def summary_table(found: Any) -> dict[str, Any]:
     if found.success:
         summary = found.summary()
         rows = {n: summary[n] | {"unit": found.unit(n), "determined": n in found.determined} for n in summary.rows}
+    single = len(found.parts) == 1
+    keys = ("from_hz", "median_hz", "to_hz", "probability")
+    modes = {name: [dict(zip(keys, m, strict=True)) for m in modes] for name, modes in found.frequency_modes.items()}
+    p_values = {name: part.replicates.p_value for name, part in found.parts.items()}
+    about = {name: {"target": part.target.name, "task": type(part.task).__name__, "noise": type(part.task.noise).__name__}
+             for name, part in found.parts.items()}  # fmt: skip
     return {
         "format": 1,
         "success": found.success,
         "message": found.message,
-        "target": found.target.name,
-        "task": type(found.task).__name__,
-        "noise": type(found.task.noise).__name__,
+        **(next(iter(about.values())) if single else {"parts": about}),
         "divergences": found.divergences,
         "diagnostics": {n: dict(zip(KEYS, d, strict=True)) for n, d in found.diagnostics.items()},
         "summary": rows,
-        "modes": [dict(zip(("from_hz", "median_hz", "to_hz", "probability"), m, strict=True)) for m in found.modes],
-        "predictive_p_value": found.replicates.p_value if found.success else None,
+        "modes": next(iter(modes.values()), []) if single else modes,
+        "predictive_p_value": None if not found.success else found.replicates.p_value if single else p_values,
         "seed": found.seed,
         "settings": found.settings,
         "versions": found.versions,

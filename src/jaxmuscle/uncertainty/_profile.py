@@ -12,12 +12,13 @@ from jaxtyping import Float
 from jaxmuscle import plot
 from jaxmuscle._common.text import choices, folded
 from jaxmuscle.data._target import Target
-from jaxmuscle.fits._reopened import taken_up
+from jaxmuscle.fits._reopened import reopened
 from jaxmuscle.fits._result import FitResult
-from jaxmuscle.objective._consequences import DERIVED, UNITS, quantities, seen_at, unit_of
+from jaxmuscle.objective._consequences import expand, quantities, unit_of
 from jaxmuscle.objective._likelihood import Likelihood
-from jaxmuscle.objective._problem import Setup, theta_of
-from jaxmuscle.objective._scoring import Peak, Pin, climb, highest
+from jaxmuscle.objective._problem import FitProblem
+from jaxmuscle.objective._scoring import Maximum, Pin, highest, maximise
+from jaxmuscle.objective._starts import distinct, frequency_names
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -120,42 +121,45 @@ def profile(
     if not 0 < level < 1:
         raise ValueError(f"level = {level}: give a probability between 0 and 1, 0.95 say")
     with jax.enable_x64(True):
-        setup = taken_up(result, target, free=free, priors=priors, bounds=bounds)
-        names = setup.coordinates.names
-        known = (*names, *(n for n in DERIVED if n not in names))
+        problem = reopened(result, target, free=free, priors=priors, bounds=bounds)
+        names = problem.coordinates.names
+        known = (*names, *(n for n in result.derived_names if n not in names))
         if name not in known:
             raise ValueError(f"name = {name!r} is neither free nor derived: {choices(name, known)}")
-        likelihood = Likelihood.of(setup)
-        precision = np.asarray(setup.prior, dtype=float) if with_priors else np.full(len(names), WEAK)
-        peak, best = highest(setup, likelihood, theta_of(setup, result.task), precision)
+        likelihood = Likelihood.of(problem)
+        precision = np.asarray(problem.prior, dtype=float) if with_priors else np.full(len(names), WEAK)
+        peak, best = highest(problem, likelihood, problem.theta_of(tuple(result.tasks.values())), precision)
         scan = _parameter if name in names else _derived
-        value, stderr, values, height, cost = scan(setup, likelihood, peak, best, precision, name)
+        value, stderr, values, height, cost = scan(problem, likelihood, peak, best, precision, name)
     order = np.argsort(values, kind="stable")
     values, height, cost = values[order], height[order], cost[order]
     rise = 2 * (cost - cost.min()) if with_priors else 2 * (height.max() - height)
     intervals = _intervals(values, rise, float(scipy.stats.chi2.ppf(level, 1)))
-    unit = setup.task.output_unit if name == "mean" else UNITS.get(name, unit_of(name) or "1")
-    return Profile(name, unit, setup.target.name, value, stderr, values, rise, intervals, level, with_priors)
+    unit = unit_of(name, problem.parts[problem.where(name)[0]].task.output_unit) or "1"
+    return Profile(name, unit, problem.title, value, stderr, values, rise, intervals, level, with_priors)
 
 
 Scan = tuple[float, float, np.ndarray, np.ndarray, np.ndarray]
 
 
-def _parameter(setup: Setup, likelihood: Likelihood, peak: Peak, best: int, precision: np.ndarray, name: str) -> Scan:
+def _parameter(
+    problem: FitProblem, likelihood: Likelihood, peak: Maximum, best: int, precision: np.ndarray, name: str
+) -> Scan:
     """A free parameter held at θ_j."""
-    coordinates = setup.coordinates
+    coordinates = problem.coordinates
     j = coordinates.names.index(name)
     centre, sd = peak.theta[best, j], np.sqrt(peak.covariance(best)[j, j])
-    if name == "harmonic_frequency":
-        f, settings = setup.target.frequency, setup.target.settings
-        held = np.arange(f[0], f[-1] + 1e-9, settings.resolution / PER_BIN)
+    if name in frequency_names(coordinates):
+        acting = [part.target.frequency for part in problem.acting(name)]
+        low, high = min(f[0] for f in acting), max(f[-1] for f in acting)
+        held = np.arange(low, high + 1e-9, problem.finest.settings.resolution / PER_BIN)
         held = coordinates.theta_of(name, np.append(held, coordinates.values(peak.theta[best])[name]))
     else:
         held = _outward(centre, sd, 1 / coordinates.sd[j])
-    theta = np.concatenate([_along(peak, i, j, held) for i in _modes(setup, peak, name)])
+    theta = np.concatenate([_along(peak, i, j, held) for i in _modes(problem, peak, name)])
     moving = np.ones_like(theta)
     moving[:, j] = 0.0
-    found = climb(likelihood, theta, precision, moving=moving)
+    found = maximise(likelihood, theta, precision, moving=moving)
     values = coordinates.values_of(found.theta)[:, j]
     slope = coordinates.slope(coordinates.values_of(peak.theta[[best]])[0])[j]
     top = float(coordinates.values_of(peak.theta[[best]])[0, j])
@@ -167,24 +171,27 @@ def _parameter(setup: Setup, likelihood: Likelihood, peak: Peak, best: int, prec
     return top, float(sd * slope), *_unique(value, height, cost)
 
 
-def _derived(setup: Setup, likelihood: Likelihood, peak: Peak, best: int, precision: np.ndarray, name: str) -> Scan:
+def _derived(
+    problem: FitProblem, likelihood: Likelihood, peak: Maximum, best: int, precision: np.ndarray, name: str
+) -> Scan:
     """A derived quantity held by a stiff penalty; its own value where that ends."""
-    values, slopes = quantities(likelihood.problem, seen_at(likelihood.problem, peak.theta))
-    q, g = np.asarray(values[name]), np.asarray(slopes[name])
+    part, quantity = problem.where(name)
+    tables = quantities(likelihood.objective, expand(likelihood.objective, peak.theta))
+    q, g = (table[part][quantity] for table in tables)
     if not np.any(g[best]):
-        raise ValueError(f"{name} follows from none of the free parameters ({', '.join(setup.coordinates.names)})")
+        raise ValueError(f"{name} follows from none of the free parameters ({', '.join(problem.coordinates.names)})")
     log = bool(q[best] > 0)
     top, rise = (np.log(q), g / q[:, None]) if log else (q, g)
     spread = np.sqrt(rise[best] @ peak.covariance(best) @ rise[best])
     held = _outward(top[best], spread, FURTHEST if log else np.inf)
     rows = []
-    for i in _modes(setup, peak, name):
+    for i in _modes(problem, peak, name):
         toward = peak.covariance(i) @ rise[i]
         rows.append(peak.theta[i] + np.outer(held - top[i], toward / (rise[i] @ toward)))
     theta = np.clip(np.concatenate(rows), -8, 8)
-    pin = Pin(name, np.tile(held, len(rows)), HELD * min(spread, FURTHEST) if log else HELD * spread, log)
-    found = climb(likelihood, theta, precision, pin=pin, max_steps=100)
-    seen = np.asarray(quantities(likelihood.problem, seen_at(likelihood.problem, found.theta))[0][name])
+    pin = Pin(part, quantity, np.tile(held, len(rows)), HELD * min(spread, FURTHEST) if log else HELD * spread, log)
+    found = maximise(likelihood, theta, precision, pin=pin, max_steps=100)
+    seen = quantities(likelihood.objective, expand(likelihood.objective, found.theta))[0][part][quantity]
     cost = 0.5 * np.sum(precision * found.theta**2, axis=1) - found.log_likelihood
     value, height, cost = _best_of(seen, found.log_likelihood, np.where(np.isfinite(found.cost), cost, np.inf), len(held))
     value, height, cost = (
@@ -203,7 +210,7 @@ def _outward(centre: float, sd: float, most: float) -> np.ndarray:
     return centre + np.concatenate([-steps[::-1], steps])
 
 
-def _along(peak: Peak, i: int, j: int, held: np.ndarray) -> np.ndarray:
+def _along(peak: Maximum, i: int, j: int, held: np.ndarray) -> np.ndarray:
     """θ on the ridge of one maximum with the coordinate j held."""
     covariance = peak.covariance(i)
     theta = peak.theta[i] + np.outer(held - peak.theta[i, j], covariance[:, j] / covariance[j, j])
@@ -212,18 +219,11 @@ def _along(peak: Peak, i: int, j: int, held: np.ndarray) -> np.ndarray:
     return theta
 
 
-def _modes(setup: Setup, peak: Peak, name: str) -> list[int]:
-    """The best maximum and others near in height but at another frequency of the harmonic."""
-    names = setup.coordinates.names
-    chosen = [peak.best]
-    if "harmonic_frequency" not in names or name == "harmonic_frequency":
-        return chosen
-    frequency = setup.coordinates.values_of(peak.theta)[:, names.index("harmonic_frequency")]
-    for i in np.argsort(peak.cost, kind="stable"):
-        near = np.min(np.abs(frequency[i] - frequency[chosen])) < setup.target.settings.resolution
-        if not near and peak.cost[i] < peak.cost[peak.best] + COUNTS and len(chosen) < MODES:
-            chosen.append(int(i))
-    return chosen
+def _modes(problem: FitProblem, peak: Maximum, name: str) -> list[int]:
+    """The best maximum and others near in height but at another frequency of a harmonic."""
+    if name in frequency_names(problem.coordinates):
+        return [peak.best]
+    return distinct(problem, peak.cost, peak.theta, problem.finest.settings.resolution, COUNTS, MODES)
 
 
 def _best_of(values: np.ndarray, height: np.ndarray, cost: np.ndarray, count: int) -> tuple[np.ndarray, ...]:

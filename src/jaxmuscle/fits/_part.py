@@ -1,0 +1,129 @@
+"""What a fit found of one target, and numbers with their errors: as objects and as tables."""
+
+from typing import Any
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Float
+
+from jaxmuscle._common.arrays import from_nulls, with_nulls
+from jaxmuscle.data._target import Target
+from jaxmuscle.model._presets import task_from_table, task_to_table
+from jaxmuscle.model._tasks import TASKS, AbstractTask
+
+SPECTRUM = ("fitted", "harmonic_share", "residual", "deviation")
+
+
+class Estimate(eqx.Module):
+    """A number, its `value` in `unit`, with its standard error; `stderr` is None where the data do not determine it.
+
+    `free`, whether it was fitted; `identifiable`, whether the data determine it.
+    """
+
+    value: float
+    unit: str
+    stderr: float | None = None
+    free: bool = True
+    identifiable: bool = True
+
+    def error_in_words(self, digits: int = 2) -> str:
+        """The standard error, or why there is none."""
+        if self.stderr is not None:
+            return f"{self.stderr:.{digits}g}"
+        return "not determined" if self.free else "fixed"
+
+
+class Start(eqx.Module):
+    """One start of a fit: final cost `½ Σ r²` (None if not finite), whether it settled, steps taken."""
+
+    cost: float | None
+    success: bool
+    steps: int
+
+
+class FittedPart(eqx.Module):
+    """What a fit found of one target.
+
+    Its fitted `task`; `chi2_per_bin` (None without knowledge of the spread) and `rms_log_error`; on the target's bins the
+    `fitted` proportional power (of fresh seeds where they were simulated), `harmonic_share` of each bin's power, `residual`
+    and `deviation` [standard deviations, log power]; `stretch`, time and output of a few simulated seconds; `check`, how far
+    linear response and nonlinear simulation differ.
+    """
+
+    target: Target
+    task: AbstractTask
+    chi2_per_bin: float | None
+    rms_log_error: float | None
+    fitted: Float[np.ndarray, " bins"]
+    harmonic_share: Float[np.ndarray, " bins"]
+    residual: Float[np.ndarray, " bins"]
+    deviation: Float[np.ndarray, " bins"] | None
+    stretch: tuple[np.ndarray, np.ndarray]
+    check: dict[str, float | int]
+
+    @property
+    def frequency_hz(self) -> Float[np.ndarray, " bins"]:
+        """Frequencies of the bins [Hz]."""
+        return np.asarray(self.target.frequency)
+
+    @property
+    def model(self) -> str:
+        """Task and noise in words."""
+        return f"{type(self.task).__name__}, {type(self.task.noise).__name__}"
+
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """Linear response against simulation, in a sentence."""
+        if "largest_deviation" not in self.check:
+            return ()
+        said = f"simulation and linear response differ by at most {100 * self.check['largest_deviation']:.2g} % of a bin"
+        if "largest_deviation_se" in self.check:
+            said += f" ({self.check['largest_deviation_se']:.1f} standard errors of {self.check['seeds']} seeds)"
+        return (said,)
+
+
+def estimates_to_table(table: dict[str, Estimate]) -> dict[str, Any]:
+    """For JSON, which knows no infinite numbers."""
+    return {n: {"value": with_nulls(float(p.value)), "unit": p.unit, "stderr": p.stderr, "free": p.free,
+                "identifiable": p.identifiable} for n, p in table.items()}  # fmt: skip
+
+
+def read_estimates(table: dict[str, Any]) -> dict[str, Estimate]:
+    """The reverse of `estimates_to_table`."""
+    return {n: Estimate(np.nan if p["value"] is None else p["value"], p["unit"], p["stderr"], p["free"], p["identifiable"])
+            for n, p in table.items()}  # fmt: skip
+
+
+def part_to_table(part: FittedPart) -> dict[str, Any]:
+    """What `fit.json` says of one target."""
+    kind = next((name for name, kind in TASKS.items() if isinstance(part.task, kind)), type(part.task).__name__)
+    return {
+        "target": part.target.name,
+        "provenance": part.target.provenance,
+        "task": kind,
+        "chi2_per_bin": part.chi2_per_bin,
+        "rms_log_error": part.rms_log_error,
+        "spectrum": {
+            "frequency_hz": with_nulls(part.frequency_hz),
+            "target": with_nulls(part.target.proportional_power),
+            **{field: with_nulls(getattr(part, field)) for field in SPECTRUM},
+        },
+        "stretch": {"time": with_nulls(part.stretch[0]), "output": with_nulls(part.stretch[1])},
+        "check": part.check,
+        "target_table": part.target.to_table(),
+        "task_table": task_to_table(part.task),
+    }
+
+
+def read_part(table: dict[str, Any]) -> FittedPart:
+    """The reverse of `part_to_table`."""
+    spectrum, stretch = table["spectrum"], table["stretch"]
+    return FittedPart(
+        target=Target.from_table(table["target_table"]),
+        task=task_from_table(table["task_table"]),
+        chi2_per_bin=table["chi2_per_bin"],
+        rms_log_error=table["rms_log_error"],
+        **{field: from_nulls(spectrum[field]) for field in SPECTRUM},
+        stretch=(from_nulls(stretch["time"]), from_nulls(stretch["output"])),
+        check=table["check"],
+    )

@@ -1,0 +1,127 @@
+"""The residuals of a fit: what each target and the prior contribute, of one target or of several."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxmuscle._common.types import Scalar
+from jaxmuscle.data._target import Target
+from jaxmuscle.model._tasks import AbstractTask
+from jaxmuscle.response._expected import Moments
+from jaxmuscle.spectra._bin_law import BinStatistics, shares_map
+
+from ._coordinates import Coordinates, task_at
+from ._moment_models import Linear, MonteCarlo
+
+
+class Data(eqx.Module):
+    """What a fit knows of a target: powers, their spread, log coefficient of variation and mean with their sds (or None).
+
+    The model does not depend on it.
+    """
+
+    target: Float[Array | np.ndarray, "*rows bins"]
+    bias: Float[Array | np.ndarray, "*rows bins"]
+    sd: Float[Array | np.ndarray, "*rows bins"]
+    sigma: Float[Array | np.ndarray, "*rows bins"]
+    variation: tuple[Scalar, Scalar] | None
+    mean: tuple[Scalar, Scalar] | None
+
+
+class PartResiduals(eqx.Module):
+    """One target's share: its task and coordinates, the model of its moments, and its data."""
+
+    task: AbstractTask
+    coordinates: Coordinates
+    model: Linear | MonteCarlo
+    data: Data
+    statistics: BinStatistics
+    residual: str = eqx.field(static=True)
+
+    def moments(self, theta: Float[Array, " own"]) -> Moments:
+        """Moments of the model at its own coordinates."""
+        return self.model.moments(task_at(self.task, self.coordinates, theta))
+
+    def data_residuals(self, moments: Moments, data: Data) -> Float[Array, " residuals"]:
+        """Residuals in standard deviations of the data: spectrum, then coefficient of variation and mean."""
+        return jnp.concatenate([jnp.asarray(self._spectrum_residuals(moments, data)), further_residuals(moments, data)])
+
+    def _spectrum_residuals(self, moments: Moments, data: Data) -> Float[Array | np.ndarray, " bins"]:
+        if self.residual == "log":
+            z = jnp.log(data.target) - data.bias - jnp.log(moments.power)
+            return (z - jnp.mean(z)) / data.sd
+        difference = data.target - moments.proportional
+        if self.residual == "linear":
+            return difference / data.sigma
+        return jnp.cumsum(difference)[:-1] / data.sigma[:-1]
+
+
+def further_residuals(moments: Moments, data: Data) -> Float[Array, " rows"]:
+    """Residuals of coefficient of variation and mean, where there are such."""
+    rows = [] if data.variation is None else [(jnp.log(moments.variation) - data.variation[0]) / data.variation[1]]
+    rows += [] if data.mean is None else [(moments.mean - data.mean[0]) / data.mean[1]]
+    return jnp.stack([jnp.asarray(row) for row in rows]) if rows else jnp.zeros(0)
+
+
+class Residuals(eqx.Module):
+    """Everything that the residuals of a fit depend on besides the free coordinates.
+
+    Of one target or of several: `columns` says of every part where its own coordinates stand among those of the fit. Moments
+    and data are tuples, one entry for each part.
+    """
+
+    parts: tuple[PartResiduals, ...]
+    coordinates: Coordinates
+    prior: Float[Array | np.ndarray, " free"]
+    moving: Float[Array | np.ndarray, " free"]
+    columns: tuple[tuple[int, ...], ...] = eqx.field(static=True)
+
+    @property
+    def linear(self) -> bool:
+        """Whether the moments are those of the linear response."""
+        return isinstance(self.parts[0].model, Linear)
+
+    @property
+    def data(self) -> tuple[Data, ...]:
+        """Data of every part."""
+        return tuple(part.data for part in self.parts)
+
+    def theta(self, s: Float[Array | np.ndarray, "*rows free"]) -> Float[Array | np.ndarray, "*rows free"]:
+        """Coordinates in prior standard deviations; what is not `moving` (1, else 0) has no slope."""
+        if not isinstance(s, np.ndarray):
+            s = jnp.where(self.moving > 0, s, jax.lax.stop_gradient(s))
+        return self.coordinates.theta(s)
+
+    def data_residuals(self, moments: tuple[Moments, ...], data: tuple[Data, ...]) -> Float[Array, " residuals"]:
+        """Data residuals of all parts, one after the other."""
+        return jnp.concatenate([p.data_residuals(m, d) for p, m, d in zip(self.parts, moments, data, strict=True)])
+
+    def residuals(
+        self, theta: Float[Array, " free"], moments: tuple[Moments, ...], data: tuple[Data, ...]
+    ) -> Float[Array, " all"]:
+        """Data residuals of the moments at θ, then those of the prior, which counts once."""
+        return jnp.concatenate([self.data_residuals(moments, data), jnp.sqrt(self.prior) * theta])
+
+    def own(self, values: Float[Array | np.ndarray, "*rows free"], i: int) -> Float[Array | np.ndarray, "*rows own"]:
+        """One part's columns of θ, or of slopes with respect to it."""
+        return values[..., np.array(self.columns[i], dtype=int)]
+
+    def spread(self, slope: Float[np.ndarray, "*rows own"], i: int) -> Float[np.ndarray, "*rows free"]:
+        """Slopes with respect to one part's coordinates as slopes with respect to all."""
+        whole = np.zeros((*np.shape(slope)[:-1], len(self.coordinates.names)))
+        whole[..., np.array(self.columns[i], dtype=int)] = slope
+        return whole
+
+
+def residual_sigma(kind: str, target: Target, statistics: BinStatistics) -> Float[np.ndarray, " bins"]:
+    """What the linear and the cumulative residual are divided by: standard deviations of p_k or of its running sum."""
+    p = target.proportional_power
+    if kind == "linear" and target.sigma is not None and target.segments is None:
+        return np.asarray(target.sigma)
+    spread = shares_map(p) @ statistics.covariance @ shares_map(p).T
+    if kind == "cumulative":
+        summed = np.tril(np.ones((len(p), len(p))))
+        spread = summed @ spread @ summed.T
+    return np.sqrt(np.maximum(np.diag(spread), 1e-300))
