@@ -5,7 +5,6 @@ ignores the stored values too: (x, y) = A (px, py) + c with A mapping the pixel 
 of the axis values, in log10 on a logarithmic axis.
 """
 
-import csv
 import io
 import json
 import tarfile
@@ -18,6 +17,7 @@ from jaxmuscle._common.errors import TargetError
 from jaxmuscle._common.text import choices
 
 from ._target_fields import Columns, check_columns, is_number
+from ._text_tables import cells_of, lines_of, number_in
 
 Axis = Literal["linear", "log-log"]
 AXES: tuple[str, ...] = ("linear", "log-log")
@@ -87,12 +87,11 @@ def read_datasets(text: str, file: str, dataset: str | None) -> Points | None:
 
     **Raises:** `TargetError` naming file and line.
     """
-    numbered = enumerate(text.splitlines(), 1)
-    lines = [(f"line {i}", line) for i, line in numbered if line.strip() and not line.lstrip().startswith("#")]
+    lines = [(line.place, line.body) for line in lines_of(text) if line.body.strip()]
     if len(lines) < 2:
         return None
     delimiter = next((sign for sign in "\t;" if sign in lines[1][1]), ",")
-    header, labels, *rows = ([cell.strip() for cell in _cells(line, delimiter)] for _, line in lines)
+    header, labels, *rows = (cells_of(line, delimiter) for _, line in lines)
     starts = [i for i in range(len(labels) - 1) if labels[i : i + 2] == LABELS]
     if not starts:
         return None
@@ -243,13 +242,6 @@ def _get(table: Any, key: str, kind: type, where: str) -> Any:
     return value
 
 
-def _cells(line: str, delimiter: str) -> list[str]:
-    try:
-        return next(csv.reader([line], delimiter=delimiter, skipinitialspace=True))
-    except csv.Error:
-        return [line]
-
-
 def _part(
     rows: list[list[str]], places: list[str], start: int, delimiter: str, file: str
 ) -> tuple[list[list[float]], list[str]]:
@@ -267,6 +259,6 @@ def _part(
 
 def _cell(cell: str, label: str, delimiter: str, where: str) -> float:
     try:
-        return float(cell if delimiter == "," else cell.replace(",", "."))
+        return number_in(cell, delimiter)
     except ValueError:
         raise TargetError(f"{where}: {label} {cell!r} is not a number") from None

@@ -1,6 +1,5 @@
 """Recordings as text: columns separated by comma, semicolon, tab or blanks, with or without a header."""
 
-import csv
 import functools
 
 import numpy as np
@@ -9,6 +8,7 @@ from jaxtyping import Float
 from jaxmuscle._common.files import text_of
 
 from ._recording_table import Table, time_name, unit_in
+from ._text_tables import SIGNS, Line, cells_of, is_number, lines_of, number_in
 
 MISSING = ("", "nan", "-nan", "na", "n/a", "null", "none")
 
@@ -22,20 +22,19 @@ def read_csv(data: bytes, file: str) -> Table:
 
     **Raises:** `ValueError` naming file and line.
     """
-    lines = text_of(data, file).replace("\r\n", "\n").replace("\r", "\n").split("\n")
-    parts = [line.partition("#") for line in lines]
-    rows = [(number, body) for number, (body, _, _) in enumerate(parts, 1) if body.strip()]
+    lines = lines_of(text_of(data, file))
+    rows = [(line.number, line.body) for line in lines if line.body.strip()]
     if not rows:
         raise ValueError(f"{file}: holds no data, only comments")
     delimiter = _delimiter([body for _, body in rows])
-    cells = [_split(body, delimiter) for _, body in rows]
+    cells = [cells_of(body, delimiter) for _, body in rows]
     if delimiter is None and all(len(row) == 1 for row in cells[1:]) and '"' not in rows[0][1]:
         cells[0] = [rows[0][1].strip()]
     numbers = [number for number, _ in rows]
     if all(len(row) > 1 and not row[-1] for row in cells):
         cells = [row[:-1] for row in cells]
     header = None
-    if not all(_is_number(cell, delimiter) for cell in cells[0]):
+    if not all(cell.casefold() in MISSING or is_number(cell, delimiter) for cell in cells[0]):
         header, place = cells.pop(0), numbers.pop(0)
         if not cells:
             raise ValueError(f"{file}: holds a header (line {place}) but no data")
@@ -43,7 +42,7 @@ def read_csv(data: bytes, file: str) -> Table:
     for number, row in zip(numbers, cells, strict=True):
         if len(row) != width:
             raise ValueError(f"{file}, line {number}: {len(row)} of {width} columns found; {_remedy(delimiter)}")
-    names = header or _commented(parts[: numbers[0] - 1], delimiter, width)
+    names = header or _commented(lines[: numbers[0] - 1], delimiter, width)
     return _table(file, names, cells, tuple(numbers), delimiter)
 
 
@@ -62,38 +61,19 @@ def _table(
 
 def _delimiter(bodies: list[str]) -> str | None:
     """Tab, semicolon or comma, the first that is in most lines; `None` for blanks or a single column."""
-    signs = ("\t", ";", ",")
-    return next((sign for sign in signs if sum(sign in body for body in bodies) > len(bodies) / 2), None)
-
-
-def _split(body: str, delimiter: str | None) -> list[str]:
-    if '"' in body:
-        cells = next(csv.reader([body.strip()], delimiter=delimiter or " ", skipinitialspace=True))
-    else:
-        cells = body.split(delimiter)
-    return [cell.strip() for cell in cells]
+    return next((sign for sign in SIGNS if sum(sign in body for body in bodies) > len(bodies) / 2), None)
 
 
 def _number(cell: str, delimiter: str | None) -> float:
     if cell.casefold() in MISSING:
         return float("nan")
-    if "_" in cell:
-        raise ValueError
-    return float(cell if delimiter == "," else cell.replace(",", "."))
+    return number_in(cell, delimiter)
 
 
-def _is_number(cell: str, delimiter: str | None) -> bool:
-    try:
-        _number(cell, delimiter)
-    except ValueError:
-        return False
-    return True
-
-
-def _commented(parts: list[tuple[str, str, str]], delimiter: str | None, width: int) -> list[str] | None:
+def _commented(lines: list[Line], delimiter: str | None, width: int) -> list[str] | None:
     """The header in the last comment, if it looks like one."""
-    notes = [note for _, sign, note in parts if sign]
-    names = _split(notes[-1], delimiter) if notes else []
+    notes = [line.note for line in lines if line.note is not None]
+    names = cells_of(notes[-1], delimiter) if notes else []
     fits = len(names) == width == len(set(names)) and time_name(Table("", dict.fromkeys(names, np.zeros)))  # pyright: ignore
     return names if fits else None
 

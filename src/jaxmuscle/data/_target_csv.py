@@ -1,6 +1,5 @@
 """Targets as CSV: columns of frequency, power and sigma, with or without a header."""
 
-import csv
 from typing import NamedTuple
 
 import numpy as np
@@ -9,6 +8,7 @@ from jaxmuscle._common.errors import TargetError
 from jaxmuscle._common.text import choices
 
 from ._target_fields import Columns
+from ._text_tables import SIGNS, cells_of, is_number, lines_of, number_in
 
 NAMES: tuple[str, ...] = ("frequency_hz", "proportional_power", "sigma")
 
@@ -29,15 +29,14 @@ def read_csv(text: str, file: str) -> Sheet:
 
     **Raises:** `TargetError` naming file and line.
     """
-    lines = text.replace("\r\n", "\n").replace("\r", "\n").split("\n")
-    parts = [line.partition("#") for line in lines]
-    rows = [(f"line {i}", body) for i, (body, _, _) in enumerate(parts, 1) if body.strip()]
-    comment = " ".join(note.strip() for _, _, note in parts if note.strip())
+    lines = lines_of(text)
+    rows = [(line.place, line.body) for line in lines if line.body.strip()]
+    comment = " ".join(line.note.strip() for line in lines if line.note and line.note.strip())
     if not rows:
         raise TargetError(f"{file}: holds no data; expected lines of {NAMES[0]},{NAMES[1]}")
     delimiter = _delimiter(*rows[0], file)
-    cells = [(place, _split(body, delimiter)) for place, body in rows]
-    has_header = not _is_number(cells[0][1][0], delimiter)
+    cells = [(place, cells_of(body, delimiter)) for place, body in rows]
+    has_header = not is_number(cells[0][1][0], delimiter)
     names = _header(*cells.pop(0), file) if has_header else list(NAMES[:2])
     if not cells:
         raise TargetError(f"{file}: holds a header but no data")
@@ -65,30 +64,10 @@ def merge_duplicates(columns: Columns, tolerance: float) -> Columns:
 def _delimiter(place: str, body: str, file: str) -> str:
     if "\t" in body.strip() and ";" in body:
         raise TargetError(f"{file}, {place}: holds tabs and semicolons; use one of them between the columns")
-    found = next((sign for sign in ("\t", ";", ",") if sign in body.strip()), None)
+    found = next((sign for sign in SIGNS if sign in body.strip()), None)
     if found is None:
         raise TargetError(f"{file}, {place}: one column; separate frequency and power by comma, semicolon or tab")
     return found
-
-
-def _split(body: str, delimiter: str) -> list[str]:
-    try:
-        cells = next(csv.reader([body.strip(" ")], delimiter=delimiter, skipinitialspace=True))
-    except csv.Error:
-        return [body]
-    return [cell.strip() for cell in cells]
-
-
-def _number(cell: str, delimiter: str) -> float:
-    return float(cell if delimiter == "," else cell.replace(",", "."))
-
-
-def _is_number(cell: str, delimiter: str) -> bool:
-    try:
-        _number(cell, delimiter)
-    except ValueError:
-        return False
-    return True
 
 
 def _header(place: str, row: list[str], file: str) -> list[str]:
@@ -110,6 +89,6 @@ def _numbers(place: str, row: list[str], names: list[str], delimiter: str, file:
         remedy = "a third column needs a header naming it sigma, or " + remedy if len(row) == 3 else remedy
         raise TargetError(f"{file}, {place}: {len(row)} of {len(names)} columns found; {remedy}")
     for name, cell in zip(names, row, strict=True):
-        if not _is_number(cell, delimiter):
+        if not is_number(cell, delimiter):
             raise TargetError(f"{file}, {place}: {name} {cell!r} is not a number")
-    return [_number(cell, delimiter) for cell in row]
+    return [number_in(cell, delimiter) for cell in row]

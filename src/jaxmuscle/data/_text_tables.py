@@ -1,0 +1,53 @@
+"""Text that holds a table: lines with comments, cells between delimiters, numbers with decimal commas."""
+
+import csv
+from typing import NamedTuple
+
+SIGNS = ("\t", ";", ",")
+
+
+class Line(NamedTuple):
+    """A line of a file: its number, what is before the `#`, and the comment behind it, None without one."""
+
+    number: int
+    body: str
+    note: str | None
+
+    @property
+    def place(self) -> str:
+        """What an error calls it."""
+        return f"line {self.number}"
+
+
+def lines_of(text: str) -> list[Line]:
+    """All lines, whatever system wrote them."""
+    parts = (line.partition("#") for line in text.replace("\r\n", "\n").replace("\r", "\n").split("\n"))
+    return [Line(number, body, note if sign else None) for number, (body, sign, note) in enumerate(parts, 1)]
+
+
+def cells_of(body: str, delimiter: str | None) -> list[str]:
+    """What stands between the delimiters (None: blanks), without blanks about it; quotes keep a delimiter as text."""
+    if '"' not in body:
+        cells = body.split(delimiter)
+    else:
+        try:
+            cells = next(csv.reader([body.strip(" ")], delimiter=delimiter or " ", skipinitialspace=True))
+        except csv.Error:
+            return [body]
+    return [cell.strip() for cell in cells]
+
+
+def number_in(cell: str, delimiter: str | None) -> float:
+    """The number of a cell; its decimal sign may be a comma unless that is the delimiter. Raises `ValueError`."""
+    if "_" in cell:  # Python would take it as one between digits
+        raise ValueError(f"{cell!r} is not a number")
+    return float(cell if delimiter == "," else cell.replace(",", "."))
+
+
+def is_number(cell: str, delimiter: str | None) -> bool:
+    """Whether a cell holds a number."""
+    try:
+        number_in(cell, delimiter)
+    except ValueError:
+        return False
+    return True
