@@ -8,7 +8,6 @@ import jax
 import numpy as np
 from jax import Array
 
-from jaxmuscle._common.arrays import as_arrays, as_numbers
 from jaxmuscle._common.errors import SimulationError
 from jaxmuscle.data._target import Target
 from jaxmuscle.ensembles._ensemble import ensemble
@@ -44,7 +43,7 @@ def replicates_of(problem: FitProblem, tasks: tuple[AbstractTask, ...], count: i
 
 def _simulated(part: Part, task: AbstractTask, count: int, key: Array, failed: dict[int, str]) -> dict[int, Datum]:
     """Targets from the nonlinear simulator, with their mean output."""
-    still = as_numbers(settled(as_arrays(task)))
+    still = settled(task)
     trials = list(part.target.segments or ())
     runs = [_runs(still, part.target, K, jax.random.fold_in(key, trial), np.arange(count), failed)
             for trial, K in enumerate(trials)]  # fmt: skip
@@ -64,7 +63,7 @@ def _runs(
 ) -> dict[int, Any]:
     """Welch power, coefficient of variation and mean of one trial of every replicate that stays finite."""
     settings = target.settings
-    rate = float(slowest_rate(as_arrays(task)))
+    rate = float(slowest_rate(task))
     start = math.ceil(max(LEAD, FORGOTTEN / rate) * settings.rate) / settings.rate
     window = start, start + (settings.length + (segments - 1) * settings.step) / settings.rate
     try:

@@ -17,7 +17,7 @@ from jaxmuscle._common.arrays import as_arrays
 from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.response._linearised import LinearTask
 from jaxmuscle.simulation._batch import LANES, Recipe, blocks, local_mesh, run_points, run_seeds
-from jaxmuscle.simulation._simulate import Plan, companion, planned
+from jaxmuscle.simulation._simulate import Schedule, companion, schedule
 from jaxmuscle.spectra._settings import WINDOW
 
 from ._processes import agreed
@@ -72,7 +72,7 @@ class Layout(NamedTuple):
     task: AbstractTask | Sweep
     key: PRNGKeyArray
     seeds: Int[np.ndarray, " seeds"] | range
-    plan: Plan
+    plan: Schedule
     linear: tuple[LinearTask, ...] | None
     recipe: Recipe
     together: int
@@ -115,7 +115,7 @@ def laid_out(
     task: AbstractTask | Sweep,
     key: PRNGKeyArray,
     seeds: Int[np.ndarray, " seeds"] | range,
-    plan: Plan,
+    plan: Schedule,
     linear: tuple[LinearTask, ...] | None,
     *,
     cut: Cut,
@@ -136,7 +136,7 @@ def _one_of(task: AbstractTask | Sweep) -> AbstractTask:
     return task.task if isinstance(task, Sweep) else task
 
 
-def cut_of(task: AbstractTask | Sweep, seeds: int, plan: Plan, chunk: int | None, *, shared: bool) -> Cut:
+def cut_of(task: AbstractTask | Sweep, seeds: int, plan: Schedule, chunk: int | None, *, shared: bool) -> Cut:
     """As many seeds at once as the cache of every device likes, times `BLOCKS`; whole points where their seeds are few.
 
     Where processes share the work, what process 0 says.
@@ -149,21 +149,21 @@ def cut_of(task: AbstractTask | Sweep, seeds: int, plan: Plan, chunk: int | None
     return Cut(1, EIGHT * math.ceil(min(lanes, seeds) / EIGHT))
 
 
-def lanes_of(plan: Plan) -> int:
+def lanes_of(plan: Schedule) -> int:
     """How many seeds a device simulates side by side."""
     return max(EIGHT, min(LANES, EIGHT * (STEPS_AT_ONCE // plan.grid.steps // EIGHT)))
 
 
-def covers_window(plan: Plan, task: AbstractTask | Sweep) -> bool:
+def covers_window(plan: Schedule, task: AbstractTask | Sweep) -> bool:
     """Whether a run covers the analysed 5 s to 15 s at a multiple of the spectrum's rate."""
     every = plan.rate / _one_of(task).settings.rate
     whole = every >= 1 and abs(every - round(every)) < 1e-9 * every
     return whole and plan.grid.dt * plan.grid.steps >= WINDOW[1] - 1e-9
 
 
-def plan_of(task: AbstractTask | Sweep, *given: Any) -> Plan:
+def plan_of(task: AbstractTask | Sweep, *given: Any) -> Schedule:
     """The plan of a task; of a sweep with the sub-steps that its fastest point needs."""
-    plans = [planned(each, *given) for each in ([task] if isinstance(task, AbstractTask) else task)]
+    plans = [schedule(each, *given) for each in ([task] if isinstance(task, AbstractTask) else task)]
     return max(plans, key=lambda plan: plan.grid.substeps)
 
 

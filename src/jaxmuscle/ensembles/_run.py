@@ -34,8 +34,8 @@ from ._store import (
     read_tallies,
     state_of,
     tally_files,
+    write_moments,
     write_region,
-    write_tally,
 )
 from ._summary import EnsembleSummary, summarised
 from ._sweep import Sweep
@@ -86,11 +86,11 @@ def _share_tallies(
     name = f"{1 + max((int(file.stem.split('-')[1]) for file in old), default=0):06d}-{rank:06d}"
     meet()  # all know what is left before anybody adds to it
     if rank == 0 and old:
-        write_tally(path, name, base)
+        write_moments(path, name, base)
         for file in old:
             file.unlink(missing_ok=True)
     found = _reduce(layout, levels, base if rank == 0 else nothing(), todo, tell, _keeper(path, name))
-    write_tally(path, name, found)
+    write_moments(path, name, found)
     meet()
 
 
@@ -151,7 +151,7 @@ def _keeper(path: Path, name: str) -> Callable[[Reduced], None]:
         nonlocal due
         begun = time.monotonic()
         if begun >= due:
-            write_tally(path, name, found)
+            write_moments(path, name, found)
             now = time.monotonic()
             due = now + max(KEEP_EVERY, KEEP_SHARE * (now - begun))
 

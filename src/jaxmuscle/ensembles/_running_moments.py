@@ -10,7 +10,7 @@ CELLS = 512
 REACH = 8.0  # standard deviations of the first chunk
 
 
-class Tally(NamedTuple):
+class RunningMoments(NamedTuple):
     """What is known of every point of a sweep (a leading axis, 1 long for one task).
 
     `seeds` that were finite; `mean` and `squares` (sums of squared deviations) of the values of a seed in a row: its output
@@ -28,22 +28,22 @@ class Tally(NamedTuple):
     cells: Int[np.ndarray, "points samples cells"]
 
 
-def empty(points: int, values: int, samples: int, levels: int, *, whole: bool) -> Tally:
+def empty(points: int, values: int, samples: int, levels: int, *, whole: bool) -> RunningMoments:
     """Of nothing; `whole` if every point comes in one piece, so that nothing has to be counted in cells."""
     rows, cells = np.zeros((points, values)), 0 if whole else CELLS
     unknown = np.full((points, samples), np.nan)
     exact = np.full((points, levels, samples), np.nan)
-    return Tally(np.zeros(points, int), rows, rows.copy(), exact, unknown, unknown.copy(),
+    return RunningMoments(np.zeros(points, int), rows, rows.copy(), exact, unknown, unknown.copy(),
                  np.zeros((points, samples, cells), np.int32))  # fmt: skip
 
 
-def add(tally: Tally, point: int, rows: Float[np.ndarray, "seeds values"]) -> None:
-    """Take the finite seeds of a chunk of one point into the tally, in place."""
+def add(kept: RunningMoments, point: int, rows: Float[np.ndarray, "seeds values"]) -> None:
+    """Take the finite seeds of a chunk of one point into what is kept, in place."""
     if len(rows):
         mean = rows.mean(axis=0, dtype=float)
         squares = np.square(rows - mean).sum(axis=0)
-        moments = _merged((tally.seeds[point], tally.mean[point], tally.squares[point]), (len(rows), mean, squares))
-        tally.seeds[point], tally.mean[point], tally.squares[point] = moments
+        moments = _merged((kept.seeds[point], kept.mean[point], kept.squares[point]), (len(rows), mean, squares))
+        kept.seeds[point], kept.mean[point], kept.squares[point] = moments
 
 
 def _merged(a: tuple, b: tuple) -> tuple:
@@ -54,35 +54,35 @@ def _merged(a: tuple, b: tuple) -> tuple:
     return count, a[1] + share * delta, a[2] + b[2] + delta**2 * (share * a[0])
 
 
-def set_cells(tally: Tally, point: int, output: Float[np.ndarray, "seeds samples"]) -> None:
+def set_cells(kept: RunningMoments, point: int, output: Float[np.ndarray, "seeds samples"]) -> None:
     """Where the cells of a point lie, from the output of its first chunk."""
     mean, sd = output.mean(axis=0, dtype=float), output.std(axis=0, dtype=float)
     tiny = 1e-6 * np.abs(mean) + 1e3 * np.finfo(output.dtype).tiny  # what does not vary has its value for a quantile
     reach = np.maximum(REACH * sd, 2 * np.abs(output - mean).max(axis=0)) + tiny
-    tally.low[point], tally.high[point] = mean - reach, mean + reach
+    kept.low[point], kept.high[point] = mean - reach, mean + reach
 
 
-def count_cells(tally: Tally, point: int, output: Float[np.ndarray, "seeds samples"]) -> None:
+def count_cells(kept: RunningMoments, point: int, output: Float[np.ndarray, "seeds samples"]) -> None:
     """Count the output of a chunk in the cells of its point."""
-    low, high = (edge[point].astype(output.dtype) for edge in (tally.low, tally.high))
+    low, high = (edge[point].astype(output.dtype) for edge in (kept.low, kept.high))
     place = np.clip((output - low) * (CELLS / (high - low)), 0, CELLS - 1)
     cell = place.astype(np.int32) + CELLS * np.arange(output.shape[1], dtype=np.int32)
-    tally.cells[point] += np.bincount(cell.ravel(), minlength=tally.cells[point].size).reshape(-1, CELLS).astype(np.int32)
+    kept.cells[point] += np.bincount(cell.ravel(), minlength=kept.cells[point].size).reshape(-1, CELLS).astype(np.int32)
 
 
-def merged(first: Tally, second: Tally) -> Tally:
+def merged(first: RunningMoments, second: RunningMoments) -> RunningMoments:
     """Both together; they must not share a chunk."""
     a, b = ((t.seeds[:, None], t.mean, t.squares) for t in (first, second))
     count, mean, squares = _merged(a, b)
     exact, low, high = (np.where(np.isnan(x), y, x) for x, y in zip(first[3:6], second[3:6], strict=True))
-    return Tally(count[:, 0], mean, squares, exact, low, high, first.cells + second.cells)
+    return RunningMoments(count[:, 0], mean, squares, exact, low, high, first.cells + second.cells)
 
 
-def quantiles(tally: Tally, levels: tuple[float, ...]) -> Float[np.ndarray, "points levels samples"]:
+def quantiles(kept: RunningMoments, levels: tuple[float, ...]) -> Float[np.ndarray, "points levels samples"]:
     """Quantiles of the output: exact, or linear within their cell (1/32 of a standard deviation); NaN in an open cell."""
-    found = tally.exact.copy()
-    for point in np.flatnonzero(np.isnan(found).all(axis=(1, 2)) & (tally.seeds > 0)):
-        low, high, cells = tally.low[point], tally.high[point], tally.cells[point]
+    found = kept.exact.copy()
+    for point in np.flatnonzero(np.isnan(found).all(axis=(1, 2)) & (kept.seeds > 0)):
+        low, high, cells = kept.low[point], kept.high[point], kept.cells[point]
         if cells.size:
             for i, level in enumerate(levels):
                 found[point, i] = _quantile(low, (high - low) / CELLS, cells, level)

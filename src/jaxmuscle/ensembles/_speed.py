@@ -9,7 +9,7 @@ import jax
 import numpy as np
 
 from jaxmuscle.model._tasks import AbstractTask
-from jaxmuscle.simulation._simulate import DT, planned
+from jaxmuscle.simulation._simulate import DT, schedule
 
 from ._ensemble import ensemble
 
@@ -43,7 +43,7 @@ def measure(task: AbstractTask, seeds: int, duration: float) -> dict[str, Any]:
         ensemble(task, jax.random.key(turn), seeds=seeds, duration=duration, reduce=True, control=False)
         taken.append(time.perf_counter() - begun)
     warm = float(np.median(taken[1:]))
-    plan = planned(task, duration, DT, None, None, None)
+    plan = schedule(task, duration, DT, None, None, None)
     devices = jax.local_devices()
     found = {
         "task": type(task).__name__, "noise": type(task.noise).__name__, "precision": str(jax.numpy.result_type(float)),

@@ -15,7 +15,7 @@ import numpy as np
 from jaxmuscle._common.errors import StoreError
 from jaxmuscle._common.files import replacing, write_json
 
-from ._running_moments import Tally, merged
+from ._running_moments import RunningMoments, merged
 
 SETTINGS = "settings"
 DONE, TALLY = "progress-", "tally-"
@@ -159,12 +159,12 @@ def logged(path: Path) -> dict[int, list[list[int]]]:
 class Reduced(NamedTuple):
     """A tally, the chunks in it, and the (point, seed) that failed in them."""
 
-    tally: Tally
+    tally: RunningMoments
     chunks: frozenset[int]
     failed: list[list[int]]
 
 
-def write_tally(path: Path, name: str, reduced: Reduced) -> None:
+def write_moments(path: Path, name: str, reduced: Reduced) -> None:
     """Keep what was reduced so far; replaces the file in one step."""
     with writing(path), replacing(path / f"{TALLY}{name}.npz") as temporary, temporary.open("wb") as file:
         np.savez(file, chunks=np.array(sorted(reduced.chunks), int), failed=np.array(reduced.failed, int).reshape(-1, 2),
@@ -178,7 +178,7 @@ def read_tallies(path: Path, whole: Reduced) -> Reduced:
             chunks = frozenset(data["chunks"].tolist())
             if chunks & whole.chunks:
                 continue
-            part = Tally(*(data[name] for name in Tally._fields))
+            part = RunningMoments(*(data[name] for name in RunningMoments._fields))
             whole = Reduced(merged(whole.tally, part), whole.chunks | chunks, whole.failed + data["failed"].tolist())
     return whole
 

@@ -14,7 +14,7 @@ from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.spectra._mean import SpectrumEstimate, from_moments
 from jaxmuscle.spectra._settings import SpectrumSettings
 
-from ._running_moments import Tally, quantiles
+from ._running_moments import RunningMoments, quantiles
 from ._sweep import Sweep
 
 if TYPE_CHECKING:
@@ -149,7 +149,7 @@ class EnsembleSummary(eqx.Module):
 
 
 def summarised(
-    tally: Tally,
+    tally: RunningMoments,
     task: AbstractTask | Sweep,
     shape: tuple[int, int],
     time: Float[np.ndarray, " samples"],

@@ -5,7 +5,6 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from jaxmuscle._common.arrays import as_arrays
 from jaxmuscle.data._target import Target
 from jaxmuscle.objective._consequences import Expansion, consequences, expand
 from jaxmuscle.objective._least_squares import Minima
@@ -44,7 +43,7 @@ def controlled_moments(runs: Trajectory, target: Target) -> tuple[Moments, Momen
     power, variance = np.asarray(runs.spectrum(settings).power), held.var(axis=1)
     expected = None
     if runs.linear is not None:
-        exact, _ = expected_moments(as_arrays(runs.task), settings, WINDOW, trial_samples(target))
+        exact, _ = expected_moments(runs.task, settings, WINDOW, trial_samples(target))
         expected = jax.tree.map(np.asarray, exact)
         beside = runs.beside()
         power = expected.power + power - np.asarray(beside.spectrum(settings).power)

@@ -7,7 +7,6 @@ import jax
 import numpy as np
 from scipy.linalg import block_diag
 
-from jaxmuscle._common.arrays import as_arrays, as_numbers
 from jaxmuscle._common.environment import versions
 from jaxmuscle._common.errors import SimulationError
 from jaxmuscle.ensembles._ensemble import ensemble
@@ -127,7 +126,7 @@ class _Made(NamedTuple):
 
 def _simulated(problem: FitProblem, part: Part, task: AbstractTask, seeds: int) -> _Made:
     """Of fresh seeds of the nonlinear model."""
-    still = as_numbers(settled(as_arrays(task))) if problem.control else task
+    still = settled(task) if problem.control else task
     runs = ensemble(still, jax.random.fold_in(problem.key, 1), seeds=seeds)
     each, expected = controlled_moments(runs, part.target)
     each = each._replace(power=np.asarray(each.power)[:, part.chosen])

@@ -7,7 +7,6 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from jaxmuscle._common.arrays import as_arrays, as_numbers
 from jaxmuscle._common.errors import SimulationError
 from jaxmuscle.ensembles._ensemble import ensemble
 from jaxmuscle.model._tasks import AbstractTask
@@ -163,7 +162,7 @@ def _with_recombined(plan: Plan, objective: Residuals, found: Minima) -> Minima:
 def correction_at(problem: FitProblem, part: Part, task: AbstractTask) -> Moments | None:
     """Moments of the nonlinear model over those of the linear response; None if the task cannot be simulated."""
     try:
-        runs = ensemble(as_numbers(settled(as_arrays(task))), jax.random.fold_in(problem.key, 2), seeds=problem.seeds)
+        runs = ensemble(settled(task), jax.random.fold_in(problem.key, 2), seeds=problem.seeds)
     except (SimulationError, ValueError):
         return None  # the check on fresh seeds meets the same error and reports it
     each, expected = controlled_moments(runs, part.target)

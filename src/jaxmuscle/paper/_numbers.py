@@ -120,10 +120,10 @@ class Experiment(eqx.Module):
 
 def tuned(task: AbstractTask) -> Tuned:
     """A preset's force in Task 1, and its displacement in Task 2 under the force that it needs there."""
-    moments, _ = expected_moments(as_arrays(task), task.settings, WINDOW)
+    moments, _ = expected_moments(task, task.settings, WINDOW)
     runs = ensemble(task, jax.random.key(0), seeds=SEEDS, control=False)
     second = pulled(task)
-    moved, _ = expected_moments(as_arrays(second), second.settings, WINDOW)
+    moved, _ = expected_moments(second, second.settings, WINDOW)
     fast = np.mean([fast_share(row, runs.rate) for row in np.asarray(runs.between())])
     return Tuned(
         force=runs,

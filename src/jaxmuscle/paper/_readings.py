@@ -5,7 +5,6 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from jaxmuscle._common.arrays import as_arrays
 from jaxmuscle.ensembles._ensemble import ensemble
 from jaxmuscle.model._muscle import Muscle
 from jaxmuscle.model._noise import BandLimitedNoise
@@ -103,7 +102,7 @@ def readings(preset: AbstractTask) -> tuple[Reading, ...]:
 
 def _stationary(key: str, words: str, task: AbstractTask) -> Reading:
     """By the expected spectrum; the time series from one seed."""
-    moments, _ = expected_moments(as_arrays(task), task.settings, WINDOW)
+    moments, _ = expected_moments(task, task.settings, WINDOW)
     runs = ensemble(task, jax.random.key(0), seeds=SEEDS, control=False)
     return _judged(key, words, task, np.asarray(runs.between())[0], _spectrum(task, moments.power), _sine(moments))
 
@@ -111,7 +110,7 @@ def _stationary(key: str, words: str, task: AbstractTask) -> Reading:
 def _simulated(key: str, words: str, task: AbstractTask, settings: SpectrumSettings) -> Reading:
     """By the mean spectrum of 16 seeds: neither a mean that leaks nor a transient has an expected spectrum."""
     runs = ensemble(task, jax.random.key(0), seeds=SEEDS, control=False)
-    moments, _ = expected_moments(as_arrays(task), settings, WINDOW)
+    moments, _ = expected_moments(task, settings, WINDOW)
     mean = runs.spectrum(settings).mean()
     spectrum = Spectrum(settings.frequency, np.asarray(mean.power), settings, mean.unit)
     sine = float(moments.line[0] / spectrum.power[0])
@@ -122,7 +121,7 @@ def _judged(
     key: str, words: str, task: AbstractTask, force: Float[np.ndarray, " times"], spectrum: Spectrum, sine: float
 ) -> Reading:
     second = pulled(task)
-    moments, _ = expected_moments(as_arrays(second), second.settings, WINDOW)
+    moments, _ = expected_moments(second, second.settings, WINDOW)
     displacement = _spectrum(second, moments.power)
     found, moved, fast = peaks(spectrum), peaks(displacement), fast_share(force, task.settings.rate)
     facts = {

@@ -237,7 +237,7 @@ def expected_moments(
 ) -> tuple[Moments, Linearisation]:
     """`response`, compiled once for all numbers of samples."""
     samples = samples_in(window, settings) if samples is None else samples
-    return _compiled_response(task, settings, window, jnp.asarray(samples))
+    return _compiled_response(as_arrays(task), settings, window, jnp.asarray(samples))
 
 
 @eqx.filter_jit
@@ -288,7 +288,7 @@ def expected_spectrum(
     settings = task.settings if settings is None else settings
     if all(is_concrete(leaf) for leaf in jax.tree.leaves(task)):
         check_line(task, settings)
-    moments, system = expected_moments(as_arrays(task), settings, window)
+    moments, system = expected_moments(task, settings, window)
     if is_concrete(moments.power):
         check_equilibrium(task, np.asarray(system.point), np.asarray(system.A))
         if not np.any(np.asarray(moments.power) > 0):

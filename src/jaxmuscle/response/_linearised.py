@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxmuscle._common.arrays import as_arrays, is_concrete
+from jaxmuscle._common.arrays import as_arrays, as_numbers, is_concrete
 from jaxmuscle._common.errors import OperatingPointError
 from jaxmuscle._common.types import Scalar
 from jaxmuscle.model._muscle import Perturbation
@@ -81,16 +81,21 @@ def settled(task: AbstractTask, time: float = HOLD) -> AbstractTask:
     Its simulation has no rise and no transient of the mean: what the linear response describes.
     """
     traced = not all(is_concrete(leaf) for leaf in jax.tree.leaves(task))
-    point = equilibrium(task, time) if traced else np.asarray(linearised(as_arrays(task), time).system.point).tolist()
+    point = equilibrium(task, time) if traced else np.asarray(linearised(task, time).system.point).tolist()
     held = {field.name: Constant(getattr(task, field.name)(jnp.asarray(time))) for field in dataclasses.fields(task)
             if isinstance(getattr(task, field.name), AbstractSignal)}  # fmt: skip
-    return task.with_parts(**held, initial=tuple(point))
+    found = task.with_parts(**held, initial=tuple(point))
+    return found if traced else as_numbers(found)
 
 
 @eqx.filter_jit
+def _compiled(task: AbstractTask, time: float) -> LinearTask:
+    return LinearTask.of(task, linearise(task, time))
+
+
 def linearised(task: AbstractTask, time: float = HOLD) -> LinearTask:
     """`LinearTask.of`, compiled."""
-    return LinearTask.of(task, linearise(task, time))
+    return _compiled(as_arrays(task), time)
 
 
 def check_equilibrium(task: Any, point: np.ndarray, A: np.ndarray) -> float:
@@ -116,7 +121,7 @@ def check_equilibrium(task: Any, point: np.ndarray, A: np.ndarray) -> float:
 def has_response(task: AbstractTask, *, required: bool) -> bool:
     """Whether a task has a stable, damped equilibrium; with `required`, why not is an error."""
     with jax.enable_x64(True):
-        system = linearised(as_arrays(task)).system
+        system = linearised(task).system
         try:
             check_equilibrium(task, np.asarray(system.point), np.asarray(system.A))
         except OperatingPointError:

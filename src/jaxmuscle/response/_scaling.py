@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxmuscle._common.arrays import as_arrays, is_concrete, require
+from jaxmuscle._common.arrays import is_concrete, require
 from jaxmuscle._common.types import Scalar
 from jaxmuscle.model._muscle import Muscle, QuadraticDamping, QuadraticStiffness
 from jaxmuscle.model._parameters import CHANNELS
@@ -181,8 +181,8 @@ def _with_variation(task: AbstractTask, before: AbstractTask, factor: Scalar) ->
 def _variation(task: AbstractTask) -> Any:
     """Expected coefficient of variation of the output: to first order proportional to the amplitudes."""
     if not all(is_concrete(leaf) for leaf in jax.tree.leaves(task)):
-        return expected_moments(as_arrays(task), task.settings, WINDOW)[0].variation
+        return expected_moments(task, task.settings, WINDOW)[0].variation
     with jax.ensure_compile_time_eval(), jax.enable_x64(True):
-        moments, system = expected_moments(as_arrays(task), task.settings, WINDOW)
+        moments, system = expected_moments(task, task.settings, WINDOW)
         check_equilibrium(task, np.asarray(system.point), np.asarray(system.A))
         return float(moments.variation)

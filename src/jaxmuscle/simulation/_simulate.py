@@ -52,7 +52,7 @@ def simulate(
     not finite (not under a JAX transformation, where it is returned as it is).
     """
     seeds = jnp.atleast_1d(jnp.asarray(seed))
-    result = one(trajectories(task, None, key, seeds, planned(task, duration, dt, rate, substeps, sampling)))
+    result = one(trajectories(task, None, key, seeds, schedule(task, duration, dt, rate, substeps, sampling)))
     require_finite(result)
     return result
 
@@ -60,7 +60,7 @@ def simulate(
 def companion(task: AbstractTask, duration: float, *, required: bool) -> LinearTask | None:
     """The linearised task, if its response is stationary in the analysed window; else None, or an error if required."""
     with jax.enable_x64(True):
-        linear = linearised(as_arrays(task))
+        linear = linearised(task)
         try:
             slowest = check_equilibrium(task, np.asarray(linear.system.point), np.asarray(linear.system.A))
         except OperatingPointError:
@@ -80,7 +80,7 @@ def companion(task: AbstractTask, duration: float, *, required: bool) -> LinearT
     return linear
 
 
-class Plan(NamedTuple):
+class Schedule(NamedTuple):
     """On which grid a task is simulated and how it is sampled, at which rate [Hz]."""
 
     grid: Grid
@@ -88,14 +88,14 @@ class Plan(NamedTuple):
     rate: float
 
 
-def planned(
+def schedule(
     task: AbstractTask,
     duration: float,
     dt: float,
     rate: float | None,
     substeps: int | None,
     sampling: str | None,
-) -> Plan:
+) -> Schedule:
     """The plan of a simulation. Raises `ValueError` for a grid that does not fit."""
     rate = task.settings.rate if rate is None else rate
     sampling = task.settings.sampling if sampling is None else sampling
@@ -110,7 +110,7 @@ def planned(
         task.noise.check_step(dt)
     if substeps is None:
         substeps = stable_substeps(task, dt, duration) if all_concrete(task) else 1
-    return Plan(Grid(dt, samples * every, every, substeps, reverse=not all_concrete(task)), sampling, rate)
+    return Schedule(Grid(dt, samples * every, every, substeps, reverse=not all_concrete(task)), sampling, rate)
 
 
 def whole(value: float, message: str) -> int:
@@ -122,7 +122,7 @@ def whole(value: float, message: str) -> int:
 
 def stable_substeps(task: AbstractTask, dt: float, duration: float = DURATION) -> int:
     """The power of two of sub-steps that brings max |eigenvalue| dt to at most 0.5; Heun diverges above 2."""
-    fastest = fastest_rate(as_numbers(task), duration)
+    fastest = fastest_rate(task, duration)
     needed = fastest * dt / MAX_RATE_STEP
     substeps = 2 ** max(0, math.ceil(math.log2(max(needed, 1.0))))
     if substeps > MAX_SUBSTEPS:
@@ -134,7 +134,7 @@ def stable_substeps(task: AbstractTask, dt: float, duration: float = DURATION) -
 
 
 def trajectories(
-    task: AbstractTask, linear: LinearTask | None, key: PRNGKeyArray, seeds: Any, plan: Plan, mesh: Any = None
+    task: AbstractTask, linear: LinearTask | None, key: PRNGKeyArray, seeds: Any, plan: Schedule, mesh: Any = None
 ) -> Trajectory:
     """Every seed of one task in one program, finite or not; arrays stay where they were computed."""
     recipe = Recipe(plan.grid, plan.sampling, True, task.settings)
