@@ -10,19 +10,19 @@ from jaxtyping import Float
 
 from jaxmuscle import plot
 from jaxmuscle._common.environment import versions
-from jaxmuscle._common.parts import only
+from jaxmuscle._common.parts import of_only, only
 from jaxmuscle._common.text import folded
 from jaxmuscle.data._target import Target
 from jaxmuscle.fits._reopened import reopened
 from jaxmuscle.fits._result import FitResult
 from jaxmuscle.objective._consequences import expand
 from jaxmuscle.objective._least_squares import least_squares
-from jaxmuscle.objective._likelihood import LEAST, Likelihood, check_known, drawn_spectra, repeated
+from jaxmuscle.objective._likelihood import Likelihood, check_known, drawn_spectra, repeated
 from jaxmuscle.objective._problem import FitProblem
 from jaxmuscle.objective._residuals import Data, Residuals
 from jaxmuscle.objective._starts import frequency_names
 from jaxmuscle.response._expected import Moments
-from jaxmuscle.spectra._bin_law import BinStatistics, bin_statistics
+from jaxmuscle.spectra._bin_law import bin_statistics
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -140,50 +140,19 @@ class Goodness(eqx.Module):
         """The part of a fit of one target. Raises `AttributeError` where there are several."""
         return only(self.parts, "goodness")
 
-    @property
-    def target(self) -> Target:
-        """The target."""
-        return self.only.target
-
-    @property
-    def residual(self) -> Float[np.ndarray, " bins"]:
-        """Residual of every bin."""
-        return self.only.residual
-
-    @property
-    def observed(self) -> dict[str, float]:
-        """The three numbers."""
-        return self.only.observed
-
-    @property
-    def reference(self) -> dict[str, Float[np.ndarray, " replicates"]]:
-        """The three numbers of the replicates."""
-        return self.only.reference
-
-    @property
-    def p_values(self) -> dict[str, float]:
-        """p-value of each number and of all."""
-        return self.only.p_values
-
-    @property
-    def residuals(self) -> Float[np.ndarray, "replicates bins"]:
-        """Residuals of the replicates."""
-        return self.only.residuals
+    target = of_only("target", "The target.")
+    residual = of_only("residual", "Residual of every bin.")
+    observed = of_only("observed", "The three numbers.")
+    reference = of_only("reference", "The three numbers of the replicates.")
+    p_values = of_only("p_values", "p-value of each number and of all.")
+    residuals = of_only("residuals", "Residuals of the replicates.")
+    law = of_only("law", "Law of the bins.")
+    sentences = of_only("sentences", "Each check in words, then the three together.")
 
     @property
     def foretold(self) -> bool:
         """Whether the spectrum is another than the one fitted."""
         return next(iter(self.parts.values())).foretold
-
-    @property
-    def law(self) -> str:
-        """Law of the bins."""
-        return self.only.law
-
-    @property
-    def sentences(self) -> tuple[str, ...]:
-        """Each check in words, then the three together."""
-        return self.only.sentences
 
     def __str__(self) -> str:
         lines = [str(part) for part in self.parts.values()]
@@ -246,15 +215,9 @@ def goodness(result: FitResult, target: Target | None = None, *, replicates: int
 
 def residuals_of(power: Rows, expected: Rows, target: Target, share: Rows) -> Rows:
     """`(ln(p_k / E_k) - bias_k - mean) / sd_k` of every row, the line's share of its bins known."""
-    bias, sd = _scatter(target, bin_statistics(target), share)
-    z = np.log(power) - np.log(expected) - bias
-    return (z - z.mean(axis=1, keepdims=True)) / sd
-
-
-def _scatter(target: Target, statistics: BinStatistics, share: Rows) -> tuple[Rows, Rows]:
-    """Bias and standard deviation of every row's log powers, as `bin_statistics` with that row's share of the line."""
-    keep = np.maximum(1 - share**2, LEAST) if target.segments is not None else np.ones_like(share)
-    return statistics.bias * keep, statistics.sd * np.sqrt(keep)
+    law = bin_statistics(target, share)
+    z = np.log(power) - np.log(expected) - law.bias
+    return (z - z.mean(axis=1, keepdims=True)) / law.sd
 
 
 class Drawn(NamedTuple):
@@ -332,9 +295,9 @@ def _starts(problem: FitProblem, theta: np.ndarray, drawn: Drawn) -> Float[np.nd
 def _data(problem: FitProblem, objective: Residuals, drawn: Drawn, share: tuple[Rows, ...]) -> tuple[Data, ...]:
     made = []
     for i, (part, own) in enumerate(zip(problem.parts, objective.data, strict=True)):
-        bias, sd = _scatter(part.target, bin_statistics(part.target), share[i])
+        law = bin_statistics(part.target, share[i])
         sigma = np.broadcast_to(np.asarray(own.sigma), (len(drawn.power[i]), *np.shape(own.sigma)))
-        made.append(Data(drawn.power[i], bias, sd, sigma, drawn.variation[i], drawn.mean[i]))
+        made.append(Data(drawn.power[i], law.bias, law.sd, sigma, drawn.variation[i], drawn.mean[i]))
     return tuple(made)
 
 

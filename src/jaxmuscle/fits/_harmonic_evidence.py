@@ -12,6 +12,7 @@ from jaxmuscle.objective._consequences import consequences, expand
 from jaxmuscle.objective._least_squares import Minima, least_squares
 from jaxmuscle.objective._problem import FitProblem
 from jaxmuscle.objective._residuals import Residuals
+from jaxmuscle.spectra._bin_law import bin_statistics
 
 from ._checks import seen_best
 
@@ -111,7 +112,7 @@ def _p_value(problem: FitProblem, objective: Residuals, final: Minima) -> float:
         return np.max(-2 * rows @ left.T - size, axis=1)
 
     noise = np.zeros((REPLICATES, len(residual)))
-    noise[:, :n] = _scatter(problem, objective, n)
+    noise[:, :n] = _scatter(problem, n)
     if objective.data[0].variation is not None:
         noise[:, n] = _generator(problem, 4).normal(size=REPLICATES)
     better = np.sum(improvement(noise) >= improvement(residual[None])[0])
@@ -122,13 +123,12 @@ def _generator(problem: FitProblem, number: int) -> np.random.Generator:
     return np.random.default_rng(np.asarray(jax.random.key_data(jax.random.fold_in(problem.key, number))))
 
 
-def _scatter(problem: FitProblem, objective: Residuals, n: int) -> np.ndarray:
+def _scatter(problem: FitProblem, n: int) -> np.ndarray:
     """Log residuals of spectra without harmonic, scattering about their expectation."""
-    statistics, nu = objective.parts[0].statistics, problem.parts[0].target.degrees_of_freedom
-    correlation = np.asarray(statistics.correlation)
-    normal = _generator(problem, 3).multivariate_normal(np.zeros(n), correlation, size=REPLICATES, method="cholesky")
-    if nu is None:
-        z = normal * np.asarray(statistics.sd)
-    else:
-        z = np.log(gammaincinv(nu / 2, ndtr(normal)) / (nu / 2)) - np.asarray(statistics.bias)
-    return (z - z.mean(axis=1, keepdims=True)) / np.asarray(statistics.sd)
+    (target,) = (part.target for part in problem.parts)
+    law = bin_statistics(target)
+    normal = _generator(problem, 3).multivariate_normal(np.zeros(n), law.correlation, size=REPLICATES, method="cholesky")
+    z = normal * law.sd
+    if target.segments is not None:
+        z = np.log(gammaincinv(law.half, ndtr(normal)) / law.half) - law.bias
+    return (z - z.mean(axis=1, keepdims=True)) / law.sd

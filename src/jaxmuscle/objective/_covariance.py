@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jaxmuscle.data._target import Target
-from jaxmuscle.spectra._bin_law import bin_correlation, log_power_moments, shares_map
+from jaxmuscle.spectra._bin_law import log_power_moments, shares_map, welch_law
 from jaxmuscle.spectra._settings import WINDOW
 
 from ._moment_models import MonteCarlo
@@ -98,14 +98,14 @@ def _in_words(names: tuple[str, ...], direction: Float[np.ndarray, " parameters"
 def residual_covariance(target: Target, part: PartResiduals, share: np.ndarray) -> np.ndarray:
     """Covariance of one target's data residuals: scatter of the target and of the simulated mean."""
     start, stop = WINDOW
-    per_seed = target.settings.degrees_of_freedom(target.settings.segments(round((stop - start) * target.settings.rate)))
+    per_seed = target.settings.segments(round((stop - start) * target.settings.rate))
+    law = welch_law(target.settings, target.bins, (per_seed,))
     # A linear response has no sampling error, and a control variate leaves next to nothing of it.
     model = part.model
     plain = model if isinstance(model, MonteCarlo) and not model.control else None
-    each = 0.0 if plain is None else log_power_moments(per_seed * plain.seeds)[1]
-    variance = each * np.maximum(1 - share**2, 0.0)
-    correlation = bin_correlation(target.settings, target.bins, (6,))
-    simulated = np.sqrt(variance)[:, None] * correlation * np.sqrt(variance)
+    each = np.zeros(len(share)) if plain is None else log_power_moments(law.degrees * plain.seeds)[1]
+    sd = np.sqrt(each * np.maximum(1 - share**2, 0.0))
+    simulated = sd[:, None] * law.correlation * sd
     measured = part.statistics.covariance
     p = np.asarray(target.proportional_power)
     spread = _spread_map(part, p)

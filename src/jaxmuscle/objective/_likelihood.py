@@ -17,7 +17,7 @@ from jaxmuscle.data._recording import Recording
 from jaxmuscle.data._target import Target
 from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.response._expected import Moments, check_line, expected_moments
-from jaxmuscle.spectra._bin_law import bin_statistics, trial_samples, welch_law
+from jaxmuscle.spectra._bin_law import LEAST, bin_statistics, trial_samples, welch_law
 from jaxmuscle.spectra._settings import WINDOW
 
 from ._consequences import Expansion, expand
@@ -35,7 +35,6 @@ Powers = Float[Array | np.ndarray, " bins"]
 NEWTON = 12
 NODES = 33
 REACH = 6.0
-LEAST = 1e-3
 
 
 class Bins(NamedTuple):

@@ -1,6 +1,7 @@
 """The sampling law of Welch bins: bias, spread, correlation."""
 
 import functools
+from collections import Counter
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -9,13 +10,53 @@ from scipy.special import digamma, polygamma
 
 from ._settings import LONGEST, WINDOW, SpectrumSettings, samples_in
 
+LEAST = 1e-3  # share of a bin that scatters, at least
+
+
+class BinLaw(NamedTuple):
+    """Sampling law of Welch powers: equivalent degrees of freedom ν of every bin, and the correlation of bins."""
+
+    degrees: Float[np.ndarray, " bins"]
+    correlation: Float[np.ndarray, "bins bins"]
+
+
+def welch_law(settings: SpectrumSettings, bins: np.ndarray, segments: tuple[int, ...]) -> BinLaw:
+    """Law of Welch powers for a density that is flat within a segment's resolution, detrending and both signs of f included.
+
+    `Cov(S_k, S_l) = Σ_j (1 - |j|/K)/K (|E X_k X_l*|² + |E X_k X_l|²)` over segments j apart, X the tapered, detrended
+    transform; ν_k = 2 E_k² / Var_k. Trials are averaged with weights proportional to their segments.
+    Removing the mean and leakage from negative frequencies cost bin 1 a fifth of its degrees of freedom.
+    """
+    return _welch_law(settings, tuple(int(k) for k in bins), tuple(segments))
+
+
+@functools.lru_cache(maxsize=256)
+def _welch_law(settings: SpectrumSettings, bins: tuple[int, ...], segments: tuple[int, ...]) -> BinLaw:
+    rows = bin_rows(settings)[np.asarray(bins) - settings.first_bin]
+    n, step = settings.length, settings.step
+    power = np.sum(np.abs(rows) ** 2, axis=1)
+    covariance = np.zeros((len(rows), len(rows)))
+    for count, trials in Counter(segments).items():
+        reach = min(count - 1, (n - 1) // step)
+        for j in range(-reach, reach + 1):
+            near, far = (rows[:, abs(j) * step :], rows[:, : n - abs(j) * step])[:: 1 if j >= 0 else -1]
+            both = np.abs(near @ far.conj().T) ** 2 + np.abs(near @ far.T) ** 2
+            covariance += trials * count * (1 - abs(j) / count) / sum(segments) ** 2 * both
+    sd = np.sqrt(np.diag(covariance))
+    return BinLaw(2 * power**2 / sd**2, covariance / np.outer(sd, sd))
+
 
 class BinStatistics(NamedTuple):
-    """Sampling law of a target's log powers: expected offset `bias`, standard deviation `sd`, `correlation` of bins."""
+    """Sampling law of a target's log powers: expected offset `bias`, standard deviation `sd`, `correlation` of bins.
 
-    bias: Float[np.ndarray, " bins"]
-    sd: Float[np.ndarray, " bins"]
+    `half` is half the degrees of freedom of every bin, NaN where no segments are stated. All but `correlation` have leading
+    axes where the line's share had.
+    """
+
+    bias: Float[np.ndarray, "*rows bins"]
+    sd: Float[np.ndarray, "*rows bins"]
     correlation: Float[np.ndarray, "bins bins"]
+    half: Float[np.ndarray, "*rows bins"]
     known: bool
 
     @property
@@ -24,51 +65,29 @@ class BinStatistics(NamedTuple):
         return self.sd[:, None] * self.correlation * self.sd
 
 
-def log_power_moments(degrees_of_freedom: float) -> tuple[float, float]:
+def log_power_moments(degrees_of_freedom: Any) -> tuple[Any, Any]:
     """Bias `ψ(ν/2) - ln(ν/2)` and variance `ψ'(ν/2)` of the log of a chi-squared estimate with ν degrees of freedom."""
-    half = degrees_of_freedom / 2
-    return float(digamma(half) - np.log(half)), float(polygamma(1, half))
+    half = np.asarray(degrees_of_freedom) / 2
+    return digamma(half) - np.log(half), polygamma(1, half)
 
 
-def bin_correlation(
-    settings: SpectrumSettings, bins: np.ndarray, segments: tuple[int, ...]
-) -> Float[np.ndarray, "bins bins"]:
-    """Correlation of Welch powers of neighbouring bins of a locally flat spectrum.
+def bin_statistics(target: Any, line_share: Float[np.ndarray, "*rows bins"] | None = None) -> BinStatistics:
+    """Statistics of a target's log powers: from its segments by `welch_law`, else from its sigma, else unknown (sd 1).
 
-    `Σ_j (1 - |j|/K) |ρ_j(δ)|²` over segment distances j, normalised at δ = 0, with
-    `ρ_j(δ) = Σ_m w_m w_(m + jD) exp(-2πi δ m / n) / Σ w²`, D the step between segments. Hann, half overlap: 0.45, 0.04.
-    """
-    window = settings.taper
-    n, step = settings.length, settings.step
-    distance = np.abs(np.asarray(bins)[:, None] - np.asarray(bins)[None, :])
-    lags = np.arange(distance.max() + 1)
-    total = np.zeros(len(lags))
-    for count in segments:
-        for j in range(-min(count - 1, (n - 1) // step), min(count - 1, (n - 1) // step) + 1):
-            shift = abs(j) * step
-            product = window[: n - shift] * window[shift:]
-            phase = np.exp(-2j * np.pi * np.outer(lags, np.arange(n - shift)) / n)
-            total += count * (1 - abs(j) / count) * np.abs(phase @ product) ** 2
-    return (total / total[0])[distance]
-
-
-def bin_statistics(target: Any, line_share: Float[np.ndarray, " bins"] | None = None) -> BinStatistics:
-    """Statistics of a target's log powers: from its segments, else from its sigma, else unknown (sd 1).
-
-    A harmonic line that holds the share ρ of a bin does not scatter: bias and variance fall by 1 - ρ².
+    A harmonic line that holds the share ρ of a bin does not scatter: it has 1 / (1 - ρ²) times the degrees of freedom.
     """
     n = len(target.bins)
-    nu = target.degrees_of_freedom
-    if nu is not None:
-        assert target.segments is not None
-        bias, variance = log_power_moments(nu)
-        keep = np.maximum(1 - (np.zeros(n) if line_share is None else line_share) ** 2, 1e-3)
-        correlation = bin_correlation(target.settings, target.bins, target.segments)
-        return BinStatistics(bias * keep, np.sqrt(variance * keep), correlation, True)
+    share = np.zeros(n) if line_share is None else np.asarray(line_share)
+    unknown = np.full(share.shape, np.nan)
+    if target.segments is not None:
+        law = welch_law(target.settings, target.bins, target.segments)
+        degrees = law.degrees / np.maximum(1 - share**2, LEAST)
+        bias, variance = log_power_moments(degrees)
+        return BinStatistics(bias, np.sqrt(variance), law.correlation, degrees / 2, True)
     if target.sigma is not None:
         sd = np.sqrt(np.log1p((target.sigma / target.proportional_power) ** 2))
-        return BinStatistics(np.zeros(n), sd, np.eye(n), True)
-    return BinStatistics(np.zeros(n), np.ones(n), np.eye(n), False)
+        return BinStatistics(np.zeros(share.shape), np.broadcast_to(sd, share.shape), np.eye(n), unknown, True)
+    return BinStatistics(np.zeros(share.shape), np.ones(share.shape), np.eye(n), unknown, False)
 
 
 def samples_of(segments: int, settings: SpectrumSettings) -> int:
@@ -94,34 +113,6 @@ def standardised(
 def shares_map(p: Float[np.ndarray, " bins"]) -> Float[np.ndarray, "bins bins"]:
     """Derivative of proportional powers with respect to log powers, `diag(p) - p pᵀ`."""
     return np.diag(p) - np.outer(p, p)
-
-
-class BinLaw(NamedTuple):
-    """Sampling law of Welch powers: equivalent degrees of freedom ν of every bin, and the correlation of bins."""
-
-    degrees: Float[np.ndarray, " bins"]
-    correlation: Float[np.ndarray, "bins bins"]
-
-
-def welch_law(settings: SpectrumSettings, bins: np.ndarray, segments: tuple[int, ...]) -> BinLaw:
-    """Law of Welch powers for a density that is flat within a segment's resolution, detrending and both signs of f included.
-
-    `Cov(S_k, S_l) = Σ_j (1 - |j|/K)/K (|E X_k X_l*|² + |E X_k X_l|²)` over segments j apart, X the tapered, detrended
-    transform; ν_k = 2 E_k² / Var_k. Trials are averaged with weights proportional to their segments.
-    Removing the mean and leakage from negative frequencies cost bin 1 a fifth of its degrees of freedom.
-    """
-    rows = bin_rows(settings)[np.asarray(bins) - settings.first_bin]
-    n, step = settings.length, settings.step
-    power = np.sum(np.abs(rows) ** 2, axis=1)
-    covariance = np.zeros((len(rows), len(rows)))
-    for count in segments:
-        reach = min(count - 1, (n - 1) // step)
-        for j in range(-reach, reach + 1):
-            near, far = (rows[:, abs(j) * step :], rows[:, : n - abs(j) * step])[:: 1 if j >= 0 else -1]
-            both = np.abs(near @ far.conj().T) ** 2 + np.abs(near @ far.T) ** 2
-            covariance += count * (1 - abs(j) / count) / sum(segments) ** 2 * both
-    sd = np.sqrt(np.diag(covariance))
-    return BinLaw(2 * power**2 / sd**2, covariance / np.outer(sd, sd))
 
 
 @functools.cache
