@@ -588,7 +588,7 @@ def test_kill_9_six_times(tmp_path, kind):
             return int(runs.stdout.readline())
 
         kills = 0
-        while kills < 6:
+        while kills < 4:
             before, pid = amount(path), begun()
             wait_for(lambda before=before: amount(path) != before)
             time.sleep(rng.uniform(0, 0.4))
