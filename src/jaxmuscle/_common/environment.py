@@ -11,10 +11,13 @@ import platformdirs
 def keep_compiled_programs() -> Path | None:
     """Switch JAX's persistent compilation cache on; returns its folder.
 
-    `$JAX_COMPILATION_CACHE_DIR`, else the user's cache folder; a folder that cannot be written is done without (None).
+    `$JAX_COMPILATION_CACHE_DIR`, else the user's cache folder; a folder that cannot be written is done without (None), and
+    so is any with `$JAXMUSCLE_CACHE=off`.
     """
     import jax
 
+    if _off():
+        return _without(jax)
     folder = Path(os.environ.get("JAX_COMPILATION_CACHE_DIR") or platformdirs.user_cache_path("jaxmuscle") / "jax")
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -29,6 +32,24 @@ def keep_compiled_programs() -> Path | None:
 
 def _without(jax) -> None:
     jax.config.update("jax_compilation_cache_dir", None)
+
+
+def _off() -> bool:
+    return os.environ.get("JAXMUSCLE_CACHE", "").lower() == "off"
+
+
+def program_folder() -> Path | None:
+    """Where compiled programs are kept, None for nowhere; switches JAX's own cache on as well, unless it was set.
+
+    `$JAXMUSCLE_CACHE=off` switches both off; the folder is that of JAX's cache where one was set, else the user's.
+    """
+    import jax
+
+    if _off():
+        return None
+    folder = jax.config.jax_compilation_cache_dir  # pyright: ignore[reportAttributeAccessIssue]
+    known = Path(folder) if folder else keep_compiled_programs()
+    return None if known is None else known / "jaxmuscle"
 
 
 @functools.cache

@@ -8,6 +8,7 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from jaxmuscle._common.programs import kept
 from jaxmuscle.data._target import Target
 from jaxmuscle.objective._consequences import BATCH, expand
 from jaxmuscle.objective._likelihood import Bins, Likelihood, _precision, without_offsets
@@ -162,7 +163,7 @@ def effective_parameters(
     return np.array(found)
 
 
-@eqx.filter_jit
+@kept
 def _marginals(likelihood: Likelihood, moments: Moments, bins: Bins | None) -> Any:
     return jax.vmap(lambda m, b: likelihood.marginal((m,), None if b is None else (b,)))(moments, bins)
 

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxmuscle._common.programs import kept
 from jaxmuscle.model._parameters import PARAMETERS, USUALLY_FREE
 from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.response._expected import Moments
@@ -120,7 +121,7 @@ def quantities(objective: Residuals, seen: Expansion) -> tuple[Tables, Tables]:
     return tuple(values for values, _ in found), slopes
 
 
-@eqx.filter_jit
+@kept
 def _quantities(part: PartResiduals, seen: Expansion) -> tuple[dict[str, Array], dict[str, Array]]:
     def one(seen):
         def everything(theta):
@@ -154,7 +155,7 @@ def consequences(objective: Residuals, seen: Expansion) -> Consequences:
     )
 
 
-@eqx.filter_jit
+@kept
 def _consequences(part: PartResiduals, seen: Expansion) -> tuple[Any, Any]:
     def everything(theta):
         moments = seen.near(theta)
@@ -176,7 +177,7 @@ class _Response(eqx.Module):
         return self.model.moments(task_at(self.task, self.coordinates, theta))
 
 
-@eqx.filter_jit
+@kept
 def _moments_and_slopes(part: Any, theta: Float[Array | np.ndarray, "points free"]) -> tuple[Any, Any]:
     def one(theta):
         def twice(theta):

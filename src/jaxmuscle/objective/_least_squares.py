@@ -9,6 +9,8 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxmuscle._common.programs import kept
+
 from ._consequences import Expansion, expand
 
 SMALL = 1e-3
@@ -41,23 +43,34 @@ def _residuals(s: Float[Array, " free"], given: tuple[Any, Any, Expansion]) -> t
 SOLVER = optx.LevenbergMarquardt(rtol=1e-9, atol=1e-9)
 
 
-@eqx.filter_jit
+def _initial(objective, data, s, seen):
+    given = (objective, data, seen)
+    shape = jax.eval_shape(lambda s: _residuals(s, given)[0], s)
+    return SOLVER.init(_residuals, s, given, {}, shape, None, frozenset())
+
+
+# The solver's state holds functions, which no file can keep: only its arrays go from program to program.
+@kept
 def _start(objective, data, starts, seen):
     def one(data, s, seen):
-        given = (objective, data, seen)
-        shape = jax.eval_shape(lambda s: _residuals(s, given)[0], s)
-        return SOLVER.init(_residuals, s, given, {}, shape, None, frozenset())
+        return eqx.filter(_initial(objective, data, s, seen), eqx.is_array)
 
     return eqx.filter_vmap(one)(data, starts, seen)
 
 
-@eqx.filter_jit
+@kept
 def _step(objective, data, s, state, seen):
     def one(data, s, state, seen):
+        functions = eqx.filter(eqx.filter_eval_shape(_initial, objective, data, s, seen), _is_shape, inverse=True)
+        state = eqx.combine(state, functions)
         s, state, _ = SOLVER.step(_residuals, s, (objective, data, seen), {}, state, frozenset())
-        return s, state, 0.5 * (state.f_info.residual**2).sum(), state.num_accepted_steps
+        return s, eqx.filter(state, eqx.is_array), 0.5 * (state.f_info.residual**2).sum(), state.num_accepted_steps
 
     return eqx.filter_vmap(one)(data, s, state, seen)
+
+
+def _is_shape(leaf):
+    return isinstance(leaf, jax.ShapeDtypeStruct)
 
 
 class _Standing(NamedTuple):

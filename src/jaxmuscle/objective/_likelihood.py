@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 from scipy.special import gammaincinv, ndtr
 
 from jaxmuscle._common.arrays import as_arrays, is_concrete
+from jaxmuscle._common.programs import kept
 from jaxmuscle._common.types import Scalar
 from jaxmuscle.data._recording import Recording
 from jaxmuscle.data._target import Target
@@ -213,7 +214,7 @@ def _gaussian(residuals: Float[Array | np.ndarray, " rows"]) -> Scalar:
     return -0.5 * jnp.sum(jnp.asarray(residuals) ** 2)
 
 
-@eqx.filter_jit
+@kept
 def _target_likelihood(task, bins, chosen, variation, samples):
     moments = expected_moments(task, task.settings, WINDOW, samples)[0]
     found = log_marginal(bins, moments.power[chosen], moments.line[chosen])
@@ -222,7 +223,7 @@ def _target_likelihood(task, bins, chosen, variation, samples):
     return found
 
 
-@eqx.filter_jit
+@kept
 def _whittle(task, settings, power, window):
     moments = expected_moments(task, settings, window)[0]
     noise, line = moments.power - moments.line, moments.line

@@ -2,11 +2,12 @@
 
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
+
+from jaxmuscle._common.programs import kept
 
 from ._consequences import Expansion, expand, quantities
 from ._coordinates import Coordinates
@@ -68,7 +69,7 @@ class Pin(NamedTuple):
         return (np.log(values), slopes / values[:, None]) if self.log else (values, slopes)
 
 
-@eqx.filter_jit
+@kept
 def _local(likelihood: Likelihood, bins: AllBins, seen: Expansion, offset: Array) -> tuple[Array, Array, Array]:
     """Log likelihood, its gradient and its Fisher information with respect to (θ, offsets), for every row."""
     free = seen.theta.shape[-1]

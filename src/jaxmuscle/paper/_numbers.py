@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxmuscle._common.arrays import as_arrays
+from jaxmuscle._common.programs import kept
 from jaxmuscle.data._recording import RECORDED, Recording
 from jaxmuscle.ensembles._ensemble import ensemble
 from jaxmuscle.model._noise import OrnsteinUhlenbeckNoise
@@ -172,7 +173,7 @@ def fitted(level: int) -> AbstractTask:
     return Isometric().replace(**values[level])
 
 
-@eqx.filter_jit
+@kept
 def _carried(task: AbstractTask, fractions: Float[Array, " levels"], reference: Float[Array, ""]) -> tuple[Array, Array]:
     """Power and coefficient of variation at every level."""
 

@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 
 from jaxmuscle import plot
 from jaxmuscle._common.arrays import as_arrays, require
+from jaxmuscle._common.programs import kept
 from jaxmuscle._common.types import Scalar
 from jaxmuscle.model._muscle import AbstractMuscle
 from jaxmuscle.model._signals import AbstractSignal, Constant
@@ -105,7 +106,7 @@ def _operating(task: AbstractTask) -> tuple[float, float, float]:
     return float(P_w), float(y[0]), float(x_z)
 
 
-@eqx.filter_jit
+@kept
 def _curves(muscle: AbstractMuscle, x: Array, v: Array, P_w: Array) -> dict[str, Array]:
     zero, still = jnp.zeros(()), jnp.zeros(4)
     springs = {

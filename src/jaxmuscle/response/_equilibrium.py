@@ -1,6 +1,5 @@
 """The operating point of a task: equilibrium under its held inputs, and its eigenvalues."""
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,6 +8,7 @@ from jaxtyping import Array, Float
 
 from jaxmuscle._common.arrays import as_arrays
 from jaxmuscle._common.errors import OperatingPointError
+from jaxmuscle._common.programs import kept
 from jaxmuscle.model._signals import AbstractSignal
 from jaxmuscle.model._tasks import AbstractTask
 
@@ -85,7 +85,7 @@ def fastest_rate(task: AbstractTask, duration: float) -> float:
         return float(max(np.abs(np.linalg.eigvals(j)).max() for j in np.asarray(jacobians) if np.all(np.isfinite(j))))
 
 
-@eqx.filter_jit
+@kept
 def _linearisations(task, times):
     """Initial state and equilibria at the given times, with the Jacobians there."""
     points = jnp.stack([task.initial_state(), *(equilibrium(task, t) for t in times)])

@@ -3,7 +3,6 @@
 import functools
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,6 +10,7 @@ import scipy.signal
 from jaxtyping import Array, Float, Int
 
 from jaxmuscle._common.arrays import as_arrays, is_concrete
+from jaxmuscle._common.programs import kept
 from jaxmuscle._common.types import Scalar
 from jaxmuscle.model._noise import ShapingFilter
 from jaxmuscle.model._tasks import AbstractTask
@@ -226,7 +226,7 @@ def response(
     return Moments(noise + line, line, system.rest, variance + swing, slowest(system.A)), system
 
 
-_compiled_response = eqx.filter_jit(response)
+_compiled_response = kept(response)
 
 
 def expected_moments(
@@ -240,7 +240,7 @@ def expected_moments(
     return _compiled_response(as_arrays(task), settings, window, jnp.asarray(samples))
 
 
-@eqx.filter_jit
+@kept
 def log_variation_sd(task: AbstractTask, settings: SpectrumSettings, samples: int) -> Float[Array, ""]:
     """Standard deviation of the log of the coefficient of variation of so many successive samples, in linear response.
 

@@ -3,7 +3,6 @@
 import dataclasses
 from typing import Any, ClassVar, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,6 +10,7 @@ from jaxtyping import Array, Float
 
 from jaxmuscle._common.arrays import as_arrays, as_numbers, is_concrete
 from jaxmuscle._common.errors import OperatingPointError
+from jaxmuscle._common.programs import kept
 from jaxmuscle._common.types import Scalar
 from jaxmuscle.model._muscle import Perturbation
 from jaxmuscle.model._signals import AbstractSignal, Constant
@@ -88,7 +88,7 @@ def settled(task: AbstractTask, time: float = HOLD) -> AbstractTask:
     return found if traced else as_numbers(found)
 
 
-@eqx.filter_jit
+@kept
 def _compiled(task: AbstractTask, time: float) -> LinearTask:
     return LinearTask.of(task, linearise(task, time))
 

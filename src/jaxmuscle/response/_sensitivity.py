@@ -11,6 +11,7 @@ from jaxtyping import Float
 
 from jaxmuscle import plot
 from jaxmuscle._common.arrays import as_arrays
+from jaxmuscle._common.programs import kept
 from jaxmuscle._common.text import choices
 from jaxmuscle.model._parameters import PARAMETERS, set_parameters
 from jaxmuscle.model._tasks import AbstractTask
@@ -86,7 +87,7 @@ def sensitivity(
     return Sensitivity(chosen, tuple(rows), values, relative, settings.frequency, slopes[:, bins:], slopes[:, :bins])
 
 
-@eqx.filter_jit
+@kept
 def _slopes(task, names, values, settings, window):
     """Jacobian of log power and log proportional power."""
 

@@ -1,6 +1,5 @@
 """One chunk of an ensemble: the compiled program for some points and seeds, shared by the devices of this process."""
 
-import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -12,6 +11,7 @@ from jax.sharding import Mesh
 from jax.sharding import PartitionSpec as P
 from jaxtyping import Array, Int, PRNGKeyArray
 
+from jaxmuscle._common.programs import kept
 from jaxmuscle.model._noise import AbstractNoise, Realisation
 from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.spectra._measures import coefficient_of_variation
@@ -91,28 +91,12 @@ def _seen(output: Array, recipe: Recipe) -> tuple[Array, Array]:
     return welch(passed, recipe.settings), coefficient_of_variation(passed)
 
 
-def _dispatched(program: Callable) -> Callable:
-    """Compiled for the arrays among its arguments, the rest fixed. Returns at once, where `eqx.filter_jit` would wait."""
-
-    @functools.partial(jax.jit, static_argnums=(1, 2))
-    def compiled(arrays, leaves, structure):
-        return program(*eqx.combine(arrays, jax.tree.unflatten(structure, leaves)))
-
-    @functools.wraps(program)
-    def run(*given):
-        arrays, rest = eqx.partition(given, lambda leaf: isinstance(leaf, jax.Array | np.ndarray))
-        leaves, structure = jax.tree.flatten(rest)
-        return compiled(arrays, tuple(leaves), structure)
-
-    return run
-
-
 def blocks(seeds: int, lanes: int) -> int:
     """How many blocks of at most `lanes` seeds that makes."""
     return -(-seeds // lanes)
 
 
-@_dispatched
+@kept
 def run_seeds(task: Any, linear: Any, key: Any, seeds: Any, recipe: Recipe, mesh: Mesh | None) -> dict[str, Any]:
     """Output, finiteness and what else the recipe asks for, of one task and every seed."""
 
@@ -134,7 +118,7 @@ def run_seeds(task: Any, linear: Any, key: Any, seeds: Any, recipe: Recipe, mesh
     return _shared(local, mesh, (P(), P("lanes")))(arrays, seeds)
 
 
-@_dispatched
+@kept
 def run_points(tasks: Any, linears: Any, key: Any, seeds: Any, recipe: Recipe, mesh: Mesh | None) -> dict[str, Any]:
     """The same for every task along a leading axis of points; all of them get the same normals."""
 

@@ -10,6 +10,7 @@ import scipy.signal
 from jaxtyping import Array, Float, Real
 
 from jaxmuscle import plot
+from jaxmuscle._common.programs import kept
 
 from ._settings import SpectrumSettings, require
 
@@ -77,9 +78,14 @@ def lowpass(signal: Real[Array | np.ndarray, "*batch times"], settings: Spectrum
 
     **Raises:** `ValueError` if the signal is too short for the extension that `"both"` needs.
     """
-    signal, sections = floating(signal), settings.sections
-    if sections is None:
-        return signal
+    signal = floating(signal)
+    return signal if settings.sections is None else _lowpass(signal, settings)
+
+
+@kept
+def _lowpass(signal: Float[Array, "*batch times"], settings: SpectrumSettings) -> Float[Array, "*batch times"]:
+    sections = settings.sections
+    assert sections is not None
     if settings.filter_direction == "both":
         return _forward_and_backward(signal, sections)
     response = _impulse_response(sections, signal.shape[-1])
@@ -160,7 +166,7 @@ def periodogram(
     return np.fft.rfftfreq(signal.shape[-1], 1 / settings.rate), _density(signal, settings)
 
 
-@eqx.filter_jit
+@kept
 def filtered_power(signal: Any, settings: SpectrumSettings, edges: tuple[int, int] | None) -> Float[Array, "*batch bins"]:
     filtered = lowpass(signal, settings)
     return welch(filtered if edges is None else filtered[..., edges[0] : edges[1]], settings)

@@ -9,6 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxmuscle._common.programs import kept
+
 Density = Any  # has `size`, `centre`, `scale` that whiten, and `log_density` of whitened coordinates
 BLOCK = 50
 ADAPTATIONS = (2, 3, 5)  # blocks of warm-up; the metric is learnt after each but the last
@@ -48,14 +50,14 @@ def _strong(tree: Any) -> Any:
     return jax.tree.map(lambda x: jnp.asarray(x, dtype=jnp.result_type(x)), tree)
 
 
-@eqx.filter_jit
+@kept
 def _first(density: Density, positions: Array) -> Any:
     nuts, (start, _, _) = _tools()
     made = _State(jax.vmap(lambda x: nuts.init(x, density.log_density))(positions), start(jnp.asarray(0.5)))
     return _strong(made)
 
 
-@eqx.filter_jit
+@kept
 def _block(density: Density, key: Array, state: Any, adapting: Array) -> tuple[Any, Any]:
     """`BLOCK` draws of every chain; while `adapting` the step size follows the mean acceptance of all chains."""
     nuts, (_, update, final) = _tools()

@@ -3,13 +3,13 @@
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
 from jaxmuscle._common.environment import versions
+from jaxmuscle._common.programs import kept
 from jaxmuscle._common.progress import teller
 from jaxmuscle.data._target import Target
 from jaxmuscle.fits._reopened import reopened
@@ -131,12 +131,12 @@ def _thetas(problem: FitProblem, density: PosteriorDensity, found: Chains) -> tu
     return theta.reshape(*shape, -1), sampled.reshape(*shape, -1)
 
 
-@eqx.filter_jit
+@kept
 def _placed(density: PosteriorDensity, both: Array) -> Array:
     return jax.lax.map(lambda row: density.placed(row)[0], both, batch_size=16)
 
 
-@eqx.filter_jit
+@kept
 def _frequencies(density: PosteriorDensity, white: Array) -> tuple[Array, ...]:
     return jax.lax.map(density.at_frequencies, white, batch_size=16)
 

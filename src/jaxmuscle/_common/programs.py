@@ -1,0 +1,272 @@
+"""Compiled programs that outlive the process: traced and compiled once, then loaded from the user's cache folder."""
+
+import contextlib
+import functools
+import hashlib
+import logging
+import os
+import pickle
+import platform
+import re
+from collections.abc import Callable, Iterator
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, NamedTuple, ParamSpec, TypeVar
+
+import equinox as eqx
+import jax
+import numpy as np
+from jax.core import Tracer
+
+from .environment import program_folder
+from .files import replacing
+
+P = ParamSpec("P")
+R = TypeVar("R")
+# What a program may be made of: code whose version is part of the key. Another's class may change without a sign.
+OTHERS = ("jax", "jaxlib", "numpy", "equinox", "diffrax", "optimistix", "lineax", "jaxtyping")
+KNOWN = ("jaxmuscle", "builtins", "collections", *OTHERS)
+ADDRESS = re.compile(r" at 0x[0-9a-f]+")
+CONFIG = ("jax_enable_x64", "jax_numpy_dtype_promotion", "jax_default_matmul_precision", "jax_default_prng_impl",
+          "jax_threefry_partitionable", "jax_debug_nans", "jax_disable_most_optimizations")  # fmt: skip
+HIT = "/jax/compilation_cache/cache_hits"
+LOG = logging.getLogger("jaxmuscle")
+
+
+class _Slot(NamedTuple):
+    """Where the number of an output stands in what a program returns."""
+
+    number: int
+
+
+class _Program(NamedTuple):
+    """A compiled program of arrays, and the tree of what it returns, a `_Slot` for each array."""
+
+    call: Callable[..., Any]
+    shape: Any
+
+    def __call__(self, arrays: list[Any]) -> Any:
+        found = self.call(*arrays)
+        return jax.tree.map(lambda x: found[x.number] if isinstance(x, _Slot) else x, self.shape, is_leaf=_is_slot)
+
+
+def _is_slot(leaf: Any) -> bool:
+    return isinstance(leaf, _Slot)
+
+
+class Kept:
+    """A function that is compiled for the arrays among its arguments (trees), the rest fixed, and kept between processes.
+
+    As `eqx.filter_jit`; a program is loaded if its code, its versions, the machine and the structure of its arguments are
+    the same. Anything that stands against it (an own class among the arguments, no folder, a damaged file) means that it
+    is traced and compiled as usual. `JAXMUSCLE_CACHE=off` switches keeping off.
+    """
+
+    def __init__(self, function: Callable[..., Any]):
+        functools.update_wrapper(self, function)
+        self.function = function
+        self.jitted = eqx.filter_jit(function)
+        self.programs: dict[Any, _Program] = {}
+        self.traces = 0
+
+    def __call__(self, *args: Any, **kwargs: Any) -> Any:
+        leaves, structure = jax.tree.flatten((args, kwargs))
+        which = tuple(_is_array(leaf) for leaf in leaves)
+        arrays = [leaf for leaf, own in zip(leaves, which, strict=True) if own]
+        if any(isinstance(x, Tracer) for x in arrays) or jax.config.jax_disable_jit:  # pyright: ignore
+            return self.jitted(*args, **kwargs)
+        fixed = tuple(leaf for leaf, own in zip(leaves, which, strict=True) if not own)
+        signature = (structure, which, fixed, tuple(map(_kind, arrays)), _config())
+        program = self.programs.get(signature)
+        if program is None:
+            program = self.programs[signature] = self._made(structure, which, fixed, arrays, signature)
+        return program(arrays)
+
+    def _made(self, structure: Any, which: tuple[bool, ...], fixed: tuple, arrays: list[Any], signature: Any) -> _Program:
+        """From the folder, or traced, compiled and put there."""
+        folder = program_folder()
+        place = None if folder is None or len(jax.devices()) > 1 else _place(folder, self.function, signature)
+        if place is not None and (entry := _read(place)) is not None:
+            compiled = _load(place.parent.parent / entry[0])
+            if compiled is not None:
+                return _Program(compiled, entry[1])
+        shape: list[Any] = []
+
+        def flat(*arrays: Any) -> tuple[Any, ...]:
+            self.traces += 1
+            some, rest = iter(arrays), iter(fixed)
+            args, kwargs = jax.tree.unflatten(structure, [next(some if own else rest) for own in which])
+            leaves, tree = jax.tree.flatten(self.function(*args, **kwargs))
+            number = iter(range(len(leaves)))
+            shape[:] = [jax.tree.unflatten(tree, [_Slot(next(number)) if _is_array(x) else x for x in leaves])]
+            return tuple(x for x in leaves if _is_array(x))
+
+        # A name that JAX's own cache does not know, see `_compiled`.
+        flat.__name__ = ("" if place is None else "kept_") + getattr(self.function, "__name__", "program")
+        lowered = jax.jit(flat).lower(*arrays)
+        if place is None:
+            return _Program(lowered.compile(), shape[0])
+        return _Program(_compiled(lowered, place, shape[0]), shape[0])
+
+
+def _compiled(lowered: Any, place: Path, shape: Any) -> Any:
+    """A lowered program, compiled or from the folder if code that was changed gives the same one; put there."""
+    key = (lowered.as_text(), _versions(), _machine(), os.environ.get("XLA_FLAGS", ""))
+    name = hashlib.sha256(repr(key).encode()).hexdigest()
+    program = place.parent.parent / name
+    compiled = _load(program)
+    if compiled is None:
+        before = len(_hits())
+        with _beside_jax():
+            compiled = lowered.compile()
+        # What JAX's own cache gave back cannot be written again: XLA would leave its functions out.
+        if len(_hits()) == before:
+            _write(program, lambda: _serialized(compiled))
+    if program.exists():
+        _write(place, lambda: (name, shape))
+    return compiled
+
+
+@contextlib.contextmanager
+def _beside_jax() -> Iterator[None]:
+    """JAX's own cache writes nothing: one copy of a program is enough."""
+    least = jax.config.jax_persistent_cache_min_compile_time_secs  # pyright: ignore[reportAttributeAccessIssue]
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 1e9)
+    try:
+        yield
+    finally:
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", least)
+
+
+@functools.cache
+def _hits() -> list[str]:
+    """What JAX's cache of compiled programs has given back, one entry each."""
+    found: list[str] = []
+    jax.monitoring.register_event_listener(lambda event, **_: found.append(event) if event == HIT else None)
+    return found
+
+
+def kept(function: Callable[P, R]) -> Callable[P, R]:
+    """Decorates a function that is to be compiled, and kept."""
+    return Kept(function)
+
+
+def _is_array(leaf: Any) -> bool:
+    return isinstance(leaf, jax.Array | np.ndarray | np.generic)
+
+
+def _kind(array: Any) -> tuple[Any, ...]:
+    return np.shape(array), str(array.dtype), getattr(array, "weak_type", False)
+
+
+def _config() -> tuple[Any, ...]:
+    return tuple(getattr(jax.config, name, None) for name in CONFIG)
+
+
+def _place(folder: Path, function: Any, signature: Any) -> Path | None:
+    """The file of a program; None if it is made of what may change without a sign."""
+    structure, which, fixed, kinds, config = signature
+    told = _told(structure)
+    rest = repr((which, fixed, kinds, config))
+    if told is None or ADDRESS.search(rest) or not all(_known(type(leaf)) for leaf in fixed):
+        return None
+    key = (function.__module__, function.__qualname__, told, rest, _machine(), os.environ.get("XLA_FLAGS", ""))
+    return folder / _code()[:16] / hashlib.sha256(repr(key).encode()).hexdigest()
+
+
+def _known(kind: type) -> bool:
+    return kind.__module__.partition(".")[0] in KNOWN
+
+
+def _told(structure: Any) -> str | None:
+    """A tree's structure as text that says the same in every process."""
+    node = structure.node_data()
+    if node is None:
+        return "*"
+    kind, data = node
+    name, text = f"{kind.__module__}.{kind.__qualname__}", repr(data)
+    if not _known(kind) or ADDRESS.search(text):
+        return None
+    children = [_told(child) for child in structure.children()]
+    return None if None in children else f"{name}|{text}({','.join(map(str, children))})"
+
+
+@functools.cache
+def _code() -> str:
+    """Digest of the package's code and of the versions of what it calls."""
+    digest = hashlib.sha256(repr(_versions()).encode())
+    root = Path(__file__).resolve().parents[1]
+    for path in sorted(root.rglob("*.py")):
+        digest.update(path.relative_to(root).as_posix().encode() + b"\0" + path.read_bytes())
+    return digest.hexdigest()
+
+
+@functools.cache
+def _versions() -> tuple[str, ...]:
+    return tuple(version(name) for name in OTHERS)
+
+
+@functools.cache
+def _machine() -> str:
+    """What machine code depends on."""
+    device = jax.devices()[0]
+    try:
+        flags = next(line for line in Path("/proc/cpuinfo").read_text().splitlines() if line.startswith("flags"))
+    except (OSError, StopIteration):
+        flags = platform.processor()
+    return repr((platform.system(), platform.machine(), device.platform, device.device_kind, flags))
+
+
+def _serialized(compiled: Any) -> Any:
+    from jax.experimental.serialize_executable import serialize
+
+    return serialize(compiled)
+
+
+def _write(place: Path, content: Callable[[], Any]) -> None:
+    """Write what can be pickled, a digest before it; what cannot be written is done without."""
+    try:
+        whole = pickle.dumps(content())
+        place.parent.mkdir(parents=True, exist_ok=True)
+        with replacing(place) as temporary:
+            temporary.write_bytes(hashlib.sha256(whole).digest() + whole)
+    except Exception as error:  # a cache: the program is there, it is only not kept
+        LOG.debug("not kept: %s: %s", place.name, error)
+
+
+def _read(place: Path) -> Any:
+    """What `_write` wrote; None if there is nothing, or something damaged."""
+    try:
+        whole = place.read_bytes()
+        if hashlib.sha256(whole[32:]).digest() == whole[:32]:
+            return pickle.loads(whole[32:])
+        LOG.debug("damaged: %s", place.name)
+    except OSError:
+        pass
+    except Exception as error:  # of another version, perhaps
+        LOG.debug("not read: %s: %s", place.name, error)
+    return None
+
+
+@functools.cache
+def _prepare() -> None:
+    """Make JAX's linear algebra ready to be called.
+
+    jaxlib finds LAPACK when it lowers the first program that needs it; one that is loaded would call into nothing.
+    """
+    jax.jit(jax.lax.linalg.lu).lower(np.eye(1))
+
+
+def _load(place: Path) -> Any:
+    """A compiled program that was kept; None if there is none, or a damaged one."""
+    made = _read(place)
+    if made is None:
+        return None
+    _prepare()
+    try:
+        from jax.experimental.serialize_executable import deserialize_and_load
+
+        return deserialize_and_load(*made)
+    except Exception as error:  # a cache: it is made again
+        LOG.debug("not loaded: %s: %s", place.name, error)
+        return None
