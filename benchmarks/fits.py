@@ -1,9 +1,5 @@
 """What a user of fits waits for: a fit, its search from many starts, the command in a cold process."""
 
-import os
-import subprocess
-import sys
-import tempfile
 import time
 
 import jax
@@ -19,7 +15,7 @@ TARGETS = ("vastus-lateralis-26mvc", "fdi-abduction-45mvc")
 NOISES = ("band-limited", "ornstein-uhlenbeck")
 STARTS, MAX_STEPS, SEEDS = 100, 40, 32
 NEAR = 1e-3
-CHI2, SEARCH, FOUND_AGAIN, COLD, WARM, COHORT = 1.2, 6.0, 10, 45.0, 15.0, 30.0
+CHI2, SEARCH, FOUND_AGAIN, COHORT = 1.2, 6.0, 10, 30.0
 POSTERIOR = 120.0
 PEOPLE, SEGMENTS = 50, 12
 
@@ -100,20 +96,3 @@ def cohort() -> list[Row]:
     converged = sum(result.success for result in found.results.values())
     return [Row(f"cohort of {PEOPLE}: warm wall time", wall, "s", target=COHORT, at_most=True),
             Row(f"cohort of {PEOPLE}: converged", converged, "fits")]  # fmt: skip
-
-
-def cold() -> list[Row]:
-    """`jaxmuscle fit` of a bundled target in a new process, without and with compiled programs on disk."""
-    found: list[Row] = []
-    with tempfile.TemporaryDirectory() as folder:
-        environment = os.environ | {"JAX_COMPILATION_CACHE_DIR": os.path.join(folder, "cache")}
-        command = [sys.executable, "-m", "jaxmuscle", "fit", TARGETS[0], "--out", os.path.join(folder, "fit")]
-        for state, limit in (("an empty", COLD), ("a warm", WARM)):
-            group = f"jaxmuscle fit, new process, {state} compilation cache"
-            start, before = time.perf_counter(), os.times()
-            subprocess.run(command, env=environment, stdout=subprocess.DEVNULL, check=True)
-            wall, after = time.perf_counter() - start, os.times()
-            busy = sum(after[2:4]) - sum(before[2:4])
-            found += [Row(f"{group}: wall time", wall, "s", target=limit, at_most=True)]
-            found += [Row(f"{group}: processor time", busy, "s")]
-    return found

@@ -18,6 +18,7 @@ import jax
 import linear
 import scale
 import usage
+import waiting
 from measure import DTYPES, Row, Unequal
 
 import jaxmuscle as jm
@@ -36,7 +37,7 @@ SECTIONS: dict[str, Callable[[int], list[Row]]] = {
     "cohort": lambda n: fits.cohort(),
     "posterior": lambda n: fits.posterior(),
     "alternative": lambda n: alternative.rows(),
-    "cold": lambda n: fits.cold(),
+    "waiting": waiting.rows,
 }
 
 
@@ -76,6 +77,7 @@ def main() -> int:
                         help=f"some of {', '.join(SECTIONS)} (default: all)")  # fmt: skip
     options = parser.parse_args()
     jax.config.update("jax_enable_compilation_cache", False)
+    os.environ["JAXMUSCLE_CACHE"] = "off"  # what is measured here is compiled here
     facts, rows, unequal = machine() | {"load_before": os.getloadavg()}, [], []
     print(json.dumps(facts))
     for name in options.only:

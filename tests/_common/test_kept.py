@@ -83,6 +83,21 @@ def test_changed_code_is_traced_again_and_compiled_only_if_it_says_something_els
     assert {path for path in folder.iterdir() if path.is_file()} == before  # the same machine code
 
 
+def test_programs_that_differ_in_unused_arguments_are_not_confused(x64, folder):
+    def first(x, y):
+        return x + 1
+
+    def second(x, y):
+        return y + 1
+
+    one, other = Kept(first), Kept(second)
+    other.function.__name__ = "first"
+    x, y = np.zeros(3), np.ones(3)
+    for _ in range(2):
+        assert float(one(x, y)[0]) == 1.0 and float(other(x, y)[0]) == 2.0
+        one, other = Kept(first), Kept(second)
+
+
 class Own(Muscle):
     """Somebody else's muscle, whose code may change without a sign."""
 

@@ -383,14 +383,14 @@ from jaxmuscle.commands import fit as _cli_fit
 signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs ignore it
 
 @contextlib.contextmanager
-def loud(title):
-    def told(text, share):
+def loud(progress, title):
+    def tell(text, share):
         print(text, flush=True)
         if text.startswith("trying starts"):
             time.sleep(60)  # until the signal: Python would swallow it while it collects garbage
-    yield told
+    yield tell
 
-_cli_fit.progress = loud
+_cli_fit.told = loud
 _cli.main()
 """
     arguments = ["fit", str(csv_file(tmp_path)), "--free", "c_w,noise_K_w", "--starts", "4", "--seeds", "24"]

@@ -96,7 +96,7 @@ def test_groups_differ_by_what_they_were_given():
 def test_a_member_says_what_was_not_done():
     member = cohort().results["person0"]
     assert (member.settings["seeds"], member.settings["check_seeds"]) == (0, 0)
-    assert any(notice.startswith("fitted together with other targets") for notice in member.notices)
+    assert any(notice.startswith("in linear response alone") for notice in member.notices)
     figure = member.plot()
     try:
         said = {text.get_text() for ax in figure.axes for text in ax.texts}
@@ -238,4 +238,4 @@ def test_groups_and_seeds_do_not_go_with_everything(tmp_path):
     path.write_text("target,group\na,b\n")
     assert "--groups needs several targets" in command("fdi-abduction-45mvc", "--groups", path).stderr
     both = command("fdi-abduction-45mvc", "vastus-lateralis-26mvc", "--seeds", 8)
-    assert both.exit_code == 2 and "leave out --method and --seeds" in both.stderr
+    assert both.exit_code == 2 and "leave out --method, --seeds and --quick" in both.stderr

@@ -669,6 +669,30 @@ def test_an_interrupted_fit_holds_what_had_been_reached(stage):
     assert all(start.steps <= (2 if stage == "trying starts" else 12) for start in result.starts)
 
 
+def test_the_answer_comes_before_the_checks_and_an_interruption_in_them_keeps_it():
+    order, given = [], {"free": FEW, "key": 0, **QUICK}
+
+    def tell(text, share):
+        order.append(text)
+        if text.startswith("checking on fresh seeds"):
+            raise KeyboardInterrupt
+
+    with pytest.raises(jm.fits.FitInterrupted) as caught:
+        jm.fit(jm.Isometric(), simple_target(), progress=tell, answer=order.append, **given)
+    (found,) = (x for x in order if not isinstance(x, str))
+    assert order.index(found) == len(order) - 2 and order[-1].startswith("checking")
+    kept = caught.value.result
+    assert kept.success and kept.parameters == found.parameters
+    assert not found.stretch[0].size and found.harmonic_p_value is None
+    assert [n for n in kept.notices if n not in found.notices] == [
+        "not checked on simulated seeds; no profile over the harmonic's frequency and no p-value (check_seeds=0)"
+    ]
+    # The checks change no estimate, but for the spectrum's own numbers, which they simulate.
+    whole, quick = jm.fit(jm.Isometric(), simple_target(), **given), found
+    assert whole.parameters == quick.parameters and "seeds" in whole.check
+    assert jm.fit(jm.Isometric(), simple_target(), **(given | {"check_seeds": 0})).parameters == quick.parameters
+
+
 def test_an_interruption_before_the_first_step_has_no_result():
     def interrupt(text, share):
         raise KeyboardInterrupt

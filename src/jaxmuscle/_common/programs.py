@@ -103,7 +103,8 @@ class Kept:
 
         # A name that JAX's own cache does not know, see `_compiled`.
         flat.__name__ = ("" if place is None else "kept_") + getattr(self.function, "__name__", "program")
-        lowered = jax.jit(flat).lower(*arrays)
+        # Unused arguments stay: programs that say the same take the same arguments.
+        lowered = jax.jit(flat, keep_unused=True).lower(*arrays)
         if place is None:
             return _Program(lowered.compile(), shape[0])
         return _Program(_compiled(lowered, place, shape[0]), shape[0])

@@ -7,7 +7,7 @@ import jax
 import numpy as np
 from jax import Array
 
-from jaxmuscle._common.progress import teller
+from jaxmuscle._common.progress import told
 from jaxmuscle.fits._reopened import reopened
 from jaxmuscle.fits._result import FitResult
 from jaxmuscle.fits._search import search_together
@@ -56,8 +56,7 @@ def bootstrap(
     stated = result.determined
     if not stated:
         raise ValueError(f"{result.title}: the fit determines no quantity, so there is no stated error to check")
-    tell = teller(progress)
-    with jax.enable_x64(True):
+    with told(progress, f"bootstrap of {result.title}") as tell, jax.enable_x64(True):
         problem = reopened(result, key=key)
         tell("making data", 0.0)
         made, failed = replicates_of(problem, tuple(result.tasks.values()), replicates)

@@ -8,7 +8,7 @@ from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
 import jaxmuscle as jm
-from jaxmuscle._common.progress import progress
+from jaxmuscle._common.progress import told
 
 from .console import BAD_INPUT, CONVERGED, NOT_CONVERGED, csv_text, err, out, plain, save_figure, writable, write_fit
 from .options import TaskName
@@ -46,7 +46,7 @@ def fit_together(
     options = {name: value for name, value in options.items() if name != "starts"} | starts
     if not targets:
         raise ValueError(f"none of the targets can be read: {_reasons(failed)}")
-    with progress(f"fitting {len(targets)} targets") as tell:
+    with told(True, f"fitting {len(targets)} targets") as tell:
         found = jm.fit_cohort(
             targets, groups=grouped, task=None if task is None else jm.model.TASKS[task], progress=tell, **options
         )

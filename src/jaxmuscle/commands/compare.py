@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 import jaxmuscle as jm
-from jaxmuscle._common.progress import progress
+from jaxmuscle._common.progress import told
 
 from .console import CONVERGED, NOT_CONVERGED, aim_of, csv_text, out, plain, reporting, save_figure, writable
 from .options import Fix, Free, Output, Quantity, Seed, Segments, TargetTask, fixed_values, names_in
@@ -48,7 +48,7 @@ def compare(
         names = names_in(free)
         aim, model = aim_of(target, task, {"quantity": quantity, "segments": segments})
         writable(output)
-        with progress(f"comparing noises on {aim.name}") as tell:
+        with told(True, f"comparing noises on {aim.name}") as tell:
             found = jm.compare_noise(model, aim, free=names, fix=fixed, key=seed, progress=tell)
         _write(found, output)
         _show(found, output)

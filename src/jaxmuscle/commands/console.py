@@ -109,7 +109,7 @@ def save_figure(figure: Any, path: Path) -> None:
     plt.close(figure)
 
 
-def write_fit(result: "FitResult", folder: Path) -> None:
+def write_fit(result: "FitResult", folder: Path, *, figure: bool = True) -> None:
     """fit.json, spectrum.csv and fit.png, each whole or not there."""
     from jaxmuscle._common.files import write_text
 
@@ -117,4 +117,5 @@ def write_fit(result: "FitResult", folder: Path) -> None:
     columns = {"frequency_hz": result.frequency_hz, "target": result.target.proportional_power, "fitted": result.fitted,
                "harmonic_share": result.harmonic_share, "residual_sd": result.residual}  # fmt: skip
     write_text(folder / "spectrum.csv", csv_text(columns))
-    save_figure(result.plot(), folder / "fit.png")
+    if figure:
+        save_figure(result.plot(), folder / "fit.png")

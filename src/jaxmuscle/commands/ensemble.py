@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 import jaxmuscle as jm
-from jaxmuscle._common.progress import progress
+from jaxmuscle._common.progress import told
 
 from .console import NOT_CONVERGED, err, out, reporting, task_of
 from .options import OtherTask, Preset, Seed
@@ -134,7 +134,7 @@ def watching(title: str, *, first: bool, as_json: bool) -> Iterator[Callable[["P
 
         yield line
     else:
-        with progress(title) as tell:
+        with told(True, title) as tell:
             yield lambda pace: tell(str(pace), pace.done / pace.total)
 
 

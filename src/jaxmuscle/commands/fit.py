@@ -6,9 +6,9 @@ from typing import Annotated, Any
 import typer
 
 import jaxmuscle as jm
-from jaxmuscle._common.progress import progress
+from jaxmuscle._common.progress import told
 
-from .console import CONVERGED, INTERRUPTED, NOT_CONVERGED, aim_of, err, out, reporting, show, writable, write_fit
+from .console import CONVERGED, INTERRUPTED, NOT_CONVERGED, aim_of, err, out, plain, reporting, show, writable, write_fit
 from .options import (
     AxisName,
     Fix,
@@ -55,11 +55,15 @@ def fit(
     groups: Annotated[
         Path | None, typer.Option(metavar="FILE", help="CSV with the columns target, group (several targets).")
     ] = None,
+    quick: Annotated[
+        bool, typer.Option("--quick", help="Leave out simulated check, profile of the harmonic, p-value and figure.")
+    ] = False,
     output: Output = Path("out"),
 ) -> None:
     """Fit the muscle to a target spectrum, or to those of many people together.
 
-    Prints a table and writes DIR/fit.json, DIR/fit.png and DIR/spectrum.csv. Several targets: DIR/TARGET/... and
+    Prints a table as soon as the search has ended, then what the checks on simulated seeds add. Writes DIR/fit.json,
+    DIR/fit.png and DIR/spectrum.csv. Several targets: DIR/TARGET/... and
     DIR/cohort.csv, cohort.png (and differences.csv with groups); fitted in linear response, without its last checks.
 
     Examples:
@@ -92,28 +96,41 @@ def fit(
         if len(target) > 1:
             from .cohort import fit_together
 
-            if method != MethodName.linear or seeds is not None:
-                raise ValueError("several targets are fitted together in linear response: leave out --method and --seeds, "
-                                 "or fit them one at a time")  # fmt: skip
+            if method != MethodName.linear or seeds is not None or quick:
+                raise ValueError("several targets are fitted together in linear response, without checks: leave out "
+                                 "--method, --seeds and --quick, or fit them one at a time")  # fmt: skip
             raise typer.Exit(fit_together(target, read, task, groups, output, options))
         if groups is not None:
             raise ValueError("--groups needs several targets")
         options |= {"method": str(method), "seeds": seeds}
-        converged = _fit_one(*aim_of(target[0], task, read), output, options)
+        options |= {"check_seeds": 0} if quick else {}
+        converged = _fit_one(*aim_of(target[0], task, read), output, options, quick=quick)
     raise typer.Exit(CONVERGED if converged else NOT_CONVERGED)
 
 
-def _fit_one(target: Any, model: Any, folder: Path, options: dict[str, Any]) -> bool:
-
+def _fit_one(target: Any, model: Any, folder: Path, options: dict[str, Any], *, quick: bool) -> bool:
+    """The table as soon as the search has ended, then what the checks add; Ctrl-C in these keeps the fit."""
     writable(folder)
+    printed = []
+
+    def answer(result: Any) -> None:
+        show(result, success=result.success)
+        printed.append(result)
+
     try:
-        with progress(f"fitting {target.name}") as tell:
-            result = jm.fit(model, target, progress=tell, **options)
+        with told(True, f"fitting {target.name}") as tell:
+            result = jm.fit(model, target, progress=tell, answer=answer, **options)
+            tell("writing", 1.0)
+            write_fit(result, folder, figure=not quick)
     except jm.fits.FitInterrupted as stop:
-        write_fit(stop.result, folder)
+        write_fit(stop.result, folder, figure=False)
         err.print(f"interrupted: what had been reached is in {folder}")
         raise typer.Exit(INTERRUPTED) from None
-    write_fit(result, folder)
-    show(result, success=result.success)
-    out.print(f"Written: {folder}/fit.json, fit.png, spectrum.csv", highlight=False)
+    if not printed:
+        answer(result)
+    told_before = {*printed[0].remarks, *printed[0].notices}
+    for sentence in (*result.remarks, *(f"note: {notice}" for notice in result.notices)):
+        if sentence.removeprefix("note: ") not in told_before:
+            out.print(plain(sentence), highlight=False, soft_wrap=True)
+    out.print(f"Written: {folder}/fit.json, {'' if quick else 'fit.png, '}spectrum.csv", highlight=False, soft_wrap=True)
     return result.success

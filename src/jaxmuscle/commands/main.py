@@ -1,6 +1,7 @@
 """The `jaxmuscle` command."""
 
 import gc
+import logging
 import os
 import sys
 from typing import Annotated
@@ -46,8 +47,12 @@ def common(
     version: Annotated[
         bool, typer.Option("--version", is_eager=True, callback=show_version, help="Show the version and exit.")
     ] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress.")] = False,
+    verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Also say what is kept and loaded.")] = False,
 ) -> None:
     """A stochastic rheological muscle: simulate its force, analyse recordings, fit it to measured force spectra."""
+    logging.basicConfig(format="%(message)s", stream=sys.stderr)
+    logging.getLogger("jaxmuscle").setLevel(logging.WARNING if quiet else logging.DEBUG if verbose else logging.INFO)
 
 
 @app.command()
@@ -76,6 +81,7 @@ def presets() -> None:
 def main() -> None:
     """Entry point of the console script."""
     os.environ.setdefault("MPLBACKEND", "Agg")
+    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # XLA's remarks on slow compilation are not for users
     # Tracing makes many objects that stay: a tenth of a command would go into looking for cycles among them.
     gc.set_threshold(200_000, 10, 10)
     app(prog_name="jaxmuscle")

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 import jaxmuscle as jm
-from jaxmuscle._common.progress import progress
+from jaxmuscle._common.progress import told
 
 from .console import CONVERGED, NOT_CONVERGED, aim_of, err, out, plain, reporting, save_figure, show, writable
 from .options import (
@@ -69,7 +69,7 @@ def posterior(
             raise typer.Exit(NOT_CONVERGED)
         result.save(output / "fit.json")
         try:
-            with progress(f"posterior of {result.target.name}") as tell:
+            with told(True, f"posterior of {result.target.name}") as tell:
                 found = jm.posterior(result, key=seed, chains=chains, draws=draws, warmup=warmup, progress=tell)
         except ImportError as error:
             raise ValueError(str(error)) from None
@@ -91,7 +91,7 @@ def _fitted(target: str, read: dict[str, Any], asked: dict[str, Any], seed: int)
         raise ValueError(f"{target}: states neither segments nor sigma, so nothing says how much it scatters: give "
                          "--segments, the number of Welch segments that were averaged, or a third column sigma")  # fmt: skip
     names = names_in(asked["free"])
-    with progress(f"fitting {loaded.name}") as tell:
+    with told(True, f"fitting {loaded.name}") as tell:
         return jm.fit(model, loaded, free=names, fix=fixed_values(asked["fix"]), noise=asked["noise"], key=seed,
                    progress=tell)  # fmt: skip
 

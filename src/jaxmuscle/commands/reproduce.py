@@ -8,7 +8,7 @@ import typer
 import jaxmuscle as jm
 from jaxmuscle import paper
 
-from .console import err, out, reporting, writable
+from .console import out, reporting, writable
 from .options import Output
 
 
@@ -41,7 +41,7 @@ def reproduce(
 def _reproduce(folder: Path, given) -> None:
     from collections import Counter
 
-    rows = paper.check(jm.reproduce(folder, given, progress=err.is_terminal))
+    rows = paper.check(jm.reproduce(folder, given, progress=True))
     count = Counter(row.verdict for row in rows)
     out.print(f"{len(rows)} statements: " + ", ".join(f"{n} {verdict}" for verdict, n in count.items()), highlight=False)
     for row in rows:

@@ -7,7 +7,7 @@ import typer
 
 import jaxmuscle as jm
 
-from .console import csv_text, err, out, reporting, save_figure, task_of, writable
+from .console import csv_text, out, reporting, save_figure, task_of, writable
 from .options import OtherTask, Output, Preset, Seed
 
 if TYPE_CHECKING:
@@ -46,7 +46,7 @@ def _simulate(model: "AbstractTask", seeds: int, seed: int, folder: Path) -> Non
 
     from jaxmuscle._common.files import replacing, write_text
 
-    runs = jm.ensemble(model, jax.random.key(seed), seeds=seeds, progress=err.is_terminal)
+    runs = jm.ensemble(model, jax.random.key(seed), seeds=seeds, progress=True)
     spectra = runs.spectrum()
     estimate = runs.mean_spectrum()
     mean = estimate.spectrum

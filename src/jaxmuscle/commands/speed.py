@@ -1,6 +1,7 @@
 """`jaxmuscle speed`."""
 
 import json
+import os
 from typing import Annotated
 
 import typer
@@ -26,6 +27,7 @@ def speed(
     Reduces an ensemble as `jaxmuscle ensemble --reduce` does, without control variate; medians of three calls.
     """
     with reporting():
+        os.environ["JAXMUSCLE_CACHE"] = "off"  # compile time is what it takes, not what loading takes
         use(precision, devices, cores(None, None))
         model = task_of(preset, task) if preset else jm.Isometric() if task is None else jm.model.TASKS[task]()
         found = jm.ensembles.measure(model, seeds, duration)

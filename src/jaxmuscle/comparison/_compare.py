@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array
 
 from jaxmuscle._common.arrays import as_numbers
-from jaxmuscle._common.progress import teller
+from jaxmuscle._common.progress import told
 from jaxmuscle._common.text import choices
 from jaxmuscle.data._target import Target
 from jaxmuscle.model._parameters import PARAMETERS
@@ -66,19 +66,16 @@ def compare_noise(
     """
     if not 2 <= groups <= len(target.bins):
         raise ValueError(f"groups = {groups}: give a number from 2 to that of the target's bins, {len(target.bins)}")
-    tell = teller(progress)
-    with jax.enable_x64(True):
+    with told(progress, f"comparing noises on {target.name}") as tell, jax.enable_x64(True):
         carried, left_out = _carried(task, noises, dict(fix or {}))
         problems = _setups(carried, target, free, dict(fix or {}), dict(priors or {}), dict(bounds or {}), key)
         folds = None if target.segments is None else Folds.of([target], groups)
         found: dict[tuple[str, bool], dict[str, Any]] = {}
         for number, (noise, problem) in enumerate(problems.items()):
             for harmonic in (True, False) if float(problem.parts[0].task["harmonic_amplitude"]) > 0 else (False,):
-                tell(
-                    f"{noise}, {'with' if harmonic else 'without'} harmonic", (number + 0.5 * (not harmonic)) / len(problems)
-                )
+                what = f"{noise}, {'with' if harmonic else 'without'} harmonic"
+                tell(what, (number + 0.5 * (not harmonic)) / len(problems))
                 found[noise, harmonic] = _fitted(problem, folds, harmonic=harmonic)
-    tell("done", 1.0)
     sought = any("harmonic_frequency" in problem.coordinates.names for problem in problems.values())
     needed = NEEDED + 2 * np.log(len(target.bins)) * sought
     tasks, fitted = ({model: values.pop(name) for model, values in found.items()} for name in ("task", "fitted"))

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Int, PRNGKeyArray
 
 from jaxmuscle._common.arrays import all_concrete, as_arrays
+from jaxmuscle._common.progress import told
 from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.response._linearised import LinearTask
 from jaxmuscle.simulation._simulate import DT, DURATION, require_finite, trajectories
@@ -160,13 +161,6 @@ def telling(progress: Progress, layout: Layout) -> Iterator[Callable[[Pace], Non
     """A bar, a function of (text, share), or silence."""
     if isinstance(progress, Watch):
         yield progress.tell
-    elif callable(progress):
-        yield lambda pace: progress(str(pace), pace.done / pace.total)
-    elif not progress:
-        yield lambda pace: None
     else:
-        from rich.progress import Progress as Bar
-
-        with Bar(transient=True) as bar:
-            row = bar.add_task(f"simulating {layout.points * len(layout.seeds)} seeds", total=1.0)
-            yield lambda pace: bar.update(row, description=str(pace), completed=pace.done / pace.total)
+        with told(progress, f"simulating {layout.points * len(layout.seeds)} seeds") as tell:
+            yield lambda pace: tell(str(pace), pace.done / pace.total)

@@ -13,7 +13,7 @@ from jaxtyping import PRNGKeyArray
 
 from jaxmuscle import plot
 from jaxmuscle._common.environment import versions
-from jaxmuscle._common.progress import teller
+from jaxmuscle._common.progress import told
 from jaxmuscle.data._target import Target, load_target
 from jaxmuscle.model._noise import AbstractNoise
 from jaxmuscle.model._tasks import AbstractTask, with_noise
@@ -192,9 +192,8 @@ def fit_cohort(
         raise ValueError(f"groups: no target is called {', '.join(sorted(unknown))}; there are {', '.join(loaded)}")
     options = FitOptions(free=free, fix=fix, residual=residual, starts=starts, key=key, bounds=bounds, priors=priors,
                          coefficient_of_variation=coefficient_of_variation, max_steps=max_steps)  # fmt: skip
-    tell = teller(progress)
     results: dict[str, FitResult] = {}
-    with jax.enable_x64(True):
+    with told(progress, f"fitting {len(loaded)} targets") as tell, jax.enable_x64(True):
         batches: dict[Any, dict[str, Plan]] = {}
         for name, target in loaded.items():
             model = task_for(target) if task is None else task(settings=target.settings)

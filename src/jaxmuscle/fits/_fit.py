@@ -5,6 +5,7 @@ from collections.abc import Callable, Iterable, Mapping
 import jax
 from jaxtyping import PRNGKeyArray
 
+from jaxmuscle._common.progress import told
 from jaxmuscle.data._target import Target
 from jaxmuscle.model._noise import AbstractNoise
 from jaxmuscle.model._tasks import AbstractTask, with_noise
@@ -34,6 +35,7 @@ def fit(
     dt: float = DT,
     check_seeds: int | None = None,
     progress: bool | Callable[[str, float], None] = False,
+    answer: Callable[[FitResult], None] | None = None,
 ) -> FitResult:
     """Find the parameters whose expected spectrum is the target's: Levenberg-Marquardt from many starts.
 
@@ -54,17 +56,18 @@ def fit(
     for a flat one};
     `coefficient_of_variation`, whether the target's, if it states one, is one more residual (it fixes the scale of the
     noise); `mean_force` (value, sd) [N] as a further residual; `max_steps` for each descent; `check_seeds` (64, or 200
-    then; 0: not simulated); `dt` [s], noise grid of a Monte Carlo fit; `progress`, True or a function of (text, share).
+    then; 0: not simulated); `dt` [s], noise grid of a Monte Carlo fit; `progress`, True or a function of (text, share);
+    `answer`, a function that gets the result as soon as the search ends, before simulated check, profile and p-value.
 
     **Returns:** a `FitResult`; a fit that fails is one, too, and says why.
 
     **Raises:** `ValueError` for bad arguments (unknown names with the nearest known, too few bins, values outside
     bounds); `FitInterrupted` on Ctrl-C, with what was reached.
     """
-    options = FitOptions(
-        free=free, fix=fix, method=method, residual=residual, starts=starts, seeds=seeds, check_seeds=check_seeds, key=key,
-        bounds=bounds, priors=priors, coefficient_of_variation=coefficient_of_variation, mean_force=mean_force,
-        max_steps=max_steps, dt=dt, progress=progress,
-    )  # fmt: skip
-    with jax.enable_x64(True):
-        return search(planned(with_noise(task, noise, fix), target, options))
+    with told(progress, f"fitting {target.name}") as tell, jax.enable_x64(True):
+        options = FitOptions(
+            free=free, fix=fix, method=method, residual=residual, starts=starts, seeds=seeds, check_seeds=check_seeds,
+            key=key, bounds=bounds, priors=priors, coefficient_of_variation=coefficient_of_variation,
+            mean_force=mean_force, max_steps=max_steps, dt=dt, progress=tell,
+        )  # fmt: skip
+        return search(planned(with_noise(task, noise, fix), target, options), answer)

@@ -8,6 +8,7 @@ from typing import Any
 import jax
 from jaxtyping import PRNGKeyArray
 
+from jaxmuscle._common.progress import told
 from jaxmuscle._common.text import choices
 from jaxmuscle.data._target import Target, load_target
 from jaxmuscle.model._noise import AbstractNoise
@@ -75,14 +76,15 @@ def fit_joint(
     """
     options = FitOptions(free=free, fix=fix, residual=residual, starts=starts, seeds=seeds, check_seeds=check_seeds, key=key,
                          bounds=bounds, priors=priors, coefficient_of_variation=coefficient_of_variation,
-                         max_steps=max_steps, progress=progress)  # fmt: skip
+                         max_steps=max_steps)  # fmt: skip
     loaded = _loaded(targets)
     for argument, named in (("tasks", tasks or {}), ("mean_force", mean_force or {})):
         for name in named:
             if name not in loaded:
                 raise ValueError(f"{argument}: no target is called {name!r}: {choices(name, loaded)}")
     models = _models(loaded, tasks or {}, noise, dict(fix or {}))
-    with jax.enable_x64(True):
+    with told(progress, f"fitting {', '.join(loaded)}") as tell, jax.enable_x64(True):
+        options = dataclasses.replace(options, progress=tell)
         return search(planned_jointly(models, loaded, options, separate, proportional, mean_force))
 
 

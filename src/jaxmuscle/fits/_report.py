@@ -46,9 +46,10 @@ from ._result import FitResult
 SAME = 1e-9
 OUTPUTS = ("coefficient_of_variation", "mean")
 STRETCH = 5.0
+UNCHECKED = "not checked on simulated seeds; no profile over the harmonic's frequency and no p-value (check_seeds=0)"
 TOGETHER = (
-    "fitted together with other targets, in linear response and without simulation: fit it alone for the nonlinear "
-    "correction, the check on simulated seeds, and the harmonic's profile and p-value"
+    "in linear response alone: no nonlinear correction, no check on simulated seeds, no profile and p-value of the "
+    "harmonic; a fit of this target by itself has them"
 )
 
 
@@ -197,7 +198,7 @@ def unsimulated(plan: Plan, stages: list[Stage]) -> tuple[str, ...]:
     if plan.check_seeds:
         return ()
     if len(plan.problem.parts) == 1:
-        return (TOGETHER,)
+        return (UNCHECKED if stages[-1].name == "polishing" else TOGETHER,)
     if stages[-1].name == "polishing":
         return ()
     return ("in linear response, without the nonlinear model's correction (0.2 % of a bin is usual)",)

@@ -1,5 +1,6 @@
 """The search of a fit: many starts, the best minima polished, whatever was reached when interrupted."""
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any
 
@@ -20,7 +21,7 @@ from jaxmuscle.response._expected import Moments
 from jaxmuscle.response._linearised import settled
 
 from ._checks import Stage, controlled_moments, seen_best
-from ._report import report_fit
+from ._report import UNCHECKED, report_fit
 from ._result import FitResult
 
 FIRST_STEPS = 12
@@ -38,8 +39,11 @@ class FitInterrupted(KeyboardInterrupt):
         self.result = result
 
 
-def search(plan: Plan) -> FitResult:
-    """From the starting points to a result; Ctrl-C ends it with what had been reached."""
+def search(plan: Plan, answer: Callable[[FitResult], None] | None = None) -> FitResult:
+    """From the starting points to a result; Ctrl-C ends it with what had been reached.
+
+    `answer` gets the result before its checks. Ctrl-C in these keeps it.
+    """
     problem = plan.problem
     stages: list[Stage] = []
     interrupted = False
@@ -50,11 +54,19 @@ def search(plan: Plan) -> FitResult:
         interrupted = True
     if not stages:
         raise KeyboardInterrupt("fit interrupted before its first step")
-    problem.tell("checking on fresh seeds" if plan.check_seeds else "reporting", 0.8)
-    result = report_fit(plan, stages, interrupted=interrupted)
-    problem.tell("done", 1.0)
+    result = report_fit(plan._replace(check_seeds=0), stages, interrupted=interrupted)
     if interrupted:
         raise FitInterrupted(result)
+    if answer is not None:
+        later = tuple(n for n in result.notices if n != UNCHECKED) if plan.check_seeds else result.notices
+        answer(dataclasses.replace(result, notices=later))
+    if plan.check_seeds:
+        try:
+            problem.tell("checking on fresh seeds", 0.8)
+            result = report_fit(plan, stages)
+        except KeyboardInterrupt:
+            raise FitInterrupted(result) from None
+    problem.tell("done", 1.0)
     return result
 
 

@@ -8,7 +8,7 @@ import equinox as eqx
 import jax
 import numpy as np
 
-from jaxmuscle._common.arrays import _is_scalar, checked, require
+from jaxmuscle._common.arrays import _is_scalar, checked, is_concrete, require
 from jaxmuscle._common.text import choices
 
 _HAND = "mass of a hand, about 0.6 % of body mass (Winter 2009, Biomechanics, table 4.1); design 2: keeps fits non-stiff"
@@ -139,7 +139,8 @@ def set_parameters(task: Any, values: dict[str, Any]) -> Any:
         row = PARAMETERS.get(name)
         if row is not None:
             message = f"{name} = {value} {row.unit} is outside [{row.lower}, {row.upper}]: {row.meaning}"
-            require(jax.numpy.isfinite(value) & (value >= row.lower) & (value <= row.upper), message)
+            finite = np.isfinite(value) if is_concrete(value) else jax.numpy.isfinite(value)
+            require(finite & (value >= row.lower) & (value <= row.upper), message)
         path = _path(task, name)
         index = path[-1] if isinstance(path[-1], int) else None
         node = task

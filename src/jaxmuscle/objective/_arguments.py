@@ -2,7 +2,7 @@
 
 import dataclasses
 import itertools
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple
 
 import jax
@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import PRNGKeyArray
 
 from jaxmuscle._common.arrays import as_numbers
-from jaxmuscle._common.progress import teller
+from jaxmuscle._common.progress import Tell, nothing
 from jaxmuscle._common.text import choices
 from jaxmuscle.data._target import Target
 from jaxmuscle.model._noise import AbstractNoise
@@ -79,7 +79,7 @@ class FitOptions:
     mean_force: tuple[float, float] | None = None
     max_steps: int = 40
     dt: float = DT
-    progress: bool | Callable[[str, float], None] = False
+    progress: Tell = nothing
 
     def __post_init__(self) -> None:
         for name, known in (("method", METHODS), ("residual", RESIDUALS)):
@@ -128,7 +128,7 @@ def planned(task: AbstractTask, target: Target, options: FitOptions) -> Plan:
     part = Part("", task, target, coordinates, tuple(range(len(names))), variation, options.mean_force)
     key = jax.random.key(options.key) if isinstance(options.key, int) else options.key
     problem = FitProblem((part,), coordinates, np.array([0.0 if sds[n] is None else 1.0 for n in names]), options.residual,
-                         options.method, options.dt, key, counts["seeds"], control, teller(options.progress))  # fmt: skip
+                         options.method, options.dt, key, counts["seeds"], control, options.progress)  # fmt: skip
     settings = {
         **settings_of(problem, bounds), **counts, "max_steps": options.max_steps, "dt": options.dt,
         "coefficient_of_variation": variation is not None,

@@ -97,8 +97,8 @@ class Part:
         if correction is None:
             ones, one = np.ones(len(self.chosen)), np.ones(())
             correction = Moments(ones, ones, one, one, one)
-        samples = jnp.asarray(trial_samples(self.target))
-        return self.residuals(Linear(self.chosen, jax.tree.map(jnp.asarray, correction), samples, WINDOW), residual, share)
+        samples = np.asarray(trial_samples(self.target))
+        return self.residuals(Linear(self.chosen, jax.tree.map(np.asarray, correction), samples, WINDOW), residual, share)
 
     def residuals(self, model: Linear | MonteCarlo, residual: str, share: np.ndarray | None) -> PartResiduals:
         """Its residuals with a model of its moments; `share` is what a line holds of each bin."""

@@ -25,16 +25,14 @@ def reproduce(
 
     **Raises:** `ValueError` unless there are three recordings of one quantity, and for a file that cannot be read.
     """
-    from jaxmuscle._common.progress import progress as bar
+    from jaxmuscle._common.progress import told
 
     from ._claims import check
     from ._figures import draw
     from ._page import write_page
 
     given = None if recordings is None else given_recordings(recordings)
-    if not progress:
-        return _written(Path(out), given, lambda text, share: None, draw, check, write_page)
-    with bar("reproduce") as report:
+    with told(progress, "reproduce") as report:
         return _written(Path(out), given, report, draw, check, write_page)
 
 

@@ -10,7 +10,7 @@ from jaxtyping import Array
 
 from jaxmuscle._common.environment import versions
 from jaxmuscle._common.programs import kept
-from jaxmuscle._common.progress import teller
+from jaxmuscle._common.progress import told
 from jaxmuscle.data._target import Target
 from jaxmuscle.fits._reopened import reopened
 from jaxmuscle.fits._result import FitResult
@@ -65,8 +65,7 @@ def posterior(
     for name, count, least in (("chains", chains, 2), ("draws", draws, 100), ("warmup", warmup, 1)):
         if count < least:
             raise ValueError(f"{name} = {count} must be at least {least}")
-    tell = teller(progress)
-    with jax.enable_x64(True):
+    with told(progress, f"posterior of {result.title}") as tell, jax.enable_x64(True):
         problem = reopened(result, target, free=free, priors=priors, bounds=bounds, key=key)
         likelihood = Likelihood.of(problem)
         tell("climbing to the maximum", 0.0)
