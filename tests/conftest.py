@@ -104,6 +104,9 @@ def _forget_compiled_programs():
     yield
     maps = Path("/proc/self/maps")
     if not maps.exists() or len(maps.read_text().splitlines()) > MOST_MAPS:
+        from jaxmuscle._common.programs import forget
+
+        forget()
         jax.clear_caches()
         gc.collect()
 

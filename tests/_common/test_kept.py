@@ -98,6 +98,19 @@ def test_programs_that_differ_in_unused_arguments_are_not_confused(x64, folder):
         one, other = Kept(first), Kept(second)
 
 
+def test_what_nobody_uses_is_removed_when_the_code_changes(x64, folder, monkeypatch):
+    assert_right(Kept(solved)(TASK, MATRIX))
+    old = [path for path in folder.rglob("*") if path.is_file()]
+    unused = folder / "unused"
+    unused.write_bytes(b"")
+    for path in (*old, unused):
+        os.utime(path, (0, 0))
+    assert_right(Kept(solved)(TASK, MATRIX))  # the program is in use, and says so
+    monkeypatch.setattr(programs, "_code", lambda: "f" * 64)
+    assert_right(Kept(solved)(TASK, MATRIX))
+    assert not unused.exists() and sum(path.exists() for path in old) == 1
+
+
 class Own(Muscle):
     """Somebody else's muscle, whose code may change without a sign."""
 

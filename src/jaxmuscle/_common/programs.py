@@ -8,6 +8,8 @@ import os
 import pickle
 import platform
 import re
+import time
+import weakref
 from collections.abc import Callable, Iterator
 from importlib.metadata import version
 from pathlib import Path
@@ -30,6 +32,7 @@ ADDRESS = re.compile(r" at 0x[0-9a-f]+")
 CONFIG = ("jax_enable_x64", "jax_numpy_dtype_promotion", "jax_default_matmul_precision", "jax_default_prng_impl",
           "jax_threefry_partitionable", "jax_debug_nans", "jax_disable_most_optimizations")  # fmt: skip
 HIT = "/jax/compilation_cache/cache_hits"
+UNUSED = 60 * 86400.0
 LOG = logging.getLogger("jaxmuscle")
 
 
@@ -54,6 +57,10 @@ def _is_slot(leaf: Any) -> bool:
     return isinstance(leaf, _Slot)
 
 
+_ALL: "weakref.WeakSet[Kept]" = weakref.WeakSet()
+MOST = 48  # programs of one function in memory; those that have to go come back from the folder
+
+
 class Kept:
     """A function that is compiled for the arrays among its arguments (trees), the rest fixed, and kept between processes.
 
@@ -68,6 +75,7 @@ class Kept:
         self.jitted = eqx.filter_jit(function)
         self.programs: dict[Any, _Program] = {}
         self.traces = 0
+        _ALL.add(self)
 
     def __call__(self, *args: Any, **kwargs: Any) -> Any:
         leaves, structure = jax.tree.flatten((args, kwargs))
@@ -79,6 +87,9 @@ class Kept:
         signature = (structure, which, fixed, tuple(map(_kind, arrays)), _config())
         program = self.programs.get(signature)
         if program is None:
+            # Every program takes memory maps, of which Linux allows a process 65530.
+            for oldest in list(self.programs)[: max(0, len(self.programs) + 1 - MOST)]:
+                self.programs.pop(oldest, None)
             program = self.programs[signature] = self._made(structure, which, fixed, arrays, signature)
         return program(arrays)
 
@@ -150,6 +161,12 @@ def _hits() -> list[str]:
 def kept(function: Callable[P, R]) -> Callable[P, R]:
     """Decorates a function that is to be compiled, and kept."""
     return Kept(function)
+
+
+def forget() -> None:
+    """Drop all programs from memory, as `jax.clear_caches` does with JAX's own."""
+    for function in list(_ALL):
+        function.programs.clear()
 
 
 def _is_array(leaf: Any) -> bool:
@@ -228,11 +245,22 @@ def _write(place: Path, content: Callable[[], Any]) -> None:
     """Write what can be pickled, a digest before it; what cannot be written is done without."""
     try:
         whole = pickle.dumps(content())
+        if not place.parent.exists():
+            _tidied(place.parent.parent)
         place.parent.mkdir(parents=True, exist_ok=True)
         with replacing(place) as temporary:
             temporary.write_bytes(hashlib.sha256(whole).digest() + whole)
     except Exception as error:  # a cache: the program is there, it is only not kept
         LOG.debug("not kept: %s: %s", place.name, error)
+
+
+def _tidied(folder: Path) -> None:
+    """Before a new version of the code begins its own: what nobody has used for `UNUSED` seconds is removed."""
+    now = time.time()
+    for path in folder.rglob("*") if folder.exists() else ():
+        with contextlib.suppress(OSError):
+            if path.is_file() and now - path.stat().st_mtime > UNUSED:
+                path.unlink()
 
 
 def _read(place: Path) -> Any:
@@ -263,6 +291,8 @@ def _load(place: Path) -> Any:
     made = _read(place)
     if made is None:
         return None
+    with contextlib.suppress(OSError):
+        os.utime(place)  # it is in use, see `_tidied`
     _prepare()
     try:
         from jax.experimental.serialize_executable import deserialize_and_load
