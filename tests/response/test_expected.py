@@ -594,3 +594,16 @@ def test_a_harmonic_beyond_half_the_sampling_rate(x64):
     kind, noise, changes = CASES["force, shared OU"]
     faster = kind(*INPUTS[kind], noise=noise).replace(harmonic_frequency=50.0)
     assert np.all(np.isfinite(jm.expected_spectrum(faster, Settings().replace(**changes)).power))
+
+
+def test_the_expected_spectrum_has_a_second_derivative(x64):
+    """Against differences of the first; designs by gradient need it."""
+    task = jm.Isometric()
+
+    def power(k):
+        return jnp.log(jm.expected_spectrum(task.replace(k_w=k)).power[4])
+
+    k, step = task["k_w"], 10.0
+    slope = jax.jit(jax.grad(power))
+    second = float(jax.jit(jax.grad(jax.grad(power)))(k))
+    assert second == pytest.approx(float(slope(k + step) - slope(k - step)) / (2 * step), rel=1e-4)

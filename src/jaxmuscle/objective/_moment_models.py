@@ -11,7 +11,7 @@ from jaxtyping import Array, Float, Int
 
 from jaxmuscle.model._noise import Realisation
 from jaxmuscle.model._tasks import AbstractTask
-from jaxmuscle.response._equilibrium import slowest_rate
+from jaxmuscle.response._equilibrium import slowest, slowest_rate
 from jaxmuscle.response._expected import Moments, expected_moments, response
 from jaxmuscle.response._linearised import LinearTask, settled
 from jaxmuscle.simulation._batch import respond
@@ -64,8 +64,9 @@ class Linear(eqx.Module):
     def moments(self, task: AbstractTask) -> Moments:
         """Expected moments of the task's output."""
         # Compiled apart, so that it is traced once.
-        found = expected_moments(task, task.settings, self.window, self.samples)[0]
-        found = found._replace(power=found.power[self.chosen], line=found.line[self.chosen])
+        found, system = expected_moments(task, task.settings, self.window, self.samples)
+        chosen = found.power[self.chosen], found.line[self.chosen]
+        found = found._replace(power=chosen[0], line=chosen[1], rate=slowest(system.A))
         return jax.tree.map(jnp.multiply, found, self.correction)
 
 
@@ -129,7 +130,7 @@ class MonteCarlo(eqx.Module):
             beside = outputs(LinearTask.of(task, system))
             power = exact.power[self.chosen] + jnp.mean(self._power(seen, settings) - self._power(beside, settings), 0)
             spread = jnp.mean(swing(seen) - swing(beside))
-            return Moments(power, exact.line[self.chosen], mean, exact.variance + spread, exact.rate)
+            return Moments(power, exact.line[self.chosen], mean, exact.variance + spread, slowest(system.A))
         quiet, noisy = seen[:1], seen[1:] - seen[:1]
         line, random = jnp.mean(self._power(quiet, settings), 0), jnp.mean(self._power(noisy, settings), 0)
         variance = swing(quiet[0]) + jnp.mean(swing(noisy))
