@@ -428,7 +428,7 @@ def test_bundled_targets_are_no_figures(option, word):
 
 def test_command_passes_dataset_and_axis_on(made, tmp_path, monkeypatch):
     path, seen = write(tmp_path, made), []
-    monkeypatch.setattr(_cli_fit, "_fit_one", lambda target, *_: bool(seen.append(target)) or True)
+    monkeypatch.setattr(_cli_fit, "_fit_one", lambda target, *_, **__: bool(seen.append(target)) or True)
     result = CliRunner().invoke(app, ["fit", str(path), "--dataset", "95 MVC", "--segments", "6"])
     assert result.exit_code == 0 and seen[0] == load_target(path, dataset="95 MVC", segments=6)
     rows = "".join(f"{np.log10(f)},{np.log10(p)}\n" for f, p in zip(GRID, spectrum(GRID), strict=True))
