@@ -131,6 +131,6 @@ def _fit_one(target: Any, model: Any, folder: Path, options: dict[str, Any], *, 
     told_before = {*printed[0].remarks, *printed[0].notices}
     for sentence in (*result.remarks, *(f"note: {notice}" for notice in result.notices)):
         if sentence.removeprefix("note: ") not in told_before:
-            out.print(plain(sentence), highlight=False, soft_wrap=True)
+            out.print(plain(sentence), highlight=False)
     out.print(f"Written: {folder}/fit.json, {'' if quick else 'fit.png, '}spectrum.csv", highlight=False, soft_wrap=True)
     return result.success
