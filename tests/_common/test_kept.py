@@ -101,14 +101,15 @@ def test_programs_that_differ_in_unused_arguments_are_not_confused(x64, folder):
 def test_what_nobody_uses_is_removed_when_the_code_changes(x64, folder, monkeypatch):
     assert_right(Kept(solved)(TASK, MATRIX))
     old = [path for path in folder.rglob("*") if path.is_file()]
-    unused = folder / "unused"
-    unused.write_bytes(b"")
-    for path in (*old, unused):
+    unused, beside = folder / "unused", folder.parent / "somebody-elses"
+    for path in (unused, beside):
+        path.write_bytes(b"")
+    for path in (*old, unused, beside):
         os.utime(path, (0, 0))
     assert_right(Kept(solved)(TASK, MATRIX))  # the program is in use, and says so
     monkeypatch.setattr(programs, "_code", lambda: "f" * 64)
     assert_right(Kept(solved)(TASK, MATRIX))
-    assert not unused.exists() and sum(path.exists() for path in old) == 1
+    assert beside.exists() and not unused.exists() and sum(path.exists() for path in old) == 1
 
 
 class Own(Muscle):
@@ -128,6 +129,25 @@ def test_a_folder_that_cannot_be_written_is_done_without(x64, folder, monkeypatc
 
     monkeypatch.setattr(programs, "replacing", full)
     assert_right(Kept(solved)(TASK, MATRIX))
+
+
+def test_a_folder_that_is_new_costs_its_neighbours_nothing(x64, tmp_path, monkeypatch):
+    """The folder may lie in a cache that somebody has set up for all of JAX."""
+    neighbour = tmp_path / "neighbour"
+    neighbour.write_bytes(b"")
+    os.utime(neighbour, (0, 0))
+    monkeypatch.setattr(programs, "program_folder", lambda: tmp_path / "jaxmuscle")
+    monkeypatch.setattr(programs, "KNOWN", (*programs.KNOWN, __name__))
+    assert_right(Kept(solved)(TASK, MATRIX))
+    assert neighbour.exists()
+
+
+def test_equal_numbers_of_other_types_are_other_programs(folder):
+    def typed(x, flag):
+        return x + (1 if flag is True else 2)
+
+    program = Kept(typed)
+    assert [float(program(np.zeros(1), flag)[0]) for flag in (True, 1, 1.0)] == [1.0, 2.0, 2.0]
 
 
 def test_derivatives_and_batches_go_through(x64, folder):

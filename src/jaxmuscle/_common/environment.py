@@ -48,6 +48,8 @@ def program_folder() -> Path | None:
     if _off():
         return None
     folder = jax.config.jax_compilation_cache_dir  # pyright: ignore[reportAttributeAccessIssue]
+    if folder and "://" in folder:  # of a remote store, which JAX can write to
+        return None
     known = Path(folder) if folder else keep_compiled_programs()
     return None if known is None else known / "jaxmuscle"
 

@@ -8,6 +8,7 @@ import os
 import pickle
 import platform
 import re
+import threading
 import time
 import weakref
 from collections.abc import Callable, Iterator
@@ -32,7 +33,8 @@ ADDRESS = re.compile(r" at 0x[0-9a-f]+")
 CONFIG = ("jax_enable_x64", "jax_numpy_dtype_promotion", "jax_default_matmul_precision", "jax_default_prng_impl",
           "jax_threefry_partitionable", "jax_debug_nans", "jax_disable_most_optimizations")  # fmt: skip
 HIT = "/jax/compilation_cache/cache_hits"
-UNUSED = 60 * 86400.0
+UNUSED = 60 * 86400.0  # seconds
+LOCK = threading.Lock()
 LOG = logging.getLogger("jaxmuscle")
 
 
@@ -84,7 +86,8 @@ class Kept:
         if any(isinstance(x, Tracer) for x in arrays) or jax.config.jax_disable_jit:  # pyright: ignore
             return self.jitted(*args, **kwargs)
         fixed = tuple(leaf for leaf, own in zip(leaves, which, strict=True) if not own)
-        signature = (structure, which, fixed, tuple(map(_kind, arrays)), _config())
+        # With their types: 1, 1.0 and True are equal, and not the same program.
+        signature = (structure, which, tuple((type(x), x) for x in fixed), tuple(map(_kind, arrays)), _config())
         program = self.programs.get(signature)
         if program is None:
             # Every program takes memory maps, of which Linux allows a process 65530.
@@ -125,7 +128,10 @@ def _compiled(lowered: Any, place: Path, shape: Any) -> Any:
     """A lowered program, compiled or from the folder if code that was changed gives the same one; put there."""
     key = (lowered.as_text(), _versions(), _machine(), os.environ.get("XLA_FLAGS", ""))
     name = hashlib.sha256(repr(key).encode()).hexdigest()
-    program = place.parent.parent / name
+    folder = place.parent.parent
+    if not place.parent.exists():
+        _tidied(folder)
+    program = folder / name
     compiled = _load(program)
     if compiled is None:
         before = len(_hits())
@@ -141,13 +147,14 @@ def _compiled(lowered: Any, place: Path, shape: Any) -> Any:
 
 @contextlib.contextmanager
 def _beside_jax() -> Iterator[None]:
-    """JAX's own cache writes nothing: one copy of a program is enough."""
-    least = jax.config.jax_persistent_cache_min_compile_time_secs  # pyright: ignore[reportAttributeAccessIssue]
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 1e9)
-    try:
-        yield
-    finally:
-        jax.config.update("jax_persistent_cache_min_compile_time_secs", least)
+    """JAX's own cache writes nothing: one copy of a program is enough. One thread at a time, since it sets an option."""
+    with LOCK:
+        least = jax.config.jax_persistent_cache_min_compile_time_secs  # pyright: ignore[reportAttributeAccessIssue]
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 1e9)
+        try:
+            yield
+        finally:
+            jax.config.update("jax_persistent_cache_min_compile_time_secs", least)
 
 
 @functools.cache
@@ -186,7 +193,7 @@ def _place(folder: Path, function: Any, signature: Any) -> Path | None:
     structure, which, fixed, kinds, config = signature
     told = _told(structure)
     rest = repr((which, fixed, kinds, config))
-    if told is None or ADDRESS.search(rest) or not all(_known(type(leaf)) for leaf in fixed):
+    if told is None or ADDRESS.search(rest) or not all(_known(kind) for kind, _ in fixed):
         return None
     key = (function.__module__, function.__qualname__, told, rest, _machine(), os.environ.get("XLA_FLAGS", ""))
     return folder / _code()[:16] / hashlib.sha256(repr(key).encode()).hexdigest()
@@ -245,8 +252,6 @@ def _write(place: Path, content: Callable[[], Any]) -> None:
     """Write what can be pickled, a digest before it; what cannot be written is done without."""
     try:
         whole = pickle.dumps(content())
-        if not place.parent.exists():
-            _tidied(place.parent.parent)
         place.parent.mkdir(parents=True, exist_ok=True)
         with replacing(place) as temporary:
             temporary.write_bytes(hashlib.sha256(whole).digest() + whole)
@@ -255,7 +260,7 @@ def _write(place: Path, content: Callable[[], Any]) -> None:
 
 
 def _tidied(folder: Path) -> None:
-    """Before a new version of the code begins its own: what nobody has used for `UNUSED` seconds is removed."""
+    """Remove what nobody has used for two months from the folder of programs, before new code adds its own."""
     now = time.time()
     for path in folder.rglob("*") if folder.exists() else ():
         with contextlib.suppress(OSError):

@@ -13,7 +13,7 @@ from jaxmuscle.fits._result import FitResult
 from jaxmuscle.fits._search import search_together
 from jaxmuscle.objective._arguments import Plan, settings_of
 from jaxmuscle.objective._consequences import expand, quantities
-from jaxmuscle.objective._likelihood import check_known
+from jaxmuscle.objective._likelihood import require_spread
 from jaxmuscle.objective._problem import FitProblem
 
 from ._recovery import Bootstrap, Recovery
@@ -52,7 +52,7 @@ def bootstrap(
     if replicates < 2:
         raise ValueError(f"replicates = {replicates} must be at least 2: one refit has no spread")
     for target in result.targets.values():
-        check_known(target)
+        require_spread(target)
     stated = result.determined
     if not stated:
         raise ValueError(f"{result.title}: the fit determines no quantity, so there is no stated error to check")

@@ -17,7 +17,7 @@ from jaxmuscle.fits._reopened import reopened
 from jaxmuscle.fits._result import FitResult
 from jaxmuscle.objective._consequences import expand
 from jaxmuscle.objective._least_squares import least_squares
-from jaxmuscle.objective._likelihood import Likelihood, check_known, drawn_spectra, repeated
+from jaxmuscle.objective._likelihood import Likelihood, drawn_spectra, repeated, require_spread
 from jaxmuscle.objective._problem import FitProblem
 from jaxmuscle.objective._residuals import Data, Residuals
 from jaxmuscle.objective._starts import frequency_names
@@ -42,7 +42,7 @@ def _p(value: float) -> str:
 
 def _check(result: FitResult, judged: Target | None) -> None:
     for of in (*result.targets.values(), *([] if judged is None else [judged])):
-        check_known(of)
+        require_spread(of)
     if judged is None:
         return
     fitted = result.target

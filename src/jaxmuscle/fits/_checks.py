@@ -121,7 +121,7 @@ def ambiguity(told: list[str], moved: list[str]) -> tuple[str, ...]:
         return ()
     verb = "is" if len(moved) == 1 else "are"
     return (f"{' and '.join(moved)} {verb} ambiguous: {' or '.join(told)} fits almost as well (log-likelihood within "
-            f"{AMBIGUOUS}); the other numbers hold for what is shown",)  # fmt: skip
+            f"{AMBIGUOUS}); the other numbers belong to the frequency shown",)  # fmt: skip
 
 
 def notices_of(target: Any, statistics: BinStatistics, check: dict[str, float | int], left: float) -> tuple[str, ...]:

@@ -11,7 +11,7 @@ from jaxmuscle._common.environment import versions
 from jaxmuscle._common.errors import SimulationError
 from jaxmuscle.ensembles._ensemble import ensemble
 from jaxmuscle.model._tasks import AbstractTask
-from jaxmuscle.objective._arguments import Plan, base_of
+from jaxmuscle.objective._arguments import SAME, Plan, base_of
 from jaxmuscle.objective._consequences import DERIVED, consequences, jackknife, observed, unit_of
 from jaxmuscle.objective._covariance import (
     Identifiability,
@@ -43,7 +43,6 @@ from ._harmonic_evidence import harmonic_test
 from ._part import Estimate, FittedPart, Start
 from ._result import FitResult
 
-SAME = 1e-9
 OUTPUTS = ("coefficient_of_variation", "mean")
 STRETCH = 5.0
 UNCHECKED = "not checked on simulated seeds; no profile over the harmonic's frequency and no p-value (check_seeds=0)"

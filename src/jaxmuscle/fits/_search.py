@@ -54,20 +54,24 @@ def search(plan: Plan, answer: Callable[[FitResult], None] | None = None) -> Fit
         interrupted = True
     if not stages:
         raise KeyboardInterrupt("fit interrupted before its first step")
-    result = report_fit(plan._replace(check_seeds=0), stages, interrupted=interrupted)
     if interrupted:
-        raise FitInterrupted(result)
+        raise FitInterrupted(_unchecked(plan, stages, interrupted=True))
     if answer is not None:
-        later = tuple(n for n in result.notices if n != UNCHECKED) if plan.check_seeds else result.notices
-        answer(dataclasses.replace(result, notices=later))
-    if plan.check_seeds:
-        try:
-            problem.tell("checking on fresh seeds", 0.8)
-            result = report_fit(plan, stages)
-        except KeyboardInterrupt:
-            raise FitInterrupted(result) from None
+        found = _unchecked(plan, stages)
+        later = tuple(n for n in found.notices if n != UNCHECKED) if plan.check_seeds else found.notices
+        answer(dataclasses.replace(found, notices=later))
+    try:
+        problem.tell("checking on fresh seeds" if plan.check_seeds else "reporting", 0.8)
+        result = report_fit(plan, stages)
+    except KeyboardInterrupt:
+        raise FitInterrupted(_unchecked(plan, stages)) from None
     problem.tell("done", 1.0)
     return result
+
+
+def _unchecked(plan: Plan, stages: list[Stage], *, interrupted: bool = False) -> FitResult:
+    """The result before anything is simulated to check it."""
+    return report_fit(plan._replace(check_seeds=0), stages, interrupted=interrupted)
 
 
 def search_together(plans: list[Plan], tell: Callable[[str, float], None]) -> list[FitResult]:

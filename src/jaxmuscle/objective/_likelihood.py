@@ -48,7 +48,7 @@ class Bins(NamedTuple):
     mask: Float[Array | np.ndarray, "*rows bins"]
 
 
-def check_known(target: Target) -> None:
+def require_spread(target: Target) -> None:
     """Raises `ValueError` for a target that states neither segments nor sigma."""
     if target.segments is None and target.sigma is None:
         raise ValueError(
@@ -137,7 +137,7 @@ class Likelihood(eqx.Module):
     def of(cls, problem: FitProblem) -> "Likelihood":
         """Of the problem's targets. Raises `ValueError` if one states neither segments nor sigma."""
         for part in problem.parts:
-            check_known(part.target)
+            require_spread(part.target)
         bins = (None if p.target.segments is None else as_arrays(measured_bins(p.target)) for p in problem.parts)
         return cls(problem.linear(), tuple(bins))
 

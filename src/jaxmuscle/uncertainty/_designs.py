@@ -10,19 +10,19 @@ from jaxtyping import Float
 from jaxmuscle._common.text import choices
 from jaxmuscle.data._target import Target
 from jaxmuscle.model._tasks import AbstractTask, Isometric, PrescribedForce
+from jaxmuscle.objective._arguments import INPUTS
 from jaxmuscle.objective._consequences import Expansion, expand
 from jaxmuscle.objective._coordinates import Coordinates
-from jaxmuscle.objective._likelihood import Likelihood, check_known, without_offsets
+from jaxmuscle.objective._likelihood import Likelihood, require_spread, without_offsets
 from jaxmuscle.objective._problem import FitProblem, Part, target_variation
 from jaxmuscle.response._expected import Moments
 from jaxmuscle.response._linearised import has_response
+from jaxmuscle.response._scaling import FORCES
 from jaxmuscle.spectra._settings import SpectrumSettings
 
 AMPLITUDES = ("noise_K_w", "noise_K_z", "noise_C_w", "noise_C_z", "harmonic_amplitude")
 MEAN_ERROR = 0.02
 LEVELS = (2.0, 0.5)
-INPUTS = ("P_w", "F_ext", "x_z")
-FORCES = ("P_w", "F_ext")
 LONGER = 10
 MOST_VARIATION = 1e3
 VAGUE = 1e-6  # prior precision of what is separate
@@ -122,7 +122,7 @@ def segments_of(target: Target) -> tuple[int, ...]:
     """A target's segments; where it states only a sigma, as many as scatter like its median bin."""
     if target.segments is not None:
         return target.segments
-    check_known(target)
+    require_spread(target)
     relative = float(np.median(target.sigma / target.proportional_power))
     one = target.settings.degrees_of_freedom(1000) / 1000
     return (max(1, round(2 / relative**2 / one)),)

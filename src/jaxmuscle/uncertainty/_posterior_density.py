@@ -64,8 +64,10 @@ def _polynomial(coefficients: Float[Array, " powers"], s: Complex[Array, " grid"
     return value
 
 
-def _rational(A: Array, b: Array, c: Array, d: Array, e: Array) -> tuple[Array, Array]:
-    """`c (s - A)⁻¹ b + d + s e` as numerator and denominator, by Faddeev and LeVerrier."""
+def _reply(task: AbstractTask, system: Linearisation) -> tuple[Array, Array]:
+    """The output's reply to the harmonic, `c (s - A)⁻¹ b + d + s e`, as numerator and denominator: Faddeev and LeVerrier."""
+    base, A, c = task.harmonic_base(), system.A, system.C
+    b, d, e = system.B @ base, system.D @ base, system.E @ base
     n, eye = len(A), jnp.eye(len(A), dtype=A.dtype)
     adjoint, below, above = eye, [jnp.ones((), A.dtype)], []
     for k in range(1, n + 1):
@@ -177,8 +179,7 @@ class PosteriorDensity(eqx.Module):
         """Log coefficient of variation of a long recording, the harmonic's frequencies weighted; the linearised task."""
         task, band = self.task(s, part), self.band_of(part)
         system = linearise(task)
-        variance, base = noise_variance(task, system), task.harmonic_base()
-        top, below = _rational(system.A, system.B @ base, system.C, system.D @ base, system.E @ base)
+        variance, (top, below) = noise_variance(task, system), _reply(task, system)
         frequency = jnp.atleast_1d(task.harmonic.frequency if band is None else jnp.asarray(band.frequency))
         s = jax.lax.complex(jnp.zeros_like(frequency), 2 * jnp.pi * frequency)
         reply = harmonic_size(task, system.A.dtype) * _polynomial(top, s) / _polynomial(below, s)
@@ -191,11 +192,9 @@ class PosteriorDensity(eqx.Module):
         assert isinstance(model, Linear)
         system = systems[part] if part in systems else linearise(task)
         power, variance = noise_response(task, system, task.settings, model.samples)
-        base = task.harmonic_base()
-        top, below = _rational(system.A, system.B @ base, system.C, system.D @ base, system.E @ base)
         size = harmonic_size(task, system.A.dtype)
         size = jnp.stack([jnp.real(size), jnp.imag(size)])
-        return Features(power[model.chosen] * model.correction.power, system.rest, variance, size, top, below)
+        return Features(power[model.chosen] * model.correction.power, system.rest, variance, size, *_reply(task, system))
 
     def heights(
         self, band: Band, s: Float[Array, " free"], offsets: Float[Array, " parts"], systems: Systems
