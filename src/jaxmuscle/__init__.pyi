@@ -45,8 +45,9 @@ from .objective._arguments import task_for as task_for
 from .objective._likelihood import log_likelihood as log_likelihood
 from .paper._reproduce import reproduce as reproduce
 from .response._characteristics import static_characteristics as static_characteristics
-from .response._expected import expected_spectrum as expected_spectrum
+from .response._expected_spectrum import expected_spectrum as expected_spectrum
 from .response._linearised import settled as settled
+from .response._scaling import at_force as at_force
 from .response._scaling import at_level as at_level
 from .response._scaling import scaled as scaled
 from .response._sensitivity import sensitivity as sensitivity

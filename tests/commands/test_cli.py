@@ -258,7 +258,7 @@ def test_a_fit_writes_result_table_and_figure(fitted):
 
 def test_a_fit_prints_what_it_found(fitted):
     outcome, folder = fitted
-    for part in ("c_w", "noise_K_w", "corner_frequency", "chi2 per bin", "fitted: ", f"{folder}/fit.json"):
+    for part in ("c_w", "noise_K_w", "corner_frequency", "chi2 per bin", "converged: ", f"{folder}/fit.json"):
         assert part in outcome.stdout
     assert "rescaled to 1" in outcome.stderr
     # Nothing but the parameters that were fitted and what follows from them.
@@ -306,7 +306,11 @@ def test_several_targets_have_a_folder_each(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize(
     ("result", "code", "word"),
-    [(made_result(), 0, "fitted"), (made_result(success=False), 1, "NOT FITTED"), (failed_result(), 1, "NOT FITTED")],
+    [
+        (made_result(), 0, "Describes the data: "),
+        (made_result(success=False), 1, "Not fitted: "),
+        (failed_result(), 1, "Not fitted: "),
+    ],
     ids=["converged", "not converged", "exploded"],
 )
 def test_the_exit_code_says_whether_it_converged(result, code, word, tmp_path, monkeypatch):
@@ -314,7 +318,7 @@ def test_the_exit_code_says_whether_it_converged(result, code, word, tmp_path, m
     (tmp_path / "fit.png").write_text("of an earlier fit")
     outcome = run("fit", csv_file(tmp_path), "--out", tmp_path)
     assert outcome.exit_code == code
-    assert outcome.stdout.startswith(f"{word}: made (user)") and result.message in outcome.stdout
+    assert outcome.stdout.startswith(word) and "made (user)" in outcome.stdout and result.message in outcome.stdout
     assert_equal(jm.load_result(tmp_path / "fit.json"), result)
     assert (tmp_path / "fit.png").read_bytes().startswith(b"\x89PNG")
     assert len(read_columns(tmp_path / "spectrum.csv")["fitted"]) == 30

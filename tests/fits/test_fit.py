@@ -16,13 +16,13 @@ from hypothesis import strategies as st
 import jaxmuscle as jm
 from jaxmuscle._common.arrays import as_arrays
 from jaxmuscle.fits import _search
-from jaxmuscle.fits._checks import AMBIGUOUS, rivals
+from jaxmuscle.fits._checks import AMBIGUOUS, Stage, rivals
 from jaxmuscle.model._parameters import DEFAULT_FREE, PARAMETERS
 from jaxmuscle.model._tasks import with_noise
 from jaxmuscle.objective._arguments import DT, RESIDUALS, free_names
 from jaxmuscle.objective._consequences import BATCH, _moments_and_slopes, consequences, derived, expand
 from jaxmuscle.objective._coordinates import Coordinates
-from jaxmuscle.objective._covariance import identifiability, undetermined_directions
+from jaxmuscle.objective._covariance import common_scales, identifiability
 from jaxmuscle.objective._least_squares import Minima, _residuals, least_squares
 from jaxmuscle.objective._moment_models import MonteCarlo, welch_operator
 from jaxmuscle.objective._problem import FitProblem, Part, target_variation
@@ -137,8 +137,8 @@ def test_moments_are_those_of_a_plain_ensemble(x64, task, colour_free):
 
 # --- coordinates
 
-NATURAL = {"c_w": 60.0, "P_w": -2.0, "harmonic_frequency": 4.25, "noise_K_w": 0.15, "harmonic_phase": 0.3}
-BOUNDS = {"P_w": (-3.0, 5.0), "noise_K_w": (0.0, 0.5), "c_w": (10.0, np.inf)}
+NATURAL = {"c_w": 60.0, "F_ext": -2.0, "harmonic_frequency": 4.25, "noise_K_w": 0.15, "harmonic_phase": 0.3}
+BOUNDS = {"F_ext": (-3.0, 5.0), "noise_K_w": (0.0, 0.5), "c_w": (10.0, np.inf)}
 
 
 def coordinates(values=None, bounds=None):
@@ -389,7 +389,7 @@ def test_linear_and_cumulative_residuals_are_in_standard_deviations(x64):
 def null_sentences(task, extra):
     objective = setup_of(task, VASTUS, DEFAULT_FREE, extra=extra).montecarlo(8)
     seen = expand(objective, np.zeros((1, len(DEFAULT_FREE)))).row(0)
-    return undetermined_directions(DEFAULT_FREE, identifiability(consequences(objective, seen).jacobian))
+    return common_scales(DEFAULT_FREE, identifiability(consequences(objective, seen).jacobian))
 
 
 @pytest.mark.slow
@@ -586,7 +586,7 @@ def test_a_model_that_explodes_everywhere_is_a_result(x64, method, reason):
     assert not result.success and reason in result.message
     assert result.chi2_per_bin is None and np.all(np.isnan(result.fitted))
     assert result.parameters["c_w"].stderr is None and not result.parameters["c_w"].identifiable
-    assert "NOT FITTED" in str(result)
+    assert str(result).startswith("Not fitted: ")
 
 
 def literal():
@@ -817,8 +817,10 @@ def test_a_frequency_that_the_spectrum_leaves_open_is_called_ambiguous(x64):
     problem = setup_of(jm.Isometric(), VASTUS, ("harmonic_frequency",))
     close = ended(problem.coordinates, [3.9, 6.6], [5.0, 5.0 + 0.9 * AMBIGUOUS])
     clear = ended(problem.coordinates, [3.9, 6.6], [5.0, 5.0 + 1.1 * AMBIGUOUS])
-    assert rivals(problem, clear) == ([], [])
-    assert rivals(problem, close) == (["6.60 Hz"], ["harmonic_frequency"])
+    objective = problem.montecarlo(1)
+    assert rivals(problem, Stage("clear", objective, clear), {}) == ((), set())
+    (said,), moved = rivals(problem, Stage("close", objective, close), {})
+    assert moved == {"harmonic_frequency"} and "harmonic_frequency is ambiguous: 6.60 Hz fits almost as well" in said
 
 
 def test_two_equal_lines_make_the_frequency_ambiguous():

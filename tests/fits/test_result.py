@@ -15,6 +15,7 @@ import jaxmuscle as jm
 from jaxmuscle._common.errors import PresetError, ResultError
 from jaxmuscle._common.files import replacing, write_json, write_text
 from jaxmuscle.fits import Estimate
+from jaxmuscle.fits._adequacy import Adequacy
 from jaxmuscle.fits._part import Start
 from jaxmuscle.fits._result import FORMAT
 from jaxmuscle.model._presets import task_from_table, task_to_table
@@ -36,17 +37,20 @@ def made_result(**changes: Any) -> jm.fits.FitResult:
     rng = np.random.default_rng(0)
     fields: dict[str, Any] = {
         "success": True,
-        "message": "one more step would lower the cost by less than 0.1 %",
+        "message": "converged: 1 of 2 starts agree",
+        "adequacy": Adequacy(26.1, 25.0, 0.4, "the data have more power than the model at 4.3 Hz (1.2 standard errors)"),
         "task": task,
         "target": TARGET,
         "method": "montecarlo",
         "parameters": parameters,
         "derived": {
-            "corner_frequency": Estimate(1 / 3, "Hz", 0.01),
-            "K_w0": Estimate(200.0, "N/m", None, False),
+            "corner_frequency": Estimate(1 / 3, "Hz", 0.01, interval=(0.31, None)),
+            "K_w0": Estimate(200.0, "N/m", None, False, None),
+            "mean": Estimate(2.5, "N", None, True, False),
         },
+        "products": ("k_w / c_w",),
         "correlation": {"parameters": ["k_w", "c_w"], "matrix": [[1.0, -0.5], [-0.5, 1.0]]},
-        "undetermined": ("k_w by itself",),
+        "undetermined": ("stiffness and damping can be scaled together",),
         "singular_values": np.array([12.0, 1 / 3]),
         "chi2_per_bin": 0.9,
         "rms_log_error": 0.2,
@@ -59,6 +63,7 @@ def made_result(**changes: Any) -> jm.fits.FitResult:
         "profile": (np.linspace(0.4, 11.7, 64), rng.uniform(0, 9, 64)),
         "harmonic_p_value": 0.08,
         "check": {"seeds": 64, "largest_deviation": 0.002, "largest_deviation_se": 2.1, "largest_deviation_sd": 0.01},
+        "further": {"coefficient_of_variation": -1.5},
         "notices": ("a notice",),
         "seed": 3,
         "settings": {"free": ["k_w", "c_w"], "starts": 2, "bounds": {"k_w": [1.0, 2e6]}, "mean_force": None},
@@ -72,8 +77,9 @@ def failed_result():
     """What a fit gives whose every start explodes."""
     nothing = np.full(30, np.nan)
     return made_result(
-        success=False, message="no start has a finite spectrum", derived={"mean": Estimate(np.nan, "N")},
-        correlation={}, undetermined=(), singular_values=np.full(2, np.nan), chi2_per_bin=None, rms_log_error=None,
+        success=False, message="no start has a finite spectrum", derived={"mean": Estimate(np.nan, "N")}, adequacy=None,
+        products=(), further={}, correlation={}, undetermined=(),
+        singular_values=np.full(2, np.nan), chi2_per_bin=None, rms_log_error=None,
         fitted=nothing, harmonic_share=nothing, residual=nothing, deviation=None,
         stretch=(np.zeros(0), np.zeros(0)), profile=None, harmonic_p_value=None, check={}, seed=None,
         starts=(Start(None, False, 0),),
@@ -118,8 +124,12 @@ def test_the_file_has_the_entries_of_the_design(tmp_path):
     assert table["task"] == "isometric" and table["target"] == "made" and table["provenance"] == "user"
     for key in ("success", "message", "method", "chi2_per_bin", "rms_log_error", "seed", "settings", "versions"):
         assert table[key] == getattr(made_result(), key)
-    c_w = {"value": 50 / 3, "unit": "N", "stderr": 0.1 / 3, "free": True, "identifiable": True}
+    c_w = {"value": 50 / 3, "unit": "N", "stderr": 0.1 / 3, "free": True, "identifiable": True, "interval": None}
     assert table["parameters"]["c_w"] == c_w
+    assert table["derived"]["corner_frequency"]["interval"] == [0.31, None]
+    assert table["derived"]["K_w0"]["identifiable"] is None  # fixed: neither
+    assert table["adequate"] is True and table["adequacy_p"] == 0.4
+    assert table["per_newton"] == {"K_w0": 80.0}
     assert table["parameters"]["k_w"]["stderr"] is None and not table["parameters"]["k_w"]["identifiable"]
     assert set(table["spectrum"]) >= {"frequency_hz", "target", "fitted"}
     assert table["starts"] == [
@@ -148,19 +158,37 @@ def test_a_fit_json_is_a_preset(tmp_path):
 
 def test_text_shows_what_is_known_and_what_is_not():
     text = str(made_result())
-    assert text.startswith("fitted: made (user), Isometric, BandLimitedNoise, montecarlo")
+    first, second, *_ = text.splitlines()
+    assert first == "Describes the data: chi2 per bin 0.9, p = 0.4"
+    assert second == "  made (user), Isometric, BandLimitedNoise, montecarlo"
+    words = " ".join(text.split())
     for part in (
-        "c_w",
-        "0.0333",
-        "not determined",
-        "corner_frequency",
-        "k_w by itself",
+        "converged: 1 of 2 starts agree",
+        "c_w 16.667 ± 0.033 N",
+        "corner_frequency 0.333 ± 0.010 above 0.31 Hz",
+        "they also fix, roughly: k_w / c_w",
+        "not determined (near their defaults by the prior): k_w 5e+05 N",
+        "do not notice if: - stiffness and damping can be scaled together",
+        "Per newton of mean force: K_w0 80 1/m",
         "note: a notice",
         "chi2 per bin 0.90",
     ):
-        assert part in text
-    assert "NOT FITTED" in str(failed_result()) and "no start has a finite spectrum" in str(failed_result())
-    assert "no chi2" in str(made_result(chi2_per_bin=None))
+        assert part in words
+    assert words.index("determined by the data") < words.index("not determined (near")
+    assert str(failed_result()).startswith("Not fitted: no start has a finite spectrum")
+
+
+def test_a_fit_that_misses_the_data_says_so_first():
+    missed = Adequacy(145.0, 25.0, 0.001, "the data have more power than the model from 7 to 9 Hz (12.0 standard errors)")
+    found = made_result(adequacy=missed, chi2_per_bin=5.0)
+    first, *rest = str(found).splitlines()
+    assert found.adequate is False and found.adequacy_p == 0.001
+    assert first.startswith("Does not describe the data: chi2 per bin 5, p = 0.001; the data have more power")
+    words = " ".join(" ".join(rest).split())
+    for part in (f"errors are widened by a factor of {np.sqrt(145 / 25):.2g}", "what to do: look at the residuals"):
+        assert part in words
+    unknown = made_result(adequacy=None, chi2_per_bin=None)
+    assert unknown.adequate is None and str(unknown).startswith("Cannot be judged: the target does not say how much")
 
 
 def test_text_fits_a_terminal():

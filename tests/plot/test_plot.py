@@ -243,7 +243,10 @@ def result(**changes):
     residual = np.resize([0.5, -1.5, 2.5, -0.5], f.size)
     fields = {
         "success": True,
-        "message": "one more step would lower the cost by less than 0.1 %",
+        "message": "converged: 28 of 100 starts agree",
+        "adequate": True,
+        "verdict": "describes the data: chi2 per bin 1.2, p = 0.2",
+        "advice": (),
         "task": Isometric().replace(harmonic_frequency=3.9),
         "target": aim,
         "method": "linear",
@@ -281,6 +284,7 @@ def failed():
     nothing = np.full(30, np.nan)
     return result(
         success=False, message="no start has a finite spectrum: lower the noise", derived={}, chi2_per_bin=None,
+        adequate=None, verdict="not fitted: no start has a finite spectrum: lower the noise",
         rms_log_error=None, fitted=nothing, harmonic_share=nothing, residual=nothing, deviation=None,
         undetermined=(), stretch=(np.zeros(0), np.zeros(0)), seed=None, remarks=(), profile=None, harmonic_p_value=None,
     )  # fmt: skip
@@ -326,8 +330,8 @@ def test_fit_draws_the_simulated_stretch():
 def test_fit_tells_verdict_parameters_and_what_is_not_determined():
     said = texts(plot.fit(result()))
     for text in (
-        "vastus-lateralis-26mvc", "Converged: one more step would lower the cost by less than 0.1 %",
-        "Isometric (BandLimitedNoise)  ·  linear  ·  χ² per bin 1.18  ·  rms log error 0.31  ·  2 starts, seed 7",
+        "vastus-lateralis-26mvc", "Describes the data: chi2 per bin 1.2, p = 0.2",
+        "Isometric (BandLimitedNoise)  ·  linear  ·  χ² per bin 1.18  ·  rms log error 0.31  ·  28 of 100 starts agree",
         "k_w", "4.20", "± 0.13", "10⁵ N/m³", "c_w", "57.0", "not determined", "N s³/m³", "3.900", "± 0.047", "Hz",
         "corner_frequency", "1.23", "± 0.16", "•  stiffness and damping can be scaled together",
     ):  # fmt: skip
@@ -360,9 +364,9 @@ def test_a_failed_fit_still_shows_the_target_and_the_reason():
     figure = plot.fit(failed())
     figure.canvas.draw()
     said = texts(figure)
-    assert "Did not converge: no start has a finite spectrum: lower the noise" in said
+    assert "Not fitted: no start has a finite spectrum: lower the noise" in said
     assert {"no finite fit", "no finite simulation", "none"} <= set(said)
-    assert "Isometric (BandLimitedNoise)  ·  linear  ·  2 starts" in said
+    assert "Isometric (BandLimitedNoise)  ·  linear" in said
     assert not any(line.get_label() == "fit" for line in panels(figure)[0].lines)
 
 
@@ -373,7 +377,7 @@ def test_a_fit_without_known_spread_draws_logarithms_without_bands():
     ax = panels(figure)[2]
     assert ax.get_ylabel() == "Residual (ln units)" and len(ax.patches) == 3
     assert any("no χ² (spread unknown)" in text for text in texts(figure))
-    assert "What the data do not determine" not in texts(figure)
+    assert "What the data do not notice" not in texts(figure)
 
 
 @pytest.mark.parametrize(("frequency", "share"), [(25.0, 1e-5), (3.9, 0.0)])

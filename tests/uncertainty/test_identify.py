@@ -313,7 +313,7 @@ def test_the_report_agrees_with_itself():
     assert found.present.determined == np.sum(found.present.singular_values >= 3) == 5
     assert len(found.pairs) == len(found.designs) * (len(found.designs) - 1) // 2
     for outlook in (found.present, *found.designs, *found.pairs):
-        assert outlook.determined + len(outlook.undetermined) == 8
+        assert outlook.determined == len(outlook.products) == np.sum(outlook.singular_values >= 3)
         for name, known in outlook.quantities.items():
             assert known.determined is (known.left**2 <= 0.1), name
             assert known.left <= found.present.quantities[name].left * (1 + 1e-9)

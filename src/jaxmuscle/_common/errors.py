@@ -17,6 +17,10 @@ class OperatingPointError(ValueError):
     """A task has no usable equilibrium."""
 
 
+class FirstOrderWarning(UserWarning):
+    """Numbers of the linear response that the model itself does not have: its perturbations are too large there."""
+
+
 class StoreError(ValueError):
     """A store that is there already, cannot be resumed, or cannot be written; the message says what to do."""
 

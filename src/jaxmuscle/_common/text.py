@@ -21,6 +21,24 @@ def _parts(line: str) -> list[str]:
     return textwrap.wrap(line, WIDTH, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False)
 
 
+def rounded(value: float, error: float) -> tuple[str, str]:
+    """A value and its error as they are printed: the error to two digits, the value to as many places."""
+    if not (np.isfinite(value) and np.isfinite(error) and error > 0):
+        return f"{value:.3g}", f"{error:.2g}"
+    places = 1 - int(np.floor(np.log10(error)))
+    if float(f"{error:.1e}") >= 10.0 ** (2 - places):  # 0.0996 is rounded up to 0.10
+        places -= 1
+    if not -4 <= places <= 7:
+        return f"{value:.3g}", f"{error:.2g}"
+    shown = [f"{round(x, places):.{max(places, 0)}f}" for x in (value, error)]
+    return shown[0], shown[1]
+
+
+def probability(p: float) -> str:
+    """ "p = 0.23"; one below a thousandth as "p < 0.001"."""
+    return "p < 0.001" if p < 0.001 else f"p = {p:.2g}"
+
+
 def choices(word: str, options: Iterable[str]) -> str:
     """The end of a message about an unknown word: the nearest option, then all of them."""
     options = list(options)

@@ -112,8 +112,10 @@ def _show(cohort: "CohortResult", folder: Path) -> None:
     for name, result in cohort.results.items():
         cells = [plain(cohort.groups.get(name, ""))] * grouped + [_cell(result.derived.get(q)) for q in SHOWN]
         chi2 = "" if result.chi2_per_bin is None else f"{result.chi2_per_bin:.2f}"
+        chi2 = f"[bold red]{chi2}*[/]" if result.adequate is False else chi2
         table.add_row(plain(name), *cells, chi2 if result.success else "[bold red]failed[/]")
     out.print(table)
+    out.print(plain(cohort.verdict), highlight=False)
     for d in cohort.differences():
         unit = "" if d.unit == "1" else f" {d.unit}"
         out.print(f"{plain(d.quantity)}: {plain(d.b)} - {plain(d.a)} = {d.difference:.3g}{unit} "

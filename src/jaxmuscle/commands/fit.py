@@ -114,7 +114,7 @@ def _fit_one(target: Any, model: Any, folder: Path, options: dict[str, Any], *, 
     printed = []
 
     def answer(result: Any) -> None:
-        show(result, success=result.success)
+        show(result, success=result.success and result.adequate is not False)
         printed.append(result)
 
     try:

@@ -12,15 +12,17 @@ from jaxmuscle._common.arrays import as_numbers
 from jaxmuscle._common.progress import told
 from jaxmuscle._common.text import choices
 from jaxmuscle.data._target import Target
+from jaxmuscle.fits._adequacy import judged
 from jaxmuscle.model._parameters import PARAMETERS
 from jaxmuscle.model._tasks import NOISES, AbstractTask, with_noise
 from jaxmuscle.objective._arguments import FitOptions, planned
+from jaxmuscle.objective._consequences import expand
 from jaxmuscle.objective._coordinates import task_at
 from jaxmuscle.objective._problem import FitProblem
 from jaxmuscle.spectra._bin_law import bin_statistics, standardised
 
 from ._comparison import NEEDED, ComparedModel, Comparison, score_difference
-from ._evidence import Candidate, Folds, held_out, masked_bins, maxima
+from ._evidence import Candidate, Folds, held_out, masked_bins, maxima, without_harmonic
 
 Value = TypeVar("Value")
 
@@ -141,6 +143,9 @@ def _fitted(problem: FitProblem, folds: Folds | None, *, harmonic: bool) -> dict
     held = None if folds is None else held_out(model, peak.theta, folds, moving)
     residual = standardised(target.proportional_power, peak.proportional[0], bin_statistics(target, peak.line[0]))
     (part,) = model.likelihood.objective.parts
+    problem = problem if harmonic else without_harmonic(problem)
+    objective = problem.linear([peak.line[0]])
+    judgement = judged(problem, objective, expand(objective, peak.theta).row(0))
     return {
         "task": as_numbers(task_at(part.task, part.coordinates, jnp.asarray(peak.theta[0]))),
         "fitted": peak.proportional[0],
@@ -149,6 +154,7 @@ def _fitted(problem: FitProblem, folds: Folds | None, *, harmonic: bool) -> dict
         "aic": float(2 * (peak.parameters[0] - peak.log_likelihood[0])),
         "scores": None if held is None else held.scores[0],
         "chi2_per_bin": float(np.sum(residual**2) / (len(residual) - 1)),
+        "adequacy_p": None if judgement is None else judgement.p,
         "success": bool(peak.settled[0] and (held is None or held.settled[0])),
     }
 

@@ -15,6 +15,7 @@ from jaxmuscle._common.environment import versions
 from jaxmuscle._common.files import write_text
 from jaxmuscle._common.text import folded
 from jaxmuscle.data._target import Target
+from jaxmuscle.fits._adequacy import ADEQUATE
 from jaxmuscle.model._presets import task_to_table
 from jaxmuscle.model._tasks import AbstractTask
 
@@ -27,8 +28,8 @@ if TYPE_CHECKING:
 FORMAT = 1
 NEEDED = 6.0
 NUMBERS = ("log_likelihood", "parameters", "aic", "delta_aic", "weight", "score", "score_difference", "score_stderr",
-           "chi2_per_bin")  # fmt: skip
-COLUMNS = ("noise", "harmonic", *NUMBERS, "success")
+           "chi2_per_bin", "adequacy_p")  # fmt: skip
+COLUMNS = ("noise", "harmonic", *NUMBERS, "adequate", "success")
 
 
 class Evidence(NamedTuple):
@@ -99,7 +100,8 @@ class ComparedModel(eqx.Module):
     `log_likelihood` at the maximum of the posterior, the offset integrated out; `parameters`, their effective number
     p = tr(F (F + Λ)⁻¹); `aic` = -2 ln L + 2 p; `delta_aic` above the lowest; Akaike `weight`; `scores`, log density of every
     bin foretold from the others, and `score`, their sum; `score_difference` to the model of lowest AIC with `score_stderr`
-    (None where the target has no segments); `chi2_per_bin`; `success`, whether its climbs settled.
+    (None where the target has no segments); `chi2_per_bin`; `adequacy_p`, how often its own spectra would lie as far from
+    their fit; `success`, whether its climbs settled.
     """
 
     noise: str
@@ -113,10 +115,16 @@ class ComparedModel(eqx.Module):
     score_difference: float | None
     score_stderr: float | None
     chi2_per_bin: float
+    adequacy_p: float | None
     success: bool
     scores: Float[np.ndarray, " bins"] | None
 
     needed: ClassVar[float] = NEEDED
+
+    @property
+    def adequate(self) -> bool | None:
+        """Whether the model describes the data, `adequacy_p >= 0.01`."""
+        return None if self.adequacy_p is None else self.adequacy_p >= ADEQUATE
 
     @property
     def evidence(self) -> "Evidence":
@@ -198,10 +206,21 @@ class Comparison(eqx.Module):
         """Sentences: the best noise against each other one, and whether there is a harmonic."""
         first, *others = self.noises
         decisions = [self.between(first, other) for other in others] + ([] if self.harmonic is None else [self.harmonic])
-        said = [str(decision) for decision in decisions]
+        said = [self._describing(), *(str(decision) for decision in decisions)]
         if self.best.scores is None:
             said.append("the target states no segments: nothing was held out, the AIC decides alone")
         return tuple(said)
+
+    def _describing(self) -> str:
+        """Which models describe the data: that one is better than another does not say that it is good."""
+        known = [row for row in self.rows if row.adequate is not None]
+        fine = [row.label for row in known if row.adequate]
+        if not known:
+            return "whether any model describes the data cannot be judged: the target states neither segments nor sigma"
+        if not fine:
+            return "none of the models describes the data (p < 0.01 for each): the best of them is still not to be believed"
+        every = len(fine) == len(self.rows)
+        return "every model describes the data" if every else f"these describe the data (p >= 0.01): {'; '.join(fine)}"
 
     def table(self) -> list[dict[str, Any]]:
         """Tidy rows with the keys of `COLUMNS`."""
@@ -275,7 +294,7 @@ class Comparison(eqx.Module):
 
     def __str__(self) -> str:
         kind = type(next(iter(self.tasks.values()))).__name__
-        head = f"  {'noise':<19}{'line':<5}{'ln L':>9}{'p':>5}{'AIC':>9}{'ΔAIC':>9}{'weight':>7}  held-out"
+        head = f"  {'noise':<19}{'line':<5}{'ln L':>9}{'par':>5}{'AIC':>9}{'ΔAIC':>9}{'weight':>7}{'p':>8}  held-out"
         lines = [f"{self.target.name} ({self.target.provenance}), {kind}: which noise?", head]
         for row in sorted(self.rows, key=lambda row: row.aic):
             held = "" if row.score is None else f"{_short(row.score_difference)} ± {_short(row.score_stderr)}"
@@ -283,6 +302,9 @@ class Comparison(eqx.Module):
                 f"  {row.noise:<19}{'yes' if row.harmonic else 'no':<5}{_short(row.log_likelihood):>9}{row.parameters:>5.1f}"
             )
             line += f"{_short(row.aic):>9}{_short(row.delta_aic):>9}{row.weight:>7.2f}"
+            line += (
+                f"{'' if row.adequacy_p is None else '< 0.001' if row.adequacy_p < 0.001 else f'{row.adequacy_p:.3f}':>7}"
+            )
             lines.append(f"{line}  {held if row.success else 'failed'}")
         said = [f"left out: {noise}: {why}" for noise, why in self.left_out.items()]
         for sentence in (*self.verdict, *said):

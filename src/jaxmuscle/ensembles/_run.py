@@ -15,7 +15,7 @@ from jaxmuscle._common.arrays import as_numbers
 from jaxmuscle._common.environment import versions
 from jaxmuscle._common.errors import SimulationError, StoreError
 from jaxmuscle.model._parameters import PARAMETERS
-from jaxmuscle.response._expected import expected_spectrum
+from jaxmuscle.response._expected import linear_spectrum
 from jaxmuscle.simulation._trajectory import run_attributes
 
 from ._layout import Chunk, Cut, Layout, Pace, run_chunks
@@ -273,7 +273,7 @@ def _time(layout: Layout) -> np.ndarray:
 def _summary(layout: Layout, levels: tuple[float, ...], found: Reduced) -> EnsembleSummary:
     expected = None
     if _bins(layout) and layout.linear is not None:
-        spectra = [expected_spectrum(layout.task_of(i), layout.recipe.settings) for i in range(layout.points)]
+        spectra = [linear_spectrum(layout.task_of(i), layout.recipe.settings) for i in range(layout.points)]
         expected = np.stack([np.asarray(spectrum.power, float) for spectrum in spectra])
     failed: Int[np.ndarray, "failed 2"] = np.array(sorted(found.failed), int).reshape(-1, 2)
     about = _about(layout) | ({} if layout.whole else {"cells_per_quantile": CELLS})

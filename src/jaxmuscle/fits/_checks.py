@@ -1,13 +1,15 @@
 """What is checked about a fit: nonlinear against linear, other minima, transients; and what is said about it."""
 
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 
 from jaxmuscle.data._target import Target
-from jaxmuscle.objective._consequences import Expansion, consequences, expand
-from jaxmuscle.objective._least_squares import Minima
+from jaxmuscle.objective._consequences import BATCH, Expansion, consequences, expand, quantities
+from jaxmuscle.objective._covariance import Identifiability
+from jaxmuscle.objective._least_squares import SMALL, Minima
 from jaxmuscle.objective._problem import FitProblem
 from jaxmuscle.objective._residuals import Residuals
 from jaxmuscle.objective._starts import contenders, frequency_names, harmonic_frequencies
@@ -16,9 +18,10 @@ from jaxmuscle.simulation._trajectory import Trajectory
 from jaxmuscle.spectra._bin_law import BinStatistics, trial_samples
 from jaxmuscle.spectra._settings import WINDOW
 
-from ._part import Estimate
+from ._part import Estimate, Start
 
-AMBIGUOUS = 1.92
+AMBIGUOUS, OTHER = 2.0, 3.0
+MISSED = 3.0
 NONLINEAR = 0.1
 LEFT = 1e-3
 RISEN = 1.5
@@ -97,31 +100,86 @@ def unsettled(problem: FitProblem, moments: Moments) -> float:
     return float(np.exp(-float(moments.rate) * (WINDOW[0] - RISEN))) if problem.control else 0.0
 
 
-def rivals(problem: FitProblem, minima: Minima) -> tuple[list[str], list[str]]:
-    """Other minima that fit almost as well as the best one, in words, and which harmonic frequencies differ in them.
+def rivals(problem: FitProblem, stage: Stage, stated: Mapping[str, Estimate]) -> tuple[tuple[str, ...], set[str]]:
+    """Other solutions that fit almost as well as the best one, told in words; and which stated quantities differ in them.
 
-    Almost as well: a cost `½ Σ r²` within 1.92 of the lowest, half the 95 % quantile of χ² with one degree of freedom, so
-    that a likelihood interval for the frequency would contain them.
+    Almost as well: a cost `½ Σ r²` within 2 of the lowest, so that a 95 % likelihood interval would contain them. Near a
+    single minimum no quantity is then further off than two standard errors; one that is further than three, or a
+    harmonic's frequency further than a bin, belongs to another solution.
     """
-    chosen = contenders(problem, minima, AMBIGUOUS)
+    minima = stage.minima
+    cost = np.where(np.isfinite(minima.cost), minima.cost, np.inf)
+    order = np.argsort(cost, kind="stable")[:BATCH]
+    order = order[cost[order] <= cost[order[0]] + AMBIGUOUS]
     names = frequency_names(problem.coordinates)
     theta = np.asarray(problem.coordinates.theta(minima.s))
+    chosen = contenders(problem, minima, AMBIGUOUS)
+    told, moved = [], set[str]()
     frequency = {name: harmonic_frequencies(problem, theta, name)[chosen] for name in names}
-    told, moved = [], []
     for i in range(1, len(chosen)):
         differ = [n for n, f in frequency.items() if abs(f[i] - f[0]) >= problem.finest.settings.resolution]
         told.append(" with ".join(f"{n} " * (len(names) > 1) + f"{frequency[n][i]:.2f} Hz" for n in differ))
-        moved += differ
-    return told, sorted(set(moved))
+        moved |= set(differ)
+    said: tuple[str, ...] = ()
+    if told:
+        verb = "is" if len(moved) == 1 else "are"
+        said = (f"{' and '.join(sorted(moved))} {verb} ambiguous: {' or '.join(told)} fits almost as well (log-likelihood "
+                f"within {AMBIGUOUS:g}); the other numbers belong to the frequency shown",)  # fmt: skip
+    if not any(p.stderr for p in stated.values()) or not stage.objective.linear:
+        return said, moved
+    rows = order[np.minimum(np.arange(BATCH), len(order) - 1)]  # one size, so that one program serves all
+    values = _values(problem, stage.objective, theta[rows])
+    far = {n: values[n][np.argmax(np.abs(values[n] - values[n][0]))] for n, p in stated.items()
+           if p.stderr and n in values and n not in moved
+           and np.max(np.abs(values[n] - values[n][0])) > OTHER * p.stderr}  # fmt: skip
+    if far:
+        others = ", ".join(f"{n} {far[n]:.3g} instead of {values[n][0]:.3g}" for n in far)
+        said += (f"another solution fits almost as well (log-likelihood within {AMBIGUOUS:g}): {others}; no error is stated "
+                 "for what differs",)  # fmt: skip
+    return said, moved | set(far)
 
 
-def ambiguity(told: list[str], moved: list[str]) -> tuple[str, ...]:
-    """The notice of such minima."""
-    if not told:
-        return ()
-    verb = "is" if len(moved) == 1 else "are"
-    return (f"{' and '.join(moved)} {verb} ambiguous: {' or '.join(told)} fits almost as well (log-likelihood within "
-            f"{AMBIGUOUS}); the other numbers belong to the frequency shown",)  # fmt: skip
+def _values(problem: FitProblem, objective: Residuals, theta: np.ndarray) -> dict[str, np.ndarray]:
+    """Free parameters and derived quantities at every θ."""
+    seen = expand(objective, theta)
+    derived = problem.by_name(quantities(objective, seen)[0])
+    return derived | dict(zip(problem.coordinates.names, problem.coordinates.values_of(theta).T, strict=True))
+
+
+def convergence(
+    final: Minima,
+    residuals: np.ndarray,
+    jacobian: np.ndarray,
+    prior: np.ndarray,
+    theta: np.ndarray,
+    known: Identifiability,
+    starts: tuple[Start, ...],
+    max_steps: int,
+) -> tuple[bool, str]:
+    """Success: a further step gains less than a thousandth of the cost, or only runs along what is not determined."""
+    cost = final.cost[final.best]
+    curvature = jacobian.T @ jacobian + np.diag(prior)
+    gradient = jacobian.T @ residuals + prior * theta
+    step = -np.linalg.pinv(curvature, hermitian=True) @ gradient
+    gain = -0.5 * gradient @ step / max(cost, 1e-300)
+    finite = [s.cost for s in starts if s.cost is not None]
+    near = sum(c <= 1.05 * min(finite) for c in finite) if finite else 0
+    census = f"{near} of {len(starts)} starts agree"
+    if final.settled[final.best] or gain < SMALL:
+        return True, f"converged: {census}"
+    along = known.directions[~known.determined] @ step
+    if along @ along >= 0.9 * (step @ step):
+        return True, f"stopped after {max_steps} steps along a direction that the data do not determine; {census}"
+    return False, (f"did not converge: after {max_steps} steps one more would still lower the cost by {100 * gain:.2g} %; "
+                   f"raise max_steps or give more starts")  # fmt: skip
+
+
+def further_notices(further: Mapping[str, float]) -> tuple[str, ...]:
+    """The notice of a datum that the fit misses."""
+    words = {"coefficient_of_variation": "coefficient of variation", "mean": "mean"}
+    return tuple(f"the fitted {words[name]} is {abs(off):.1f} standard deviations {'above' if off > 0 else 'below'} the "
+                 "given one: the model cannot have both it and the spectrum" for name, off in further.items()
+                 if abs(off) > MISSED)  # fmt: skip
 
 
 def notices_of(target: Any, statistics: BinStatistics, check: dict[str, float | int], left: float) -> tuple[str, ...]:

@@ -30,7 +30,8 @@ if TYPE_CHECKING:
 
 
 CONFIDENCE = 0.95
-COLUMNS = ("target", "group", "quantity", "value", "stderr", "unit", "determined", "mvc_fraction", "chi2_per_bin", "success")
+COLUMNS = ("target", "group", "quantity", "value", "stderr", "unit", "determined", "mvc_fraction", "chi2_per_bin",
+           "adequate", "adequacy_p", "success")  # fmt: skip
 
 
 class Difference(eqx.Module):
@@ -64,11 +65,20 @@ class CohortResult(eqx.Module):
         """Whether every target could be read and its fit succeeded."""
         return not self.failed and all(result.success for result in self.results.values())
 
+    @property
+    def verdict(self) -> str:
+        """How many of the fits describe their data, and which do not."""
+        judged = {name: result.adequate for name, result in self.results.items() if result.adequate is not None}
+        bad = [name for name, adequate in judged.items() if not adequate]
+        said = f"the model describes {len(judged) - len(bad)} of {len(judged)} targets"
+        return said + (f"; not {', '.join(bad)}: their errors are widened" if bad else "")
+
     def table(self) -> list[dict[str, Any]]:
         """Tidy rows, one per target and quantity (free parameters, then derived ones), with the keys of `COLUMNS`."""
         return [
             dict(zip(COLUMNS, (name, self.groups.get(name, ""), quantity, e.value, e.stderr, e.unit, e.identifiable,
-                               result.target.mvc_fraction, result.chi2_per_bin, result.success), strict=True))
+                               result.target.mvc_fraction, result.chi2_per_bin, result.adequate, result.adequacy_p,
+                               result.success), strict=True))
             for name, result in self.results.items()
             for quantity, e in _quantities(result).items()
         ]  # fmt: skip
@@ -92,6 +102,7 @@ class CohortResult(eqx.Module):
                 "stderr": (dims, grid(lambda e: np.nan if e.stderr is None else e.stderr, np.nan)),
                 "determined": (dims, grid(lambda e: e.identifiable, False)),
                 "chi2_per_bin": ("target", [_or_nan(result.chi2_per_bin) for result in results]),
+                "adequacy_p": ("target", [_or_nan(result.adequacy_p) for result in results]),
                 "success": ("target", [result.success for result in results]),
             },
             coords={

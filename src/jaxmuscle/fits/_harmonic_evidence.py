@@ -3,24 +3,20 @@
 from typing import NamedTuple
 
 import equinox as eqx
-import jax
 import numpy as np
 from jaxtyping import Float
-from scipy.special import gammaincinv, ndtr
 
-from jaxmuscle.objective._consequences import consequences, expand
+from jaxmuscle.objective._consequences import consequences
 from jaxmuscle.objective._least_squares import Minima, least_squares
 from jaxmuscle.objective._problem import FitProblem
 from jaxmuscle.objective._residuals import Residuals
-from jaxmuscle.spectra._bin_law import bin_statistics
 
+from ._adequacy import drawn_log_residuals, generator_of, line_grid, without_fitted
 from ._checks import seen_best
 
 PROFILE = 64
 STEPS = 40
 ABSENT = 1e-6
-TEMPLATES = 128
-STRENGTHS = np.geomspace(0.02, 20.0, 16)
 REPLICATES = 999
 
 
@@ -32,9 +28,10 @@ class HarmonicTest(NamedTuple):
     p_value: float | None
 
 
-def harmonic_test(problem: FitProblem, final: Minima) -> HarmonicTest | None:
+def harmonic_test(problem: FitProblem, final: Minima, *, judged: bool = True) -> HarmonicTest | None:
     """Profile and p-value in linear response; None for several targets, without one, or if the harmonic is not fitted.
 
+    No p-value unless `judged`: about a model that does not describe the data anything improves the fit.
     All bins scatter here as if none held a line (see `bin_statistics`): else the best frequency would count for more.
     """
     names = problem.coordinates.names
@@ -43,7 +40,12 @@ def harmonic_test(problem: FitProblem, final: Minima) -> HarmonicTest | None:
     objective = problem.linear()
     problem.tell("profile over frequency", 0.9)
     frequency, rise = _profile(problem, objective, final)
-    if "harmonic_amplitude" not in names or problem.residual != "log" or not objective.parts[0].statistics.known:
+    if (
+        not judged
+        or "harmonic_amplitude" not in names
+        or problem.residual != "log"
+        or not objective.parts[0].statistics.known
+    ):
         return HarmonicTest(frequency, rise, None)
     problem.tell("bootstrap without harmonic", 0.95)
     return HarmonicTest(frequency, rise, _p_value(problem, objective, final))
@@ -82,53 +84,26 @@ def _p_value(problem: FitProblem, objective: Residuals, final: Minima) -> float:
     without = least_squares(objective, problem.coordinates.from_theta(theta), STEPS)
     here = seen_best(objective, without)
     found = consequences(objective, here)
-    null, theta = here.moments[0], np.tile(here.theta, (TEMPLATES, 1))
-    frequencies = np.linspace(
-        float(problem.parts[0].target.frequency[0]), float(problem.parts[0].target.frequency[-1]), TEMPLATES
-    )
-    theta[:, columns] = np.stack(
-        [np.zeros(TEMPLATES), problem.coordinates.theta_of("harmonic_frequency", frequencies)], axis=1
-    )
-    lines = expand(objective, theta).moments[0]
-    n, sd = len(problem.parts[0].target.bins), np.asarray(objective.parts[0].statistics.sd)
+    null, own = here.moments[0], objective.parts[0]
+    n, sd = len(problem.parts[0].target.bins), np.asarray(own.statistics.sd)
     kept = np.delete(np.arange(len(names)), columns)
     residual = np.concatenate([found.residuals, np.sqrt(problem.prior[kept]) * here.theta[kept]])
     jacobian = np.concatenate([found.jacobian[:, kept], np.diag(np.sqrt(problem.prior[kept]))])
-
-    strength = lines.line / null.power
-    strength = STRENGTHS[:, None, None] * (strength / strength.max(axis=1, keepdims=True))
-    added = np.zeros((STRENGTHS.size * TEMPLATES, len(residual)))
-    logs = np.log1p(strength).reshape(-1, n)
+    _, each, square = line_grid(problem.parts[0], np.asarray(null.power))
+    added = np.zeros((len(each), len(residual)))
+    logs = np.log1p(square[:, None] * each / null.power)
     added[:, :n] = -(logs - logs.mean(axis=1, keepdims=True)) / sd
-    if objective.data[0].variation is not None:
-        swing = (lines.variance / null.variance - 1) / (lines.line / null.power).max(axis=1)
-        added[:, n] = 0.5 * np.log1p(STRENGTHS[:, None] * swing).reshape(-1) / float(objective.data[0].variation[1])
-    basis = np.linalg.svd(jacobian, full_matrices=False)
-    u = basis[0][:, basis[1] > 1e-9 * basis[1].max()]
-    left = added - (added @ u) @ u.T
+    if own.data.variation is not None:
+        added[:, n] = 0.5 * np.log1p(square / float(null.variance)) / float(own.data.variation[1])
+    left = added @ without_fitted(jacobian)
     size = np.sum(left**2, axis=1)
 
     def improvement(rows: np.ndarray) -> np.ndarray:
         return np.max(-2 * rows @ left.T - size, axis=1)
 
+    generator = generator_of(problem, 3)
     noise = np.zeros((REPLICATES, len(residual)))
-    noise[:, :n] = _scatter(problem, n)
-    if objective.data[0].variation is not None:
-        noise[:, n] = _generator(problem, 4).normal(size=REPLICATES)
+    noise[:, :n] = drawn_log_residuals(own, generator, REPLICATES)
+    noise[:, n:] = generator.normal(size=noise[:, n:].shape)
     better = np.sum(improvement(noise) >= improvement(residual[None])[0])
     return float((1 + better) / (1 + REPLICATES))
-
-
-def _generator(problem: FitProblem, number: int) -> np.random.Generator:
-    return np.random.default_rng(np.asarray(jax.random.key_data(jax.random.fold_in(problem.key, number))))
-
-
-def _scatter(problem: FitProblem, n: int) -> np.ndarray:
-    """Log residuals of spectra without harmonic, scattering about their expectation."""
-    (target,) = (part.target for part in problem.parts)
-    law = bin_statistics(target)
-    normal = _generator(problem, 3).multivariate_normal(np.zeros(n), law.correlation, size=REPLICATES, method="cholesky")
-    z = normal * law.sd
-    if target.segments is not None:
-        z = np.log(gammaincinv(law.half, ndtr(normal)) / law.half) - law.bias
-    return (z - z.mean(axis=1, keepdims=True)) / law.sd

@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxmuscle._common.arrays import from_nulls, with_nulls
+from jaxmuscle._common.text import rounded
 from jaxmuscle.data._target import Target
 from jaxmuscle.model._presets import task_from_table, task_to_table
 from jaxmuscle.model._tasks import TASKS, AbstractTask
@@ -17,20 +18,31 @@ SPECTRUM = ("fitted", "harmonic_share", "residual", "deviation")
 class Estimate(eqx.Module):
     """A number, its `value` in `unit`, with its standard error; `stderr` is None where the data do not determine it.
 
-    `free`, whether it was fitted; `identifiable`, whether the data determine it.
+    `free`, whether it was fitted; `identifiable`, whether the data determine it, None for what was fixed; `interval`,
+    ends of its 95 % interval where that was computed, an end None where the data leave it open.
     """
 
     value: float
     unit: str
     stderr: float | None = None
     free: bool = True
-    identifiable: bool = True
+    identifiable: bool | None = True
+    interval: tuple[float | None, float | None] | None = None
 
-    def error_in_words(self, digits: int = 2) -> str:
-        """The standard error, or why there is none."""
-        if self.stderr is not None:
-            return f"{self.stderr:.{digits}g}"
-        return "not determined" if self.free else "fixed"
+    def in_words(self) -> str:
+        """The value, rounded to its error where it has one."""
+        if self.stderr is None:
+            return f"{self.value:.3g}"
+        return " ± ".join(rounded(self.value, self.stderr))
+
+    def interval_in_words(self) -> str:
+        """The 95 % interval, empty where there is none."""
+        if self.interval is None:
+            return ""
+        low, high = ("" if end is None else f"{end:.3g}" for end in self.interval)
+        if low and high:
+            return f"{low} to {high}"
+        return f"above {low}" if low else f"below {high}" if high else "open"
 
 
 class Start(eqx.Module):
@@ -47,7 +59,8 @@ class FittedPart(eqx.Module):
     Its fitted `task`; `chi2_per_bin` (None without knowledge of the spread) and `rms_log_error`; on the target's bins the
     `fitted` proportional power (of fresh seeds where they were simulated), `harmonic_share` of each bin's power, `residual`
     and `deviation` [standard deviations, log power]; `stretch`, time and output of a few simulated seconds; `check`, how far
-    linear response and nonlinear simulation differ.
+    linear response and nonlinear simulation differ; `further`, residuals of the coefficient of variation and of the mean, as
+    far as they are data [standard deviations, model above data].
     """
 
     target: Target
@@ -60,6 +73,7 @@ class FittedPart(eqx.Module):
     deviation: Float[np.ndarray, " bins"] | None
     stretch: tuple[np.ndarray, np.ndarray]
     check: dict[str, float | int]
+    further: dict[str, float]
 
     @property
     def frequency_hz(self) -> Float[np.ndarray, " bins"]:
@@ -85,13 +99,14 @@ class FittedPart(eqx.Module):
 def estimates_to_table(table: dict[str, Estimate]) -> dict[str, Any]:
     """For JSON, which knows no infinite numbers."""
     return {n: {"value": with_nulls(float(p.value)), "unit": p.unit, "stderr": p.stderr, "free": p.free,
-                "identifiable": p.identifiable} for n, p in table.items()}  # fmt: skip
+                "identifiable": p.identifiable, "interval": None if p.interval is None else list(p.interval)}
+            for n, p in table.items()}  # fmt: skip
 
 
 def read_estimates(table: dict[str, Any]) -> dict[str, Estimate]:
     """The reverse of `estimates_to_table`."""
-    return {n: Estimate(np.nan if p["value"] is None else p["value"], p["unit"], p["stderr"], p["free"], p["identifiable"])
-            for n, p in table.items()}  # fmt: skip
+    return {n: Estimate(np.nan if p["value"] is None else p["value"], p["unit"], p["stderr"], p["free"], p["identifiable"],
+                        None if p["interval"] is None else tuple(p["interval"])) for n, p in table.items()}  # fmt: skip
 
 
 def part_to_table(part: FittedPart) -> dict[str, Any]:
@@ -110,6 +125,7 @@ def part_to_table(part: FittedPart) -> dict[str, Any]:
         },
         "stretch": {"time": with_nulls(part.stretch[0]), "output": with_nulls(part.stretch[1])},
         "check": part.check,
+        "further": part.further,
         "target_table": part.target.to_table(),
         "task_table": task_to_table(part.task),
     }
@@ -126,4 +142,5 @@ def read_part(table: dict[str, Any]) -> FittedPart:
         **{field: from_nulls(spectrum[field]) for field in SPECTRUM},
         stretch=(from_nulls(stretch["time"]), from_nulls(stretch["output"])),
         check=table["check"],
+        further=table["further"],
     )

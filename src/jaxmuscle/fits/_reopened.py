@@ -12,6 +12,7 @@ from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.objective._arguments import DT, FitOptions, base_of, planned, target_of
 from jaxmuscle.objective._problem import FitProblem
 from jaxmuscle.response._linearised import has_response
+from jaxmuscle.response._second_order import warn_beyond
 
 from ._joint import planned_jointly
 from ._result import FitResult
@@ -62,6 +63,7 @@ def _problem(result: FitResult, target: Target | None, options: FitOptions, cent
     """The problem with prior centres as they were: every task has its own values there."""
     for task in result.tasks.values():
         has_response(task, required=True)
+        warn_beyond(task)
     varied, means = result.settings["coefficient_of_variation"], result.settings["mean_force"]
     if len(result.parts) == 1:
         given = dataclasses.replace(

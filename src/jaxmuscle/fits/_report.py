@@ -1,36 +1,31 @@
 """From where a fit ended to its result: success in words, fresh spectrum, standard errors, what is undetermined."""
 
-from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-from scipy.linalg import block_diag
 
 from jaxmuscle._common.environment import versions
 from jaxmuscle._common.errors import SimulationError
 from jaxmuscle.ensembles._ensemble import ensemble
 from jaxmuscle.model._tasks import AbstractTask
-from jaxmuscle.objective._arguments import SAME, Plan, base_of
-from jaxmuscle.objective._consequences import DERIVED, consequences, jackknife, observed, unit_of
-from jaxmuscle.objective._covariance import (
-    Identifiability,
-    identifiability,
-    parameter_covariance,
-    residual_covariance,
-    undetermined_directions,
-)
-from jaxmuscle.objective._least_squares import SMALL, Minima
+from jaxmuscle.objective._arguments import Plan, base_of
+from jaxmuscle.objective._consequences import consequences, jackknife, observed
+from jaxmuscle.objective._covariance import Identifiability, common_scales, known_products, parameter_covariance
 from jaxmuscle.objective._moment_models import Linear
 from jaxmuscle.objective._problem import FitProblem, Part
-from jaxmuscle.response._expected import Moments
+from jaxmuscle.objective._residuals import PartResiduals, further_residuals
+from jaxmuscle.response._expected import Moments, check_power
 from jaxmuscle.response._linearised import settled
+from jaxmuscle.response._second_order import negative_coefficients, second_order
 from jaxmuscle.spectra._bin_law import bin_statistics, standardised
 
+from ._adequacy import adequacy, elsewhere, scatter_of
 from ._checks import (
     Stage,
-    ambiguity,
     controlled_moments,
+    convergence,
+    further_notices,
     linear_check,
     notices_of,
     polish_check,
@@ -40,11 +35,22 @@ from ._checks import (
     unsettled,
 )
 from ._harmonic_evidence import harmonic_test
-from ._part import Estimate, FittedPart, Start
+from ._intervals import intervals
+from ._part import FittedPart, Start
 from ._result import FitResult
+from ._tables import (
+    correlation_table,
+    derived_table,
+    merged,
+    parameter_table,
+    too_curved,
+    widened,
+    with_intervals,
+    without_errors,
+)
 
-OUTPUTS = ("coefficient_of_variation", "mean")
 STRETCH = 5.0
+UNSETTLED = 0.05
 UNCHECKED = "not checked on simulated seeds; no profile over the harmonic's frequency and no p-value (check_seeds=0)"
 TOGETHER = (
     "in linear response alone: no nonlinear correction, no check on simulated seeds, no profile and p-value of the "
@@ -52,8 +58,11 @@ TOGETHER = (
 )
 
 
-def report_fit(plan: Plan, stages: list[Stage], *, interrupted: bool = False) -> FitResult:
-    """The result of a fit that ended at the best point of the last stage; with no `check_seeds` nothing is simulated."""
+def report_fit(plan: Plan, stages: list[Stage], *, interrupted: bool = False, preliminary: bool = False) -> FitResult:
+    """The result of a fit that ended at the best point of the last stage; with no `check_seeds` nothing is simulated.
+
+    Then the second order says whether the linear response holds, unless the result is `preliminary`.
+    """
     problem, objective, final = plan.problem, stages[-1].objective, stages[-1].minima
     first = stages[0].minima
     starts = tuple(
@@ -67,51 +76,63 @@ def report_fit(plan: Plan, stages: list[Stage], *, interrupted: bool = False) ->
     seen = seen_best(objective, final)
     theta, tasks = seen.theta, problem.tasks_at(seen.theta)
     try:
+        for part, moments in zip(problem.parts, seen.moments, strict=True):
+            check_power(part.task, moments)
         made = [_simulated(problem, part, task, plan.check_seeds) if plan.check_seeds else _expected_only(moments)
                 for part, task, moments in zip(problem.parts, tasks, seen.moments, strict=True)]  # fmt: skip
     except (SimulationError, ValueError) as error:
-        return _failed(problem, common, f"the fitted task cannot be simulated: {error}")
+        return _failed(problem, common, f"the fitted task cannot be used: {error}")
     found = consequences(objective, seen)
-    shares = [moments.line / moments.power for moments in seen.moments]
     made = [m._replace(each=m.each._replace(line=np.tile(np.minimum(x.line, np.mean(m.each.power, axis=0)),
                                                          (len(m.each.mean), 1))))
             for m, x in zip(made, seen.moments, strict=True)]  # fmt: skip
-    scatter = np.asarray(
-        block_diag(
-            *(
-                residual_covariance(part.target, own, share)
-                for part, own, share in zip(problem.parts, objective.parts, shares, strict=True)
-            )
-        )
+    scatter = scatter_of(problem, objective, seen)
+    judgement = adequacy(problem, objective, seen, found, scatter)
+    covariance = parameter_covariance(found.jacobian, scatter, problem.prior)
+    known = Identifiability.of_covariance(covariance)
+    success, message = convergence(
+        final, found.residuals, found.jacobian, problem.prior, theta, known, starts, plan.max_steps
     )
-    scaled = found.jacobian / np.sqrt(np.maximum(np.diag(scatter), 1.0))[:, None]
-    known = identifiability(scaled)
-    success, message = verdict(final, found.residuals, found.jacobian, problem.prior, theta, known, starts, plan.max_steps)
     if interrupted:
         success, message = False, f"interrupted after {int(final.steps.max())} steps; this is what had been reached"
-    covariance = parameter_covariance(found.jacobian, scatter, problem.prior)
-    sizes = _Sizes(covariance, scaled, problem.prior)
-    tables = [derived_table(part, values | observed(_mean(m.each)), slopes, jackknife(m.each), sizes)
+    tables = [derived_table(part, values | observed(_mean(m.each)), slopes, jackknife(m.each), covariance, known)
               for part, values, slopes, m in zip(problem.parts, found.values, found.slopes, made, strict=True)]  # fmt: skip
     parameters = parameter_table(problem, tasks, covariance, known)
     derived = merged(problem, tables, found.slopes)
-    told, moved = rivals(problem, first if problem.method == "linear" else final)
-    parameters, derived = (_without_errors(moved, table) for table in (parameters, derived))
+    c = problem.coordinates
+    products = tuple(known_products(c.names, c.positive, c.sd, known))
+    other, moved = rivals(problem, stages[0] if problem.method == "linear" else stages[-1], parameters | derived)
+    share = elsewhere(problem, objective, seen, found, covariance)
+    if share > UNSETTLED:
+        moved |= {n for n in parameters | derived if base_of(n).startswith("harmonic_")}
+        other += (f"the harmonic may lie elsewhere or be too faint to be seen: {100 * share:.0f} % of the posterior is more "
+                  "than a bin from the frequency shown. No errors are stated for it",)  # fmt: skip
+    factor = 1.0 if judgement is None else judgement.widening
+    moved |= too_curved(problem, known)
+    parameters, derived = (widened(without_errors(moved, table), factor) for table in (parameters, derived))
+    stated = [n for n, p in (parameters | derived).items() if p.stderr and (n in derived or n in c.names)]
+    ends = intervals(problem, objective, seen, factor**2 * covariance, stated)
+    parameters, derived = (with_intervals(table, ends) for table in (parameters, derived))
     polish = polish_check(problem, stages, derived)
     parts, notices = _parts(plan, stages, tasks, seen.moments, made, polish)
-    line_test = None if interrupted or not plan.check_seeds else harmonic_test(problem, final)
+    describes = judgement is None or judgement.adequate
+    line_test = None if interrupted or not plan.check_seeds else harmonic_test(problem, final, judged=describes)
+    simulated = bool(plan.check_seeds) or preliminary or not problem.control
+    beyond = () if simulated else tuple(n for task in tasks for n in second_order(settled(task)).notices)
     return FitResult(
         success=success,
         message=message,
+        adequacy=judgement,
         parts=parts,
         parameters=parameters,
         derived=derived,
         correlation=correlation_table(problem.coordinates.names, covariance),
-        undetermined=undetermined_directions(problem.coordinates.names, known),
+        products=products,
+        undetermined=common_scales(problem.coordinates.names, known),
         singular_values=known.singular_values,
         profile=None if line_test is None else (line_test.frequency, line_test.rise),
         harmonic_p_value=None if line_test is None else line_test.p_value,
-        notices=(*notices, *ambiguity(told, moved), *polish_notices(polish), *of_several(parts), *unsimulated(plan, stages)),
+        notices=(*notices, *other, *polish_notices(polish), *of_several(parts), *unsimulated(plan, stages), *beyond),
         **common,
     )
 
@@ -164,7 +185,9 @@ def _parts(
             check = linear_check(np.asarray(simulated.each.power), simulated.expected, statistics)
         elif isinstance(model := stages[-1].objective.parts[i].model, Linear) and stages[-1].name == "polishing":
             check = {"largest_deviation": float(np.max(np.abs(np.asarray(model.correction.power) - 1)))}
-        own = notices_of(target, statistics, check, unsettled(plan.problem, moments))
+        further = further_of(stages[-1].objective.parts[i], moments)
+        own = [*notices_of(target, statistics, check, unsettled(plan.problem, moments)), *further_notices(further),
+               *negative_coefficients(task)]  # fmt: skip
         notices += own if len(tasks) == 1 else [f"{part.name}: {notice}" for notice in own]
         parts[part.name or target.name] = FittedPart(
             target=target,
@@ -177,8 +200,16 @@ def _parts(
             deviation=statistics.sd if statistics.known else None,
             stretch=simulated.stretch,
             check=check | polish,
+            further=further,
         )
     return parts, notices
+
+
+def further_of(part: PartResiduals, moments: Moments) -> dict[str, float]:
+    """Residuals of a target's further data by name."""
+    names = [name for name, given in (("coefficient_of_variation", part.data.variation), ("mean", part.data.mean))
+             if given is not None]  # fmt: skip
+    return dict(zip(names, map(float, further_residuals(moments, part.data)), strict=True))
 
 
 def of_several(parts: dict[str, FittedPart]) -> tuple[str, ...]:
@@ -219,131 +250,13 @@ def _failed(problem: FitProblem, common: dict[str, Any], reason: str) -> FitResu
     for part in problem.parts:
         notices += [n if len(problem.parts) == 1 else f"{part.name}: {n}" for n in part.target.notices]
         nothing, none = np.full(len(part.target.bins), np.nan), (np.zeros(0), np.zeros(0))
-        made = FittedPart(part.target, part.task, None, None, nothing, nothing, nothing, None, none, {})
+        made = FittedPart(part.target, part.task, None, None, nothing, nothing, nothing, None, none, {}, {})
         parts[part.name or part.target.name] = made
-    unknown = identifiability(np.zeros((free, free)))
+    unknown = Identifiability.of_covariance(np.eye(free))
     tasks = tuple(part.task for part in problem.parts)
     return FitResult(
-        success=False, message=reason, parts=parts, derived={}, correlation={}, undetermined=(),
+        success=False, message=reason, adequacy=None, parts=parts, derived={}, products=(), correlation={}, undetermined=(),
         parameters=parameter_table(problem, tasks, np.zeros((free, free)), unknown), profile=None, harmonic_p_value=None,
         singular_values=np.full(free, np.nan), notices=tuple(notices),
         **common,
     )  # fmt: skip
-
-
-def verdict(
-    final: Minima,
-    residuals: np.ndarray,
-    jacobian: np.ndarray,
-    prior: np.ndarray,
-    theta: np.ndarray,
-    known: Identifiability,
-    starts: tuple[Start, ...],
-    max_steps: int,
-) -> tuple[bool, str]:
-    """Success: a further step gains less than a thousandth of the cost, or only runs along what is not determined."""
-    cost = final.cost[final.best]
-    curvature = jacobian.T @ jacobian + np.diag(prior)
-    gradient = jacobian.T @ residuals + prior * theta
-    step = -np.linalg.pinv(curvature, hermitian=True) @ gradient
-    gain = -0.5 * gradient @ step / max(cost, 1e-300)
-    finite = [s.cost for s in starts if s.cost is not None]
-    near = sum(c <= 1.05 * min(finite) for c in finite) if finite else 0
-    census = f"{near} of {len(starts)} starts came within 5 % of the best"
-    if final.settled[final.best] or gain < SMALL:
-        return True, f"one more step would lower the cost by less than 0.1 %; {census}"
-    along = known.directions[~known.determined] @ step
-    if along @ along >= 0.9 * (step @ step):
-        return True, f"stopped after {max_steps} steps along a direction that the data do not determine; {census}"
-    return False, (f"after {max_steps} steps one more would still lower the cost by {100 * gain:.2g} %; "
-                   f"raise max_steps or give more starts")  # fmt: skip
-
-
-REDUCED = 0.1
-
-
-def parameter_table(
-    problem: FitProblem, tasks: Sequence[AbstractTask], covariance: np.ndarray, known: Identifiability
-) -> dict[str, Estimate]:
-    """Free parameters by name, then the fixed ones; a number that differs between tasks is named with its target.
-
-    A proportional parameter, which is free but differs, is given for every target.
-    """
-    sd, identifiable = np.sqrt(np.diag(covariance)), known.parameters
-    free: dict[str, Estimate] = {}
-    fixed: dict[str, dict[str, Estimate]] = {}
-    for part, task in zip(problem.parts, tasks, strict=True):
-        own = part.coordinates.names
-        slope = part.coordinates.slope(np.array([float(task[name]) for name in own]))
-        for name, value in task.parameters.items():
-            if name not in own:
-                fixed.setdefault(name, {})[part.name] = Estimate(float(value), unit_of(name), None, False, True)
-                continue
-            column = part.columns[own.index(name)]
-            joint = problem.coordinates.names[column]
-            error = float(sd[column] * slope[own.index(name)]) if identifiable[column] else None
-            made = Estimate(float(value), unit_of(name), error, True, bool(identifiable[column]))
-            differs = joint in free and abs(free[joint].value - made.value) > SAME * abs(made.value)
-            free[f"{joint}@{part.name}" if differs else joint] = made
-    held = {}
-    for name, values in fixed.items():
-        holders = sum(name in task.parameter_names for task in tasks)
-        same = len({p.value for p in values.values()}) == 1 and len(values) == holders
-        held |= {name if same else f"{name}@{target}": p for target, p in values.items()}
-    table = free | held
-    return {name: table[name] for name in tasks[0].parameter_names} if len(tasks) == 1 else table
-
-
-class _Sizes(NamedTuple):
-    """What errors of derived quantities follow from: covariance of θ, scaled Jacobian of the data, prior precision."""
-
-    covariance: np.ndarray
-    jacobian: np.ndarray
-    prior: np.ndarray
-
-
-def derived_table(
-    part: Part, values: dict[str, Any], slopes: dict[str, Any], sampling: dict[str, float], sizes: _Sizes
-) -> dict[str, Estimate]:
-    """Derived quantities; one is determined if the data leave at most a tenth of its prior variance.
-
-    Their errors are those of the parameters and, where a value comes from fresh seeds, their sampling error.
-    """
-    after = np.linalg.pinv(sizes.jacobian.T @ sizes.jacobian + np.diag(sizes.prior), hermitian=True)
-    before = np.diag(1 / np.maximum(sizes.prior, 1e-6))
-    table = {}
-    for name in DERIVED:
-        g = np.asarray(slopes[name])
-        free = bool(np.any(g != 0))
-        determined = free and bool(g @ after @ g <= REDUCED * (g @ before @ g))
-        stderr = float(np.hypot(np.sqrt(g @ sizes.covariance @ g), sampling.get(name, 0.0))) if determined else None
-        table[name] = Estimate(
-            float(values[name]), unit_of(name, part.task.output_unit), stderr, free, determined or not free
-        )
-    return table
-
-
-def merged(problem: FitProblem, tables: list[dict[str, Estimate]], slopes: Any) -> dict[str, Estimate]:
-    """Derived quantities: one entry where all targets have the same number for the same reason, else one for each."""
-    found: dict[str, Estimate] = {}
-    for name in tables[0]:
-        values = np.array([table[name].value for table in tables])
-        rows = np.stack([g[name] for g in slopes])
-        same = np.allclose(values, values[0], rtol=SAME, atol=0) and np.allclose(rows, rows[0], rtol=SAME, atol=1e-300)
-        if len(tables) == 1 or (same and name not in OUTPUTS):
-            found[name] = tables[0][name]
-        else:
-            found |= {f"{name}@{part.name}": table[name] for part, table in zip(problem.parts, tables, strict=True)}
-    # About a mean of zero the variation is infinite, and so is its prior: no measure of what the data determine.
-    vague = [n for n, p in found.items() if base_of(n) == OUTPUTS[0] and p.stderr is not None and p.stderr > p.value]
-    return _without_errors(vague, found)
-
-
-def correlation_table(names: tuple[str, ...], covariance: np.ndarray) -> dict[str, Any]:
-    sd = np.sqrt(np.diag(covariance))
-    matrix = covariance / np.maximum(np.outer(sd, sd), 1e-300)
-    return {"parameters": list(names), "matrix": matrix.tolist()}
-
-
-def _without_errors(names: list[str], table: dict[str, Estimate]) -> dict[str, Estimate]:
-    return {name: Estimate(p.value, p.unit, None, p.free, False) if name in names else p for name, p in table.items()}

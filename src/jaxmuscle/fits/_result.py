@@ -13,11 +13,12 @@ from jaxmuscle._common.arrays import from_nulls, with_nulls
 from jaxmuscle._common.errors import ResultError
 from jaxmuscle._common.files import write_json
 from jaxmuscle._common.parts import of_only, only
-from jaxmuscle._common.text import choices, folded
+from jaxmuscle._common.text import choices, folded, probability
 from jaxmuscle.data._target import Target
 from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.objective._consequences import DERIVED
 
+from ._adequacy import Adequacy
 from ._part import Estimate, FittedPart, Start, estimates_to_table, part_to_table, read_estimates, read_part
 
 if TYPE_CHECKING:
@@ -25,30 +26,35 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure, SubFigure
 
 
-FORMAT = 1
+FORMAT = 2
 PROFILE = ("frequency_hz", "chi2_rise")
 
 
 class FitResult(eqx.Module):
     """What a fit found, of one target or of several.
 
-    `success` and `message` (in words); `parts`, a `FittedPart` for each target by name; `method`; `parameters` and `derived`
-    (`Estimate`s in natural units; with several targets, what belongs to one is called "name@target", what is the same number
-    for all by its own name); `correlation` of the free parameters; `undetermined`, sentences naming the directions that the
-    data do not determine; `singular_values` of the Jacobian (residuals in standard deviations, parameters in the prior's);
-    the table of `starts`; `profile`, harmonic frequencies [Hz] and the rise of chi² there, all else fitted anew;
-    `harmonic_p_value`, how often spectra without harmonic would show one as strong (both None with several targets);
-    `notices`; `seed`; `settings`; `versions`.
+    `success` and `message`, whether the search converged; `adequacy`, whether the model describes the data (an
+    `Adequacy`, None where the scatter of the data is unknown or there is no fit); `parts`, a `FittedPart` for each
+    target by name; `method`; `parameters` and `derived` (`Estimate`s in natural units; with several targets, what
+    belongs to one is called "name@target", what is the same number for all by its own name), their errors widened by
+    `adequacy.widening`; `products` and ratios of parameters that the data determine; `correlation` of the free
+    parameters; `undetermined`, sentences naming what can be scaled together without the data noticing;
+    `singular_values` of the Jacobian (residuals in standard deviations, parameters in the prior's); the table of
+    `starts`; `profile`, harmonic frequencies [Hz] and the rise of chi² there, all else fitted anew; `harmonic_p_value`,
+    how often spectra without harmonic would show one as strong (both None with several targets); `notices`; `seed`;
+    `settings`; `versions`.
 
     A fit of one target has what its part has as its own: `task`, `target`, `chi2_per_bin`, `fitted` and so on.
     """
 
     success: bool
     message: str
+    adequacy: Adequacy | None
     parts: dict[str, FittedPart]
     method: str
     parameters: dict[str, Estimate]
     derived: dict[str, Estimate]
+    products: tuple[str, ...]
     correlation: dict[str, Any]
     undetermined: tuple[str, ...]
     singular_values: Float[np.ndarray, " free"]
@@ -76,6 +82,51 @@ class FitResult(eqx.Module):
     stretch = of_only("stretch", "Time and output of a few simulated seconds.")
     check = of_only("check", "How far linear response and nonlinear simulation differ.")
     frequency_hz = of_only("frequency_hz", "Frequencies of the bins [Hz].")
+
+    @property
+    def adequate(self) -> bool | None:
+        """Whether the model describes the data, `adequacy_p >= 0.01`; None where that cannot be judged."""
+        return None if self.adequacy is None else self.adequacy.adequate
+
+    @property
+    def adequacy_p(self) -> float | None:
+        """How often data of the fitted model itself would lie as far from their fit."""
+        return None if self.adequacy is None else self.adequacy.p
+
+    @property
+    def verdict(self) -> str:
+        """In one sentence, whether the fit may be believed."""
+        if not self.success:
+            return f"not fitted: {self.message}"
+        if self.adequacy is None:
+            return "cannot be judged: the target does not say how much its powers scatter (segments or sigma)"
+        bins = sum(len(part.fitted) - 1 for part in self.parts.values())
+        found = f"chi2 per bin {self.adequacy.chi2 / bins:.2g}, {probability(self.adequacy.p)}"
+        if self.adequacy.adequate:
+            return f"describes the data: {found}"
+        return f"does not describe the data: {found}; {self.adequacy.misfit}"
+
+    @property
+    def advice(self) -> tuple[str, ...]:
+        """What the verdict means for the numbers, and what to do."""
+        if self.adequacy is None or self.adequacy.adequate:
+            return ()
+        told = [f"standard errors are widened by a factor of {self.adequacy.widening:.2g}, since the model misses the data"]
+        if "harmonic_frequency" in self.free:
+            told.append("no p-value of the harmonic: about a model that misses the data anything improves the fit")
+        return (*told, "what to do: look at the residuals, at other noises (compare), and in the recording for drift and "
+                "tremor; do not interpret the parameters")  # fmt: skip
+
+    @property
+    def per_newton(self) -> dict[str, float]:
+        """Base stiffness [1/m] and damping [s/m] of both tissues per newton of mean force: free of the scale of force.
+
+        Empty where a mean force was given, and where the output is no force.
+        """
+        if len(self.parts) > 1 or self.settings.get("mean_force") is not None or self.task.output_unit != "N":
+            return {}
+        mean = self.derived["mean"].value if "mean" in self.derived else np.nan
+        return {n: self.derived[n].value / mean for n in ("K_w0", "K_z0", "C_w0", "C_z0") if n in self.derived}
 
     @property
     def tasks(self) -> dict[str, AbstractTask]:
@@ -128,31 +179,51 @@ class FitResult(eqx.Module):
 
     def __str__(self) -> str:
         single = len(self.parts) == 1
-        lines = [f"{'fitted' if self.success else 'NOT FITTED'}{_head(self)}", f"  {self.message}"]
+        lines = [self.verdict[0].upper() + self.verdict[1:], f"  {_head(self)}"]
+        lines += [f"  {self.message}"] * self.success
         if not single:
             lines += [f"  {name}: {p.target.name}, {p.model}{_closeness(p, ', ')}" for name, p in self.parts.items()]
+        lines += [f"  {sentence}" for sentence in self.advice]
         lines += [f"  note: {notice}" for notice in self.notices]
         if single and self.rms_log_error is not None:
-            unknown = "" if self.chi2_per_bin is not None else " (no chi2: the target states no spread)"
-            lines.append(f"  {_closeness(self.only)}{unknown}")
+            lines.append(f"  {_closeness(self.only)}")
         lines += [f"  {sentence}" for sentence in self.remarks]
-        wide = max(24, *(2 + len(name) for name in ("parameter", *self.free, *self.derived)))
-        for title, table in (("parameter", {n: self.parameters[n] for n in self.free}), ("derived", self.derived)):
-            lines.append(f"  {title:<{wide}}{'value':>12}   {'std. error':<14} unit")
-            for name, p in table.items():
-                unit = "" if p.unit == "1" else p.unit
-                lines.append(f"  {name:<{wide}}{p.value:>12.5g}   {p.error_in_words(3):<14} {unit}".rstrip())
+        every = {name: p for name, p in self.parameters.items() if p.free} | self.derived
+        shown = self.determined
+        intervals = any(p.interval is not None for p in shown.values())
+        lines += _table("determined by the data", shown, " 95 % interval  " * intervals)
+        fixed = [name for name in self.products if name not in every]
+        lines += [f"  they also fix, roughly: {', '.join(fixed)}"] if fixed else []
+        loose = {name: p for name, p in every.items() if name not in shown and p.free}
+        lines += _table("not determined (near their defaults by the prior)", loose) if loose else []
+        if self.per_newton:
+            lines += ["  the scale of force is unknown, since no mean force was given: newtons are those of the task's own "
+                      "muscle. Per newton of mean force: " + _per_newton(self)]  # fmt: skip
         if self.undetermined:
-            whose = "the data leave" if single else "all targets together leave"
-            lines.append(f"  {whose} open (the prior keeps these near their default):")
-            lines += [f"    - {sentence}" for sentence in self.undetermined]
+            whose = "the data do" if single else "all targets together do"
+            lines += [f"  {whose} not notice if:", *(f"    - {sentence}" for sentence in self.undetermined)]
         return folded(lines)
+
+
+def _table(title: str, table: dict[str, Estimate], column: str = "") -> list[str]:
+    """Rows of name, value ± error, interval and unit."""
+    wide = max([26, *(2 + len(name) for name in table)])
+    lines = [f"  {title}:"] if not column else [f"  {title + ':':<{wide + 24}}{column.strip():<18}"]
+    for name, p in table.items():
+        unit = "" if p.unit == "1" else p.unit
+        interval = f"{p.interval_in_words():<18}" if column else ""
+        lines.append(f"    {name:<{wide}}{p.in_words():<20}{interval}{unit}".rstrip())
+    return lines if table else [*lines, "    nothing"]
+
+
+def _per_newton(result: FitResult) -> str:
+    return ", ".join(f"{n} {v:.3g} {'1/m' if n[0] == 'K' else 's/m'}" for n, v in result.per_newton.items())
 
 
 def _head(result: FitResult) -> str:
     if len(result.parts) > 1:
-        return f"{' together' if result.success else ''}: {', '.join(result.parts)}"
-    return f": {result.target.name} ({result.target.provenance}), {result.only.model}, {result.method}"
+        return f"together: {', '.join(result.parts)}"
+    return f"{result.target.name} ({result.target.provenance}), {result.only.model}, {result.method}"
 
 
 def _closeness(part: FittedPart, before: str = "") -> str:
@@ -171,10 +242,16 @@ def to_table(result: FitResult) -> dict[str, Any]:
         "format": FORMAT,
         "success": result.success,
         "message": result.message,
+        "adequate": result.adequate,
+        "adequacy_p": result.adequacy_p,
+        "adequacy": None if result.adequacy is None else result.adequacy._asdict(),
+        "verdict": result.verdict,
         **own,
         "method": result.method,
         "parameters": estimates_to_table(result.parameters),
         "derived": estimates_to_table(result.derived),
+        "products": list(result.products),
+        "per_newton": {name: with_nulls(value) for name, value in result.per_newton.items()},
         "correlation": result.correlation,
         "undetermined": list(result.undetermined),
         "singular_values": with_nulls(result.singular_values),
@@ -211,10 +288,12 @@ def _from_table(table: dict[str, Any]) -> FitResult:
     return FitResult(
         success=table["success"],
         message=table["message"],
+        adequacy=None if table["adequacy"] is None else Adequacy(**table["adequacy"]),
         parts={name: read_part(part) for name, part in parts.items()},
         method=table["method"],
         parameters=read_estimates(table["parameters"]),
         derived=read_estimates(table["derived"]),
+        products=tuple(table["products"]),
         correlation=table["correlation"],
         undetermined=tuple(table["undetermined"]),
         singular_values=from_nulls(table["singular_values"]),

@@ -71,7 +71,7 @@ def search(plan: Plan, answer: Callable[[FitResult], None] | None = None) -> Fit
 
 def _unchecked(plan: Plan, stages: list[Stage], *, interrupted: bool = False) -> FitResult:
     """The result before anything is simulated to check it."""
-    return report_fit(plan._replace(check_seeds=0), stages, interrupted=interrupted)
+    return report_fit(plan._replace(check_seeds=0), stages, interrupted=interrupted, preliminary=True)
 
 
 def search_together(plans: list[Plan], tell: Callable[[str, float], None]) -> list[FitResult]:

@@ -84,7 +84,7 @@ PARAMETERS: dict[str, Parameter] = {
         _row("harmonic_frequency", "f_S", "Hz", 4.25, "harmonic frequency", "the paper: local maximum at 4.251 Hz",
              fit_lower=0.2, fit_upper=30.0),
         _free_sign("harmonic_phase", "φ", "rad", 0.0, "harmonic phase", "unknown and without influence", math.pi),
-        _free_sign("P_w", "P_w", "N", 5.0, "active force level", "light pressing, displacement near 0.01 m", 5.0),
+        _row("P_w", "P_w", "N", 5.0, "active force level", "light pressing, displacement near 0.01 m", -math.inf),
         _free_sign("F_ext", "F_ext", "N", 0.0, "external force level", "the paper's Task 2", 5.0),
         _free_sign("x_z", "x_z", "m", 0.0, "displacement of the insertion", "the paper: held", 0.01),
     )

@@ -13,6 +13,7 @@ from jaxmuscle._common.arrays import as_numbers
 from jaxmuscle._common.progress import Tell, nothing
 from jaxmuscle._common.text import choices
 from jaxmuscle.data._target import Target
+from jaxmuscle.model._muscle import Muscle
 from jaxmuscle.model._noise import AbstractNoise
 from jaxmuscle.model._parameters import PARAMETERS, USUALLY_FREE
 from jaxmuscle.model._tasks import AbstractTask, Isometric, PrescribedForce, with_noise
@@ -117,6 +118,7 @@ def planned(task: AbstractTask, target: Target, options: FitOptions) -> Plan:
     check_line(task, target.settings)
     if not (np.any(np.asarray(task.noise.amplitude) > 0) or float(task.harmonic.amplitude) > 0):
         raise ValueError("the task has neither noise nor a harmonic, so its spectrum is zero: set noise_K_w, say")
+    _check_mean(task, names, options.mean_force)
     control = has_response(task, required=options.method == "linear")
     usual = {"starts": 100, "seeds": 32, "check_seeds": 64} if control else {"starts": 8, "seeds": 48, "check_seeds": 200}
     counts = {name: count if getattr(options, name) is None else getattr(options, name) for name, count in usual.items()}
@@ -136,6 +138,18 @@ def planned(task: AbstractTask, target: Target, options: FitOptions) -> Plan:
         "spectrum": target.settings.to_dict(), "steps_per_sample": problem.steps_per_sample,
     }  # fmt: skip
     return Plan(problem, counts["starts"], options.max_steps, counts["check_seeds"], settings, options.seed)
+
+
+def _check_mean(task: AbstractTask, free: tuple[str, ...], mean: tuple[float, float] | None) -> None:
+    """Refuse a mean force that no stiffness can reach: at x_z = 0, `F_ext = P_w - K_w x_w` lies between 0 and P_w."""
+    if mean is None or not isinstance(task, Isometric) or not isinstance(task.muscle, Muscle):
+        return
+    value, most = mean[0], float(task["P_w"])
+    if float(task["x_z"]) != 0 or (value * most > 0 and (abs(value) < abs(most) or "P_w" in free)):
+        return
+    raise ValueError(f"mean_force = {value:g} N cannot be reached: in Isometric the measured force lies between 0 and the "
+                     f"active force, which is P_w = {most:g} N here, whatever the stiffnesses. Carry the muscle to that "
+                     f"force first: task = jaxmuscle.at_force(task, {value:g})")  # fmt: skip
 
 
 def settings_of(problem: FitProblem, bounds: Mapping[str, tuple[float, float]]) -> dict[str, Any]:

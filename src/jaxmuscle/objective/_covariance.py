@@ -1,5 +1,6 @@
 """What the scatter of the data leaves undetermined: covariance of parameters, determined directions, in words."""
 
+import itertools
 from typing import NamedTuple
 
 import numpy as np
@@ -13,28 +14,54 @@ from ._moment_models import MonteCarlo
 from ._residuals import PartResiduals
 
 DETERMINED = 3.0
-SHARE_DETERMINED = 0.99
+REDUCED = 1 / (1 + DETERMINED**2)  # of its prior variance is left of a direction that is just determined
+FACTORS = 4
+Vector = Float[np.ndarray, " parameters"]
 
 
 class Identifiability(NamedTuple):
-    """Singular values of the Jacobian, its directions (rows) and which of them the data determine."""
+    """Directions (rows) of the parameters in prior standard deviations, and how steep the data are along each.
+
+    `singular_values` are those of the data's Jacobian (residuals in standard deviations); of its prior variance
+    `1 / (1 + σ²)` is left.
+    """
 
     singular_values: Float[np.ndarray, " parameters"]
     directions: Float[np.ndarray, "parameters parameters"]
-    determined: Bool[np.ndarray, " parameters"]
+
+    @classmethod
+    def of_covariance(cls, covariance: Float[np.ndarray, "parameters parameters"]) -> "Identifiability":
+        """From the covariance of the estimates in prior standard deviations: bins that correlate count for less."""
+        left, vectors = np.linalg.eigh(covariance)
+        return cls(np.sqrt(np.maximum(1 / np.maximum(left, 1e-300) - 1, 0.0)), vectors.T)
+
+    @property
+    def determined(self) -> Bool[np.ndarray, " parameters"]:
+        """Which directions the data determine: singular values of at least 3."""
+        return self.singular_values >= DETERMINED
+
+    def left(self, slope: Vector) -> float:
+        """Share of its prior variance that the data leave of a quantity with these slopes; 1 if it has none."""
+        size = np.linalg.norm(slope)
+        if not size > 0:
+            return 1.0
+        return float(np.sum((self.directions @ (slope / size)) ** 2 / (1 + self.singular_values**2)))
+
+    def determines(self, slope: Vector) -> bool:
+        """The one criterion, for parameters and for all that follows from them: at most a tenth of the variance is left."""
+        return self.left(slope) <= REDUCED * (1 + 1e-9)
 
     @property
     def parameters(self) -> Bool[np.ndarray, " parameters"]:
-        """Which parameters have at least 99 % of their unit vector in determined directions."""
-        return (self.directions[self.determined] ** 2).sum(0) >= SHARE_DETERMINED
+        """Which parameters the data determine."""
+        return np.array([self.determines(unit) for unit in np.eye(len(self.directions))])
 
 
 def identifiability(jacobian: Float[np.ndarray, "residuals parameters"]) -> Identifiability:
     """Singular value decomposition of the data's Jacobian (residuals in standard deviations, parameters in prior ones)."""
     size = jacobian.shape[1]
     _, values, directions = np.linalg.svd(np.nan_to_num(jacobian), full_matrices=True)
-    values = np.concatenate([values, np.zeros(size - len(values))])
-    return Identifiability(values, directions, values >= DETERMINED)
+    return Identifiability(np.concatenate([values, np.zeros(size - len(values))]), directions)
 
 
 def parameter_covariance(
@@ -61,38 +88,59 @@ SCALES = (
 )
 
 
-def undetermined_directions(names: tuple[str, ...], found: Identifiability) -> tuple[str, ...]:
-    """Sentences that name the directions along which the parameters can move without being noticed.
+def common_scales(names: tuple[str, ...], found: Identifiability) -> tuple[str, ...]:
+    """Which groups of parameters can be scaled together without the data noticing, in sentences.
 
-    Of a joint fit, where "name@target" belongs to one target, each target's own scales and those that are shared.
+    Of a joint fit, where "name@target" belongs to one target, each target's own groups and those that are shared.
     """
-    basis = found.directions[~found.determined]
     sentences = []
     split = [name.partition("@") for name in names]
     for target in dict.fromkeys(of for _, _, of in split):
         for sentence, members in SCALES:
-            pattern = np.array([base in members and of in ("", target) for base, _, of in split], dtype=float)
-            if pattern.sum() < 2 or not len(basis):
-                continue
-            pattern /= np.linalg.norm(pattern)
-            inside = basis.T @ (basis @ pattern)
-            steepness = np.linalg.norm(found.singular_values * (found.directions @ pattern))
-            if steepness < DETERMINED and inside @ inside >= 0.5:
+            group = np.array([base in members and of in ("", target) for base, _, of in split], dtype=float)
+            size = np.linalg.norm(group)
+            if size > 1 and np.linalg.norm(found.singular_values * (found.directions @ group)) < DETERMINED * size:
                 sentences.append(sentence + (f" ({target})" if target else ""))
-                inside /= np.linalg.norm(inside)
-                basis = basis - np.outer(basis @ inside, inside)
-                _, size, rows = np.linalg.svd(basis, full_matrices=False)
-                basis = rows[size > 0.5]
-    return (*sentences, *(_in_words(names, direction) for direction in basis))
+    return tuple(dict.fromkeys(sentences))
 
 
-def _in_words(names: tuple[str, ...], direction: Float[np.ndarray, " parameters"]) -> str:
-    direction = direction * np.sign(direction[np.argmax(np.abs(direction))])
-    order = [i for i in np.argsort(-np.abs(direction)) if abs(direction[i]) > 0.25]
-    up, down = [names[i] for i in order if direction[i] > 0], [names[i] for i in order if direction[i] < 0]
-    if len(order) == 1:
-        return f"{names[order[0]]} by itself"
-    return f"{' and '.join(up)} up" + (f" against {' and '.join(down)} down" if down else " together")
+def known_products(names: tuple[str, ...], positive: Bool[np.ndarray, " parameters"], sd: Vector,
+                   found: Identifiability) -> dict[str, Vector]:  # fmt: skip
+    """The simplest products and ratios of parameters that the data determine, as many as there are such directions.
+
+    By name ("k_w / c_w"), with the slopes of their logarithms with respect to θ. Fewest factors first, then in the order of
+    the parameters: so equal data give equal words, which the directions themselves, turned by rounding, do not. `sd` are the
+    prior's, `positive` the parameters whose logarithm is meant.
+    """
+    wanted = int(found.determined.sum())
+    chosen: dict[str, Vector] = {}
+    taken: list[set[int]] = []
+    inside = np.zeros((0, wanted))
+    known = found.directions[found.determined]
+    for factors in range(1, min(FACTORS, len(names)) + 1):
+        for which in itertools.combinations(range(len(names)), factors):
+            # A factor that is known already would only thin out what is not.
+            if any(held <= set(which) for held in taken) or (factors > 1 and not np.all(positive[list(which)])):
+                continue
+            for signs in itertools.product((-1.0, 1.0), repeat=factors - 1):
+                if len(chosen) == wanted:
+                    return chosen
+                slope = np.zeros(len(names))
+                slope[list(which)] = np.array([1.0, *signs]) * sd[list(which)]
+                seen = known @ (slope / np.linalg.norm(slope))
+                rest = seen - inside.T @ (inside @ seen) if len(inside) else seen
+                if found.determines(slope) and rest @ rest > 0.1 * (seen @ seen):
+                    chosen[_written([names[i] for i in which], signs)] = slope
+                    taken.append(set(which))
+                    inside = np.concatenate([inside, rest[None] / np.linalg.norm(rest)])
+    return chosen
+
+
+def _written(names: list[str], signs: tuple[float, ...]) -> str:
+    above = [names[0], *(n for n, sign in zip(names[1:], signs, strict=True) if sign > 0)]
+    below = [n for n, sign in zip(names[1:], signs, strict=True) if sign < 0]
+    bottom = " ".join(below)
+    return " ".join(above) + (f" / {f'({bottom})' if len(below) > 1 else bottom}" if below else "")
 
 
 def residual_covariance(target: Target, part: PartResiduals, share: np.ndarray) -> np.ndarray:

@@ -11,13 +11,15 @@ from jax.scipy.special import i0e
 from jaxtyping import Array, Float
 from scipy.special import gammaincinv, ndtr
 
-from jaxmuscle._common.arrays import as_arrays, is_concrete
+from jaxmuscle._common.arrays import all_concrete, as_arrays
 from jaxmuscle._common.programs import kept
 from jaxmuscle._common.types import Scalar
 from jaxmuscle.data._recording import Recording
 from jaxmuscle.data._target import Target
 from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.response._expected import Moments, check_line, expected_moments
+from jaxmuscle.response._linearised import check_inputs
+from jaxmuscle.response._second_order import warn_beyond
 from jaxmuscle.spectra._bin_law import LEAST, bin_statistics, trial_samples, welch_law
 from jaxmuscle.spectra._settings import WINDOW
 
@@ -248,8 +250,10 @@ def log_likelihood(task: AbstractTask, data: Target | Recording) -> Scalar:
     **Raises:** `ValueError` for a target without segments, a harmonic beyond half the sampling rate, and what
     `Recording.fft_spectrum` refuses.
     """
-    if all(is_concrete(leaf) for leaf in jax.tree.leaves(task)):
+    if all_concrete(task):
         check_line(task, task.settings)
+        check_inputs(task)
+        warn_beyond(task, data.settings if isinstance(data, Target) else None)
     if isinstance(data, Target):
         task = task.with_parts(settings=data.settings)
         bins = jax.tree.map(jnp.asarray, measured_bins(data))

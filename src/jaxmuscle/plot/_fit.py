@@ -77,11 +77,14 @@ def _header(result: Any) -> list[_Line]:
     for name, part in result.parts.items():
         lines += _about(name if several else "", part)
     facts = [*_closeness(result.only)] if not several else []
-    facts += [f"{len(result.starts)} starts" + ("" if result.seed is None else f", seed {result.seed}")]
+    facts += [result.message.removeprefix("converged: ")] * result.success
     model = [] if several else [f"{type(result.task).__name__} ({type(result.task.noise).__name__})", result.method]
     lines += _wrapped("  ·  ".join([*model, *facts]))
-    verdict, colour = ("Converged", DARK_GREEN) if result.success else ("Did not converge", VERMILLION)
-    lines += _wrapped(f"{verdict}: {result.message}", color=colour)
+    believed = result.success and result.adequate is not False
+    verdict = result.verdict[0].upper() + result.verdict[1:]
+    lines += _wrapped(verdict, color=(DARK_GREEN if result.adequate else GREY) if believed else VERMILLION, weight="bold")
+    for sentence in result.advice:
+        lines += _wrapped(sentence[0].upper() + sentence[1:], color=VERMILLION)
     reasons = [part.target.reason for part in result.parts.values() if part.target.provenance == "reconstructed"]
     for notice in result.notices:
         if not any(reason in notice for reason in reasons):
@@ -121,7 +124,7 @@ def _notes(result: Any) -> list[_Line]:
     if not result.undetermined:
         return lines
     whose = "the data" if len(result.parts) == 1 else "all targets together"
-    lines += [(f"What {whose} do not determine", {"weight": "bold"})]
+    lines += [(f"What {whose} do not notice", {"weight": "bold"})]
     for sentence in result.undetermined:
         lines += _wrapped(sentence, first="•  ", rest="    ")
     return lines

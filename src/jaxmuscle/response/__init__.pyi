@@ -3,8 +3,9 @@
 from ._characteristics import StaticCharacteristics as StaticCharacteristics
 from ._characteristics import static_characteristics as static_characteristics
 from ._equilibrium import equilibrium as equilibrium
-from ._expected import expected_spectrum as expected_spectrum
+from ._expected_spectrum import expected_spectrum as expected_spectrum
 from ._linearised import settled as settled
+from ._scaling import at_force as at_force
 from ._scaling import at_level as at_level
 from ._scaling import relative_variation as relative_variation
 from ._scaling import scaled as scaled

@@ -9,7 +9,7 @@ import numpy as np
 import scipy.signal
 from jaxtyping import Array, Float, Int
 
-from jaxmuscle._common.arrays import as_arrays, is_concrete
+from jaxmuscle._common.arrays import as_arrays
 from jaxmuscle._common.programs import kept
 from jaxmuscle._common.types import Scalar
 from jaxmuscle.model._noise import ShapingFilter
@@ -19,7 +19,7 @@ from jaxmuscle.spectra._settings import LONGEST, WINDOW, SpectrumSettings, sampl
 from jaxmuscle.spectra._welch import Spectrum
 
 from ._harmonic_line import harmonic_line
-from ._linearised import Linearisation, check_equilibrium, linearise
+from ._linearised import Linearisation, linearise
 
 TAIL = 1e-13
 
@@ -264,38 +264,20 @@ def log_variation_sd(task: AbstractTask, settings: SpectrumSettings, samples: in
     return 0.5 * jnp.sqrt(variance) / (r[0] + swing)
 
 
-def expected_spectrum(
-    task: AbstractTask, settings: SpectrumSettings | None = None, window: tuple[float, float] = WINDOW
-) -> Spectrum:
-    """The expected Welch spectrum of a task's output, to first order in its perturbations: no Monte Carlo.
-
-        E_k = Σ_l M_kl r(l Δ) + line_k,    r(τ) = c exp(𝒜 τ) P cᵀ,    𝒜 P + P 𝒜ᵀ + 𝒬 = 0
-
-    𝒜 is the task linearised about its equilibrium together with the filters that shape the noise; M holds window,
-    detrending and low-pass (`covariance_operator`), Δ is the sampling interval, so that aliases are part of it; line_k is
-    the harmonic's response with phase and leakage, all its channels added coherently. The estimate's mean for a process
-    that has forgotten its start; exact where the response is linear, as it is within 0.2 % at human force fluctuations.
-
-    **Arguments:** `task`; `settings` (the task's own by default); the analysed `window` [s] (only the harmonic's phase
-    and an envelope that changes depend on it).
-
-    **Returns:** a `Spectrum`, power [unit²/Hz] of shape (bins,); differentiable, also under `jit` and `vmap`.
-
-    **Raises:** `OperatingPointError` (a `ValueError`) without a stable, damped equilibrium; `ValueError` for a harmonic
-    beyond half the sampling rate and for a task without noise and harmonic. Under a transformation, where values cannot
-    be looked at, the result is not finite instead.
-    """
-    settings = task.settings if settings is None else settings
-    if all(is_concrete(leaf) for leaf in jax.tree.leaves(task)):
-        check_line(task, settings)
-    moments, system = expected_moments(task, settings, window)
-    if is_concrete(moments.power):
-        check_equilibrium(task, np.asarray(system.point), np.asarray(system.A))
-        if not np.any(np.asarray(moments.power) > 0):
-            raise ValueError(f"the expected spectrum of this {type(task).__name__} is zero: it has neither noise nor a "
-                             f"harmonic that moves {task.output_name}; set noise_K_w, say")  # fmt: skip
+def linear_spectrum(task: AbstractTask, settings: SpectrumSettings, window: tuple[float, float] = WINDOW) -> Spectrum:
+    """The expected Welch spectrum in linear response, of tasks that have one; not finite where they have not."""
+    moments, _ = expected_moments(task, settings, window)
     frequency = jnp.asarray(settings.frequency, moments.power.dtype)
     return Spectrum(frequency, moments.power, settings, task.output_unit)
+
+
+def check_power(task: AbstractTask, moments: Moments) -> None:
+    """Refuse a spectrum that is zero but for rounding: fluctuations below the last digits of the mean."""
+    power, mean = np.asarray(moments.power), float(moments.mean)
+    least = (1e3 * np.finfo(power.dtype).eps * mean) ** 2
+    if not np.sum(power) * task.settings.resolution > least:
+        raise ValueError(f"the expected spectrum of this {type(task).__name__} is zero: it has neither noise nor a "
+                         f"harmonic that moves {task.output_name}; set noise_K_w, say")  # fmt: skip
 
 
 def check_line(task: AbstractTask, settings: SpectrumSettings) -> None:

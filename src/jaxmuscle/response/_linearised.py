@@ -15,6 +15,7 @@ from jaxmuscle._common.types import Scalar
 from jaxmuscle.model._muscle import Perturbation
 from jaxmuscle.model._signals import AbstractSignal, Constant
 from jaxmuscle.model._tasks import AbstractTask, State
+from jaxmuscle.spectra._settings import WINDOW
 
 from ._equilibrium import HOLD, equilibrium
 
@@ -118,12 +119,47 @@ def check_equilibrium(task: Any, point: np.ndarray, A: np.ndarray) -> float:
     return float(-eigenvalues.real.max())
 
 
+MOVING = 1e-4
+LOOKS = 33
+
+
+@kept
+def _inputs(task: AbstractTask, window: tuple[float, float]) -> dict[str, Array]:
+    """Every input at times across the window, then its held value."""
+    times = jnp.append(jnp.linspace(*window, LOOKS), HOLD)
+    return {name: jax.vmap(signal)(times) for name, signal in _signals(task).items()}
+
+
+def _signals(task: AbstractTask) -> dict[str, AbstractSignal]:
+    found = {field.name: getattr(task, field.name) for field in dataclasses.fields(task)}
+    return {name: value for name, value in found.items() if isinstance(value, AbstractSignal)}
+
+
+def check_inputs(task: AbstractTask, window: tuple[float, float] = WINDOW) -> None:
+    """Refuse inputs that move in the window: a linear response is about held ones."""
+    if all(isinstance(signal, Constant) for signal in _signals(task).values()):
+        return
+    with jax.ensure_compile_time_eval(), jax.enable_x64(True):
+        seen = {name: np.asarray(values) for name, values in _inputs(as_arrays(task), window).items()}
+    for name, values in seen.items():
+        off = np.abs(values[:-1] - values[-1])
+        if np.max(off) > MOVING * np.max(np.abs(values)):
+            when = np.linspace(*window, LOOKS)[np.argmax(off)]
+            raise OperatingPointError(
+                f"{name} of this {type(task).__name__} moves in the analysed window: at {when:.3g} s it is "
+                f"{values[np.argmax(off)]:.3g}, at the end {values[-1]:.3g}. The linear response needs inputs that are held "
+                f"from {window[0]:g} s to {window[1]:g} s. Simulate instead, ensemble(task, key).spectrum(), or fit with "
+                "method='montecarlo'; or hold the input: settled(task)"
+            )
+
+
 def has_response(task: AbstractTask, *, required: bool) -> bool:
-    """Whether a task has a stable, damped equilibrium; with `required`, why not is an error."""
+    """Whether a task has a stable, damped equilibrium under held inputs; with `required`, why not is an error."""
     with jax.enable_x64(True):
         system = linearised(task).system
         try:
             check_equilibrium(task, np.asarray(system.point), np.asarray(system.A))
+            check_inputs(task)
         except OperatingPointError:
             if required:
                 raise

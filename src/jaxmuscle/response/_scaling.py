@@ -9,15 +9,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxmuscle._common.arrays import is_concrete, require
+from jaxmuscle._common.arrays import all_concrete, as_numbers, is_concrete, require
 from jaxmuscle._common.types import Scalar
 from jaxmuscle.model._muscle import Muscle, QuadraticDamping, QuadraticStiffness
 from jaxmuscle.model._parameters import CHANNELS
 from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.spectra._settings import WINDOW
 
-from ._expected import expected_moments
-from ._linearised import check_equilibrium
+from ._expected import Moments, expected_moments
+from ._linearised import check_equilibrium, check_inputs
+from ._second_order import warn_beyond
 
 FORCES = ("P_w", "F_ext")
 SIZES_OF_A_SIGNAL = ("level", "initial", "final")
@@ -83,6 +84,34 @@ def at_level(
     inputs = {name: _times(getattr(task, name), level / before) for name in FORCES if hasattr(task, name)}
     moved = _with_coefficients(task.with_parts(**inputs), stiffness=stiffer, damping=stiffer**damping)
     return _with_variation(moved, task, more / less)
+
+
+def at_force(task: AbstractTask, mean: Scalar) -> AbstractTask:
+    """The task carried to another mean force: forces, masses, stiffness and damping multiplied by one number.
+
+        P_w, F_ext, m_j, k_j, c_j ∝ s    (and noise in absolute units),    s = mean / (mean force of the task)
+
+    Every term of (1a) and (1b) is then s times what it was: displacements, times, spectra and the coefficient of variation
+    stay to the last digit, forces are s times as large. So a fit about it has priors in ratio to these values, and a mean
+    force in newtons can be data (`fit(..., mean_force=)`).
+
+    **Arguments:** `mean` [N], of the sign of the task's own mean force.
+
+    **Returns:** a task of the same kind. **Raises:** `ValueError` for a task whose output is not a force, a mean of zero or
+    of the other sign, a muscle that is not made of the paper's quadratic laws; `OperatingPointError` (a `ValueError`)
+    where there is no stable equilibrium.
+    """
+    if task.output_unit != "N":
+        raise ValueError(f"the output of {type(task).__name__} is {task.output_name} in {task.output_unit}, not a force")
+    here = _moments(task).mean
+    factor = _number(mean) / here
+    require(factor > 0, f"mean = {mean} N: the mean force of this task is {here} N; give one of the same sign")
+    inputs = {name: _times(getattr(task, name), factor) for name in FORCES if hasattr(task, name)}
+    moved = _with_coefficients(task.with_parts(**inputs), stiffness=factor, damping=factor)
+    moved = moved.replace(m_w=moved["m_w"] * factor, m_z=moved["m_z"] * factor)
+    if moved.noise.relative:
+        return moved
+    return moved.replace(**{name: task[name] * factor for name in (f"noise_{channel}" for channel in CHANNELS)})
 
 
 def scaled(
@@ -168,7 +197,7 @@ def _with_coefficients(
 
 def _with_variation(task: AbstractTask, before: AbstractTask, factor: Scalar) -> AbstractTask:
     """The task with all amplitudes multiplied so that its coefficient of variation is `factor` times that of `before`."""
-    now, then = _variation(task), _variation(before)
+    now, then = _moments(task).variation, _moments(before).variation
     moving = then > 0
     if is_concrete(moving):
         louder = factor * then / now if moving else 1.0
@@ -178,11 +207,13 @@ def _with_variation(task: AbstractTask, before: AbstractTask, factor: Scalar) ->
     return task.replace(**{name: task[name] * louder for name in names})
 
 
-def _variation(task: AbstractTask) -> Any:
-    """Expected coefficient of variation of the output: to first order proportional to the amplitudes."""
-    if not all(is_concrete(leaf) for leaf in jax.tree.leaves(task)):
-        return expected_moments(task, task.settings, WINDOW)[0].variation
+def _moments(task: AbstractTask) -> Moments:
+    """Expected moments of the output; its variation is to first order proportional to the amplitudes."""
+    if not all_concrete(task):
+        return expected_moments(task, task.settings, WINDOW)[0]
     with jax.ensure_compile_time_eval(), jax.enable_x64(True):
         moments, system = expected_moments(task, task.settings, WINDOW)
         check_equilibrium(task, np.asarray(system.point), np.asarray(system.A))
-        return float(moments.variation)
+        check_inputs(task)
+        warn_beyond(task)
+        return jax.tree.map(as_numbers, moments)

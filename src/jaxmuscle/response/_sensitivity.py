@@ -17,7 +17,8 @@ from jaxmuscle.model._parameters import PARAMETERS, set_parameters
 from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.spectra._settings import WINDOW, SpectrumSettings
 
-from ._expected import expected_spectrum, response
+from ._expected import response
+from ._expected_spectrum import expected_spectrum
 
 if TYPE_CHECKING:
     import xarray

@@ -13,7 +13,7 @@ from jaxmuscle._common.errors import OperatingPointError, SimulationError
 from jaxmuscle._common.text import listed
 from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.response._equilibrium import fastest_rate
-from jaxmuscle.response._linearised import LinearTask, check_equilibrium, linearised
+from jaxmuscle.response._linearised import LinearTask, check_equilibrium, check_inputs, linearised
 from jaxmuscle.spectra._settings import WINDOW
 
 from ._batch import Recipe, run_seeds
@@ -63,6 +63,7 @@ def companion(task: AbstractTask, duration: float, *, required: bool) -> LinearT
         linear = linearised(task)
         try:
             slowest = check_equilibrium(task, np.asarray(linear.system.point), np.asarray(linear.system.A))
+            check_inputs(task)
         except OperatingPointError:
             if required:
                 raise

@@ -14,7 +14,7 @@ from jaxmuscle._common.arrays import as_numbers, is_concrete
 from jaxmuscle._common.environment import versions
 from jaxmuscle.model._parameters import PARAMETERS
 from jaxmuscle.model._tasks import AbstractTask
-from jaxmuscle.response._expected import expected_spectrum
+from jaxmuscle.response._expected import linear_spectrum
 from jaxmuscle.spectra._mean import SpectrumEstimate, estimated
 from jaxmuscle.spectra._settings import WINDOW, SpectrumSettings
 from jaxmuscle.spectra._welch import Spectrum, lowpass, spectrum_of
@@ -118,7 +118,7 @@ class Trajectory(eqx.Module):
         if control is False or self.linear is None or not same:
             return estimated(plain, None, None, settings, self.task.output_unit)
         beside = np.atleast_2d(np.asarray(self.beside().spectrum(settings, window).power))
-        exact = np.asarray(expected_spectrum(self.task, settings, window).power)
+        exact = np.asarray(linear_spectrum(self.task, settings, window).power)
         return estimated(plain, beside, exact, settings, self.task.output_unit)
 
     def beside(self) -> "Trajectory":

@@ -12,10 +12,10 @@ from jaxtyping import Float
 from jaxmuscle._common.errors import OperatingPointError
 from jaxmuscle.data._target import Target
 from jaxmuscle.fits._reopened import reopened
-from jaxmuscle.fits._report import REDUCED
 from jaxmuscle.fits._result import FitResult
 from jaxmuscle.objective._consequences import Expansion, quantities, unit_of
-from jaxmuscle.objective._covariance import DETERMINED, Identifiability, undetermined_directions
+from jaxmuscle.objective._coordinates import Coordinates
+from jaxmuscle.objective._covariance import Identifiability, common_scales, known_products
 from jaxmuscle.objective._problem import FitProblem
 
 from ._designs import Design, design_information, designs_for, information_of, seen_here, told_data, without_further
@@ -95,7 +95,7 @@ def _added(problem: FitProblem, theta: np.ndarray, design: Design) -> tuple[np.n
 class _Here(NamedTuple):
     """The fit: information of its data, its prior, values and gradients of what can be known."""
 
-    names: tuple[str, ...]
+    coordinates: Coordinates
     information: np.ndarray
     prior: np.ndarray
     values: dict[str, tuple[float, str]]
@@ -114,7 +114,7 @@ class _Here(NamedTuple):
             if name not in values and np.all(np.isfinite(g)) and np.any(g != 0) and np.isfinite(value):
                 unit = unit_of(name, problem.parts[part].task.output_unit)
                 values[name], gradients[name] = (float(value), unit), g
-        return cls(c.names, information_of(problem, seen), problem.prior, values, gradients)
+        return cls(c, information_of(problem, seen), problem.prior, values, gradients)
 
     def outlook(
         self,
@@ -127,17 +127,18 @@ class _Here(NamedTuple):
         present: Outlook | None = None,
     ) -> Outlook:
         """What is known with that information."""
-        eigenvalues, vectors = np.linalg.eigh(information)
-        size = np.sqrt(np.maximum(eigenvalues[::-1], 0.0))
-        found = Identifiability(size, vectors[:, ::-1].T, size >= DETERMINED)
         after = np.linalg.pinv(information + np.diag(self.prior), hermitian=True)
+        found = Identifiability.of_covariance(after)
         before = np.diag(1 / np.maximum(self.prior, LEAST_PRIOR))
         known = {}
         for n, g in self.gradients.items():
             left, had = g @ after @ g, g @ before @ g
-            known[n] = Known(*self.values[n], float(np.sqrt(left)), float(np.sqrt(had)), bool(left <= REDUCED * had))
+            known[n] = Known(*self.values[n], float(np.sqrt(left)), float(np.sqrt(had)), found.determines(g))
         gained = () if present is None else tuple(
             n for n, k in known.items() if k.determined and not present.quantities[n].determined
         )  # fmt: skip
-        open_now = undetermined_directions(self.names, found)
-        return Outlook(name, task, data, separate, size, int(found.determined.sum()), open_now, known, gained, failed)
+        c = self.coordinates
+        products = {n: float(np.sqrt(g @ after @ g)) for n, g in known_products(c.names, c.positive, c.sd, found).items()}
+        free_scales = common_scales(c.names, found)
+        return Outlook(name, task, data, separate, found.singular_values, int(found.determined.sum()), free_scales, products,
+                       known, gained, failed)  # fmt: skip

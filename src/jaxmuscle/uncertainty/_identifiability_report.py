@@ -54,7 +54,8 @@ class Outlook(eqx.Module):
     """What is known with the data of a design, or of several, added to the present ones.
 
     `task` and `data` in words; `separate`, the parameters that have other values there; `singular_values` in prior standard
-    deviations; `determined`, how many directions are (singular value at least 3); `undetermined`, the others in words;
+    deviations; `determined`, how many directions are (singular value at least 3); `undetermined`, what can be scaled
+    together unnoticed; `products` and ratios of parameters that are determined, with their relative standard errors;
     `quantities` by name; `gained`, those that become determined; `failed`, why the design is impossible, all else being
     as at present.
     """
@@ -66,6 +67,7 @@ class Outlook(eqx.Module):
     singular_values: Float[np.ndarray, " free"]
     determined: int
     undetermined: tuple[str, ...]
+    products: dict[str, float]
     quantities: dict[str, Known]
     gained: tuple[str, ...]
     failed: str | None
@@ -85,7 +87,7 @@ class Outlook(eqx.Module):
         return {
             "name": self.name, "task": self.task, "data": self.data, "separate": list(self.separate),
             "failed": self.failed, "singular_values": self.singular_values.tolist(), "determined": self.determined,
-            "undetermined": list(self.undetermined), "gained": list(self.gained),
+            "undetermined": list(self.undetermined), "products": self.products, "gained": list(self.gained),
             "quantities": {n: {"value": k.value, "unit": k.unit, "stderr": k.stderr, "prior_sd": k.prior_sd,
                                "left": k.left, "determined": k.determined} for n, k in self.quantities.items()},
         }  # fmt: skip
@@ -172,11 +174,17 @@ def _present(report: IdentifiabilityReport) -> list[str]:
     ]
     values = [f"{v:.3g}" for v in now.singular_values]
     lines += _wrapped("  ".join([*values[: now.determined], "|", *values[now.determined :]]), 4)
+    if now.products:
+        lines += _wrapped(f"these are known: {_products(now)}", 4, "  ")
     if now.undetermined:
-        lines += ["  left open:"]
+        lines += ["  the data do not notice if:"]
         for sentence in now.undetermined:
             lines += _wrapped(sentence, 6, "    - ")
     return lines
+
+
+def _products(outlook: Outlook) -> str:
+    return ", ".join(f"{name} (± {100 * error:.2g} %)" for name, error in outlook.products.items())
 
 
 def _designs(report: IdentifiabilityReport) -> list[str]:
@@ -223,8 +231,9 @@ def _sentences(report: IdentifiabilityReport) -> list[str]:
     lines = []
     for outlook in (*report.designs, *report.telling_pairs[:PAIRS_TOLD]):
         lines += _wrapped(str(outlook), 4, "  - ")
-    best = min((*report.designs, *report.pairs), key=lambda o: (len(o.undetermined), -len(o.gained)), default=None)
+    best = max((*report.designs, *report.pairs), key=lambda o: (o.determined, len(o.gained)), default=None)
     if best is not None and best.failed is None:
-        rest = f"this stays open: {'; '.join(best.undetermined)}" if best.undetermined else "nothing stays open"
+        count = len(report.free) - best.determined
+        rest = f"{count} of {len(report.free)} directions stay open" if count else "nothing stays open"
         lines += _wrapped(f"with the most telling, {best.name}, {rest}", 4, "  - ")
     return lines

@@ -1,0 +1,183 @@
+"""95 % intervals of what a fit determined, from the profile of its cost."""
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Float
+
+from jaxmuscle.objective._consequences import Expansion, expand, quantities
+from jaxmuscle.objective._problem import FitProblem
+from jaxmuscle.objective._residuals import Residuals
+
+REACH = 1.96
+MOST_ROWS = 32  # of one batch
+TURNS, AGAIN = 5, 3
+HELD = 0.1  # of the standard deviation
+FURTHEST = 4.0  # times as far as the curvature says: beyond, an end is open
+
+
+class Interval(NamedTuple):
+    """Ends of an interval, relative to the value (`log`) or as differences from it; None where it is open."""
+
+    low: float | None
+    high: float | None
+    log: bool
+
+    def about(self, value: float) -> tuple[float | None, float | None]:
+        """The ends in the unit of the value."""
+        low, high = (None if d is None else float(value * np.exp(d) if self.log else value + d) for d in self[:2])
+        return low, high
+
+
+def intervals(
+    problem: FitProblem, objective: Residuals, seen: Expansion, covariance: np.ndarray, names: list[str]
+) -> dict[str, Interval]:
+    """Where twice the cost, all else fitted anew, has risen by 3.84 times the factor that correlated bins ask for.
+
+    A quantity q is moved along the ridge `θ + G g (q* - q) / (gᵀ G g)`, G the inverse curvature of the cost and g the slope
+    of q, then held there while damped Gauss-Newton steps lower the cost, and once more further out or in, until the rise is
+    `3.84 gᵀ C g / gᵀ G g`, C the covariance of the estimates. Positive quantities move in their logarithm. All of them at
+    once, so that it takes six evaluations of the model.
+
+    Of fits in linear response with log residuals only (empty otherwise).
+    """
+    if not objective.linear or problem.residual != "log" or not names:
+        return {}
+    found: dict[str, Interval] = {}
+    for start in range(0, len(names), MOST_ROWS // 2):
+        found |= _some(problem, objective, seen, covariance, names[start : start + MOST_ROWS // 2])
+    return found
+
+
+def _some(
+    problem: FitProblem, objective: Residuals, seen: Expansion, covariance: np.ndarray, names: list[str]
+) -> dict[str, Interval]:
+    here = _Point.of(problem, objective, jax.tree.map(lambda x: np.asarray(x)[None], seen))
+    curvature = here.jacobian[0].T @ here.jacobian[0] + np.diag(problem.prior)
+    gain = np.linalg.pinv(curvature, hermitian=True)
+    seen_here = [here.quantity(name) for name in names]
+    value, slope = (np.repeat([pair[k][0] for pair in seen_here], 2, axis=0) for k in (0, 1))
+    log = value > 0
+    slope = np.where(log[:, None], slope / np.where(log, value, 1.0)[:, None], slope)
+    start = np.where(log, np.log(np.where(log, value, 1.0)), value)
+    ours = np.einsum("ri,ij,rj->r", slope, gain, slope)
+    stated = np.sqrt(np.einsum("ri,ij,rj->r", slope, covariance, slope))
+    wanted = REACH * stated / np.sqrt(ours)  # root of the rise that is sought
+    side = np.tile([-1.0, 1.0], len(names))
+    aim = start + side * REACH * stated
+    theta = np.clip(here.theta[0] + (slope @ gain) * ((aim - start) / ours)[:, None], -8, 8)
+    tight = HELD * np.sqrt(ours)
+    best = _look(problem, objective, theta, names, log)
+    damping = np.full(len(aim), 1e-2)
+    for turn in range(TURNS):
+        if turn == AGAIN:
+            stretch = np.clip(wanted / np.maximum(best.rise(here), 1e-6), 0.3, FURTHEST)
+            aim = start + side * np.clip(side * (best.at - start) * stretch, 0.1 * REACH * stated, FURTHEST * REACH * stated)
+            damping[:] = 1e-2
+        tried = _look(problem, objective, np.clip(best.theta + best.step(aim, tight, damping), -8, 8), names, log)
+        better = tried.merit(aim, tight) < best.merit(aim, tight)
+        best = _Look(problem, *(np.where(better.reshape(-1, *[1] * (np.ndim(old) - 1)), new, old)
+                                for new, old in zip(tried[1:], best[1:], strict=True)))  # fmt: skip
+        damping = np.where(better, 0.2 * damping, 10 * damping)
+    moved, rise = side * (best.at - start), best.rise(here)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        end = moved * wanted / rise
+    good = np.isfinite(end) & (moved > 0) & (rise > 0.5 * wanted)
+    ends = [float(s * e) if fine else None for s, e, fine in zip(side, end, good, strict=True)]
+    return {n: Interval(ends[2 * i], ends[2 * i + 1], bool(log[2 * i])) for i, n in enumerate(names)}
+
+
+class _Look(NamedTuple):
+    """Rows of θ, of each its own quantity `at` (or its logarithm) with slopes, data residuals with slopes, and cost."""
+
+    problem: FitProblem
+    theta: np.ndarray
+    at: np.ndarray
+    slope: np.ndarray
+    residual: np.ndarray
+    jacobian: np.ndarray
+    cost: np.ndarray
+
+    def rise(self, here: "_Point") -> np.ndarray:
+        """Root of twice the rise of the cost above that of the fit."""
+        return np.sqrt(np.maximum(2 * (self.cost - here.cost[0]), 0.0))
+
+    def merit(self, aim: np.ndarray, tight: np.ndarray) -> np.ndarray:
+        """The cost with the quantity held at its aim."""
+        return self.cost + 0.5 * ((self.at - aim) / tight) ** 2
+
+    def step(self, aim: np.ndarray, tight: np.ndarray, damping: np.ndarray) -> np.ndarray:
+        """A damped Gauss-Newton step of that."""
+        pull, rise = (self.at - aim) / tight, self.slope / tight[:, None]
+        prior = np.diag(self.problem.prior)
+        curvature = np.einsum("rki,rkj->rij", self.jacobian, self.jacobian) + prior + rise[:, :, None] * rise[:, None]
+        gradient = np.einsum("rki,rk->ri", self.jacobian, self.residual) + self.theta @ prior + pull[:, None] * rise
+        size = np.maximum(np.diagonal(curvature, axis1=1, axis2=2), 1e-8)
+        curvature = curvature + (damping[:, None] * size)[:, None] * np.eye(len(prior))
+        fine = np.isfinite(self.cost) & np.all(np.isfinite(gradient), axis=1)
+        step = np.zeros_like(self.theta)
+        step[fine] = -np.linalg.solve(curvature[fine], gradient[fine][..., None])[..., 0]
+        return step * np.minimum(1.0, 1.0 / np.maximum(np.max(np.abs(step), axis=1, keepdims=True), 1e-300))
+
+
+def _look(problem: FitProblem, objective: Residuals, theta: np.ndarray, names: list[str], log: np.ndarray) -> _Look:
+    """Every row with its own quantity, two rows each."""
+    point = _Point.of(problem, objective, expand(objective, theta))
+    value, slope = np.empty(len(log)), np.empty(theta.shape)
+    for i, name in enumerate(names):
+        values, slopes = point.quantity(name)
+        value[2 * i : 2 * i + 2], slope[2 * i : 2 * i + 2] = values[2 * i : 2 * i + 2], slopes[2 * i : 2 * i + 2]
+    positive = np.maximum(value, 1e-300)
+    at, slope = np.where(log, np.log(positive), value), np.where(log[:, None], slope / positive[:, None], slope)
+    return _Look(problem, theta, at, slope, point.residual, point.jacobian, point.cost)
+
+
+class _Point(NamedTuple):
+    """What a fit sees at rows of θ: data residuals, their slopes, cost `½ Σ r² + ½ Σ θ²`, tables of quantities."""
+
+    problem: FitProblem
+    theta: np.ndarray
+    residual: np.ndarray
+    jacobian: np.ndarray
+    cost: np.ndarray
+    tables: tuple[Mapping[str, np.ndarray], Mapping[str, np.ndarray]]
+
+    @classmethod
+    def of(cls, problem: FitProblem, objective: Residuals, seen: Expansion) -> "_Point":
+        residual, jacobian = [], []
+        for part, moments, slopes in zip(objective.parts, seen.moments, seen.slopes, strict=True):
+            data = part.data
+            z = np.log(np.asarray(data.target)) - np.asarray(data.bias) - np.log(moments.power)
+            rise = -slopes.power / moments.power[..., None]
+            sd = np.asarray(data.sd)
+            residual.append((z - z.mean(axis=1, keepdims=True)) / sd)
+            jacobian.append((rise - rise.mean(axis=1, keepdims=True)) / sd[:, None])
+            if data.variation is not None:
+                target, error = (float(x) for x in data.variation)
+                residual.append((np.log(moments.variation) - target)[:, None] / error)
+                change = 0.5 * slopes.variance / moments.variance[:, None] - slopes.mean / moments.mean[:, None]
+                jacobian.append(change[:, None] / error)
+            if data.mean is not None:
+                target, error = (float(x) for x in data.mean)
+                residual.append((moments.mean - target)[:, None] / error)
+                jacobian.append(slopes.mean[:, None] / error)
+        r, J, theta = np.concatenate(residual, axis=1), np.concatenate(jacobian, axis=1), np.asarray(seen.theta)
+        cost = 0.5 * np.sum(r**2, axis=1) + 0.5 * np.sum(problem.prior * theta**2, axis=1)
+        rows = np.minimum(np.arange(MOST_ROWS), len(theta) - 1)  # one size, so that one program serves all
+        filled = quantities(objective, jax.tree.map(lambda x: np.asarray(x)[rows], seen))
+        values, slopes = ({n: x[: len(theta)] for n, x in problem.by_name(tables).items()} for tables in filled)
+        return cls(problem, theta, r, J, np.where(np.isfinite(cost), cost, np.inf), (values, slopes))
+
+    def quantity(self, name: str) -> tuple[Float[np.ndarray, " rows"], Float[np.ndarray, "rows free"]]:
+        """A free parameter or derived quantity and its slopes with respect to θ."""
+        c = self.problem.coordinates
+        if name not in c.names:
+            # Of several targets, a quantity that is the same for all is that of the first.
+            known = name if name in self.tables[0] else f"{name}@{self.problem.parts[0].name}"
+            return self.tables[0][known], self.tables[1][known]
+        i, natural = c.names.index(name), c.values_of(self.theta)
+        slope = np.zeros_like(self.theta)
+        slope[:, i] = np.where(c.positive[i], natural[:, i], 1.0) * c.sd[i]
+        return natural[:, i], slope

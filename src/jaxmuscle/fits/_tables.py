@@ -1,0 +1,130 @@
+"""The tables of a fit's result: parameters and derived quantities with their errors, what the data determine of them."""
+
+from collections.abc import Collection, Mapping, Sequence
+from typing import Any
+
+import equinox as eqx
+import numpy as np
+
+from jaxmuscle.model._tasks import AbstractTask
+from jaxmuscle.objective._arguments import SAME, base_of
+from jaxmuscle.objective._consequences import DERIVED, unit_of
+from jaxmuscle.objective._covariance import Identifiability
+from jaxmuscle.objective._problem import FitProblem, Part
+
+from ._intervals import Interval
+from ._part import Estimate
+
+OUTPUTS = ("coefficient_of_variation", "mean")
+BASE = ("K_w0", "K_z0", "C_w0", "C_z0")
+
+
+def parameter_table(
+    problem: FitProblem, tasks: Sequence[AbstractTask], covariance: np.ndarray, known: Identifiability
+) -> dict[str, Estimate]:
+    """Free parameters by name, then the fixed ones; a number that differs between tasks is named with its target.
+
+    A proportional parameter, which is free but differs, is given for every target.
+    """
+    sd, identifiable = np.sqrt(np.diag(covariance)), known.parameters
+    free: dict[str, Estimate] = {}
+    fixed: dict[str, dict[str, Estimate]] = {}
+    for part, task in zip(problem.parts, tasks, strict=True):
+        own = part.coordinates.names
+        slope = part.coordinates.slope(np.array([float(task[name]) for name in own]))
+        for name, value in task.parameters.items():
+            if name not in own:
+                fixed.setdefault(name, {})[part.name] = Estimate(float(value), unit_of(name), None, False, None)
+                continue
+            column = part.columns[own.index(name)]
+            joint = problem.coordinates.names[column]
+            error = float(sd[column] * slope[own.index(name)]) if identifiable[column] else None
+            made = Estimate(float(value), unit_of(name), error, True, bool(identifiable[column]))
+            differs = joint in free and abs(free[joint].value - made.value) > SAME * abs(made.value)
+            free[f"{joint}@{part.name}" if differs else joint] = made
+    held = {}
+    for name, values in fixed.items():
+        holders = sum(name in task.parameter_names for task in tasks)
+        same = len({p.value for p in values.values()}) == 1 and len(values) == holders
+        held |= {name if same else f"{name}@{target}": p for target, p in values.items()}
+    table = free | held
+    return {name: table[name] for name in tasks[0].parameter_names} if len(tasks) == 1 else table
+
+
+def derived_table(
+    part: Part,
+    values: Mapping[str, Any],
+    slopes: Mapping[str, Any],
+    sampling: Mapping[str, float],
+    covariance: np.ndarray,
+    known: Identifiability,
+) -> dict[str, Estimate]:
+    """Derived quantities, judged by the same criterion as the parameters; what follows from fixed ones alone is fixed.
+
+    Their errors are those of the parameters and, where a value comes from fresh seeds, their sampling error.
+    """
+    table = {}
+    for name in DERIVED:
+        g = np.asarray(slopes[name])
+        free = bool(np.any(g != 0))
+        determined = free and known.determines(g)
+        stderr = float(np.hypot(np.sqrt(g @ covariance @ g), sampling.get(name, 0.0))) if determined else None
+        unit = unit_of(name, part.task.output_unit)
+        table[name] = Estimate(float(values[name]), unit, stderr, free, determined if free else None)
+    return table
+
+
+def too_curved(problem: FitProblem, known: Identifiability) -> set[str]:
+    """Single numbers of muscle and noise, whose errors do not hold while the data leave some direction open.
+
+    Along such a direction they bend: on simulated recordings of muscles drawn from the prior, intervals by curvature or by
+    profile held the truth in 75 to 85 % of cases, not in 95 % (docs/fitting.md). Observed quantities are not concerned.
+    """
+    if len(problem.parts) > 1 or np.all(known.determined):
+        return set()
+    return {n for n in problem.coordinates.names if not n.startswith("harmonic_")} | set(BASE)
+
+
+def merged(problem: FitProblem, tables: list[dict[str, Estimate]], slopes: Any) -> dict[str, Estimate]:
+    """Derived quantities: one entry where all targets have the same number for the same reason, else one for each."""
+    found: dict[str, Estimate] = {}
+    for name in tables[0]:
+        values = np.array([table[name].value for table in tables])
+        rows = np.stack([g[name] for g in slopes])
+        same = np.allclose(values, values[0], rtol=SAME, atol=0) and np.allclose(rows, rows[0], rtol=SAME, atol=1e-300)
+        if len(tables) == 1 or (same and name not in OUTPUTS):
+            found[name] = tables[0][name]
+        else:
+            found |= {f"{name}@{part.name}": table[name] for part, table in zip(problem.parts, tables, strict=True)}
+    # About a mean of zero the variation is infinite, and so is its prior: no measure of what the data determine.
+    vague = [n for n, p in found.items() if base_of(n) == OUTPUTS[0] and p.stderr is not None and p.stderr > p.value]
+    return without_errors(vague, found)
+
+
+def correlation_table(names: tuple[str, ...], covariance: np.ndarray) -> dict[str, Any]:
+    """Correlation of the free parameters, for JSON."""
+    sd = np.sqrt(np.diag(covariance))
+    matrix = covariance / np.maximum(np.outer(sd, sd), 1e-300)
+    return {"parameters": list(names), "matrix": matrix.tolist()}
+
+
+def without_errors(names: Collection[str], table: dict[str, Estimate]) -> dict[str, Estimate]:
+    """The table with these quantities called not determined."""
+    return {n: Estimate(p.value, p.unit, None, p.free, False) if n in names and p.free else p for n, p in table.items()}
+
+
+def widened(table: dict[str, Estimate], factor: float) -> dict[str, Estimate]:
+    """The table with all standard errors multiplied."""
+    return {n: p if p.stderr is None else eqx.tree_at(lambda e: e.stderr, p, factor * p.stderr) for n, p in table.items()}
+
+
+def with_intervals(table: dict[str, Estimate], ends: Mapping[str, Interval]) -> dict[str, Estimate]:
+    """The table with 95 % intervals about its values; a quantity whose interval is open at both ends is not determined."""
+    found = {}
+    for name, p in table.items():
+        if name in ends:
+            about = ends[name].about(p.value)
+            p = eqx.tree_at(lambda e: e.interval, p, about, is_leaf=lambda x: x is None)
+            p = p if any(end is not None for end in about) else Estimate(p.value, p.unit, None, p.free, False)
+        found[name] = p
+    return found

@@ -1,0 +1,184 @@
+"""Where first order ends: the power that the next order adds to the linear response, and coefficients that turn negative."""
+
+import warnings
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from scipy.linalg import expm, solve_continuous_lyapunov
+from scipy.special import ndtr
+
+from jaxmuscle._common.arrays import as_arrays
+from jaxmuscle._common.errors import FirstOrderWarning
+from jaxmuscle._common.programs import kept
+from jaxmuscle.model._noise import BandLimitedNoise, ShapingFilter, WhiteNoise
+from jaxmuscle.model._parameters import CHANNELS
+from jaxmuscle.model._tasks import AbstractTask
+from jaxmuscle.spectra._settings import WINDOW, SpectrumSettings
+
+from ._equilibrium import HOLD
+from ._expected import covariance_operator, expected_moments
+from ._linearised import Linearisation, linearised
+
+NOTICED = 0.1
+NEGATIVE = 0.01
+LINE_WIDTH = 0.3  # Hz; a line is a resonance narrower than a bin here
+SAMPLES = 1024
+FAINT = 1e-3
+
+
+class SecondOrder(NamedTuple):
+    """What the second order adds: `power`, to every bin over that of the linear response; `mean`, over the mean.
+
+    A bin of the linear response counts for a thousandth of their mean at least.
+    """
+
+    power: Float[np.ndarray, " bins"]
+    mean: float
+
+    @property
+    def notices(self) -> tuple[str, ...]:
+        """What has to be said before linear numbers are stated."""
+        most = float(np.max(self.power))
+        what = [f"about {100 * most:.2g} % of the power of a bin"] * (most > NOTICED)
+        what += [f"about {100 * abs(self.mean):.2g} % of the mean"] * (abs(self.mean) > NOTICED)
+        if not what:
+            return ()
+        return (f"first order ends here: the second order adds {' and '.join(what)}, which linear numbers leave out; "
+                "simulate (ensemble), or fit with method='montecarlo'",)  # fmt: skip
+
+
+@kept
+def _hessians(task: AbstractTask, system: Linearisation) -> Float[Array, "outputs inputs inputs"]:
+    """Second derivatives of the vector field, then of the output, with respect to (y, u, u') at the operating point."""
+    n, t = len(system.point), jnp.asarray(HOLD, system.point.dtype)
+
+    def both(given):
+        y, u, du = given[:n], given[n : n + 4], given[n + 4 :]
+        return jnp.append(task.vector_field(t, y, u), task.output(t, y, u, du))
+
+    return jax.hessian(both)(jnp.concatenate([system.point, jnp.zeros(8, system.point.dtype)]))
+
+
+class _Parts(NamedTuple):
+    """Filter of the noise, its amplitudes, what the harmonic is a fraction of, its steady size and ω, base coefficients."""
+
+    filter: ShapingFilter
+    scale: Any
+    harmonic: Any
+    swing: Any
+    omega: Any
+    base: Any
+
+
+@kept
+def _parts(task: AbstractTask) -> _Parts:
+    noise = task.noise
+    if isinstance(noise, WhiteNoise):  # has no value: as its samples at `rate` have
+        noise = BandLimitedNoise(noise.amplitude, rate=noise.rate, cutoff=noise.rate / 2)
+    harmonic = task.harmonic
+    swing = harmonic.amplitude * harmonic.envelope(jnp.asarray(HOLD))
+    return _Parts(noise.shaping_filter(), task.noise_scale(), task.harmonic_base(), swing, 2 * jnp.pi * harmonic.frequency,
+                  task.muscle.base())  # fmt: skip
+
+
+def _inputs_of(parts: _Parts, states: int, shared: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Noise filters and the harmonic as states beside `states` others: matrix, density of what drives it, (y, u, u') of x.
+
+    The harmonic is a narrow resonance of the same power.
+    """
+    made, size = parts.filter, len(parts.filter.F)
+    total = states + (1 if shared else 4) * size + 2
+    matrix, white, inputs = np.zeros((total, total)), np.zeros((total, total)), np.zeros((states + 8, total))
+    inputs[:states, :states] = np.eye(states)
+    for i in range(4):
+        start = states + (0 if shared else i) * size
+        own = slice(start, start + size)
+        inputs[states + i, own] = parts.scale[i] * made.H
+        inputs[states + 4 + i, own] = parts.scale[i] * made.H @ made.F
+        matrix[own, own], white[own, own] = made.F, made.G @ made.G.T
+    damping = 2 * np.pi * LINE_WIDTH
+    inputs[states : states + 4, -2], inputs[states + 4 :, -1] = parts.harmonic, parts.omega * parts.harmonic
+    matrix[-2:, -2:] = [[0.0, parts.omega], [-parts.omega, -damping]]
+    white[-1, -1] = damping * parts.swing**2
+    return matrix, white, inputs
+
+
+def negative_coefficients(task: AbstractTask) -> tuple[str, ...]:
+    """Sentences about coefficients that noise and harmonic make negative for more than 1 % of the time."""
+    with jax.ensure_compile_time_eval(), jax.enable_x64(True):
+        parts = jax.tree.map(np.asarray, _parts(as_arrays(task)))
+    matrix, white, inputs = _inputs_of(parts, 0, task.noise.shared)
+    rows = inputs[:4, :-2]
+    covariance = solve_continuous_lyapunov(matrix[:-2, :-2], -white[:-2, :-2])
+    sd = np.sqrt(np.maximum(np.einsum("ci,ij,cj->c", rows, covariance, rows), 0.0))
+    turn = np.sin(2 * np.pi * (np.arange(64) + 0.5) / 64)
+    level = parts.base[:, None] + parts.swing * parts.harmonic[:, None] * turn
+    share = np.mean(ndtr(level / -np.maximum(sd, 1e-12 * np.abs(parts.base) + 1e-300)[:, None]), axis=1)
+    return tuple(f"{channel} is negative for {100 * part:.2g} % of the time, which no tissue is: lower its noise or the "
+                 "harmonic" for channel, part, base in zip(CHANNELS, share, parts.base, strict=True)
+                 if part > NEGATIVE and base > 0)  # fmt: skip
+
+
+def second_order(task: AbstractTask, settings: SpectrumSettings | None = None) -> SecondOrder:
+    """The power and the mean that the second order adds to the linear response of a task.
+
+    With y₁ the linear response and u the perturbation, x = (y₁, u) Gaussian, M_a the Hessians of vector field and output,
+
+        y₂' = A y₂ + ½ xᵀ M x,    z₂ = C y₂ + ½ xᵀ M₀ x,    Cov(xᵀM_a x(τ), xᵀM_b x(0)) = 2 tr(M_a R(τ) M_b R(τ)ᵀ)
+
+    by Isserlis' theorem, R the autocovariance of x. The cross term of first and third order, of the same size, is left out,
+    and the harmonic counts as a narrow resonance, which doubles its overtone: an indicator, good to a factor of two or so
+    (docs/linear-response.md has it beside simulations). White noise counts as its samples do.
+
+    **Returns:** a `SecondOrder`. **Raises:** as `expected_spectrum` does.
+    """
+    settings = task.settings if settings is None else settings
+    with jax.ensure_compile_time_eval(), jax.enable_x64(True):
+        arrays, system = as_arrays(task), linearised(task).system
+        moments, _ = expected_moments(task, settings, WINDOW)
+        hessians, parts, system = jax.tree.map(np.asarray, (_hessians(arrays, system), _parts(arrays), system))
+    n = len(system.A)
+    matrix, white, inputs = _inputs_of(parts, n, task.noise.shared)
+    matrix[:n, :n] = system.A
+    matrix[:n] += system.B @ inputs[n : n + 4]
+    covariance = solve_continuous_lyapunov(matrix, -white)
+    power, mean = _added(0.5 * inputs.T @ hessians @ inputs, matrix, covariance, system, settings)
+    rest, first = float(system.rest), np.asarray(moments.power)
+    least = FAINT * np.mean(first)
+    relative = np.maximum(power, 0.0) / np.maximum(first, least) if least > 0 else np.zeros(len(first))
+    return SecondOrder(relative, mean / rest if rest else 0.0)
+
+
+def _added(
+    forms: np.ndarray, matrix: np.ndarray, stationary: np.ndarray, system: Any, settings: SpectrumSettings
+) -> tuple[np.ndarray, float]:
+    """Welch power and mean of z₂."""
+    operator = covariance_operator(settings)[:-2]
+    count, interval = max(SAMPLES, 1 << int(np.ceil(np.log2(2 * operator.shape[1])))), 1 / settings.rate
+    step = expm(matrix * interval)
+    each = np.empty((count // 2, *matrix.shape))
+    each[0] = stationary
+    for i in range(1, len(each)):
+        each[i] = step @ each[i - 1]
+    turned = np.einsum("aij,tjk->taik", forms, each)
+    covariance = 2 * np.einsum("taij,tbij->tab", turned, np.einsum("tij,bjk->tbik", each, forms))
+    half = interval * np.fft.rfft(covariance, count, axis=0)
+    density = half + np.conj(np.swapaxes(half, 1, 2)) - interval * covariance[0]
+    omega = 2 * np.pi * np.fft.rfftfreq(count, interval)
+    n = len(system.A)
+    row = np.linalg.solve((1j * omega[:, None, None] * np.eye(n) - system.A).swapaxes(1, 2), system.C[:, None])[..., 0]
+    row = np.concatenate([row, np.ones((len(row), 1))], axis=1)
+    seen = np.einsum("fa,fab,fb->f", row, density, row.conj()).real
+    autocovariance = np.fft.irfft(seen, count)[: operator.shape[1]] / interval
+    forced = np.einsum("aij,ij->a", forms, stationary)
+    mean = float(forced[-1] - system.C @ np.linalg.solve(system.A, forced[:-1]))
+    return operator @ autocovariance, mean
+
+
+def warn_beyond(task: AbstractTask, settings: SpectrumSettings | None = None) -> None:
+    """Warn (`FirstOrderWarning`) where the linear numbers of a task are not the model's."""
+    for notice in (*second_order(task, settings).notices, *negative_coefficients(task)):
+        warnings.warn(f"{type(task).__name__}: {notice}", FirstOrderWarning, stacklevel=3)
