@@ -39,11 +39,8 @@ def reproduce(
 
 
 def _reproduce(folder: Path, given) -> None:
-    from collections import Counter
-
     rows = paper.check(jm.reproduce(folder, given, progress=True))
-    count = Counter(row.verdict for row in rows)
-    out.print(f"{len(rows)} statements: " + ", ".join(f"{n} {verdict}" for verdict, n in count.items()), highlight=False)
+    out.print(paper.counted(rows), highlight=False)
     for row in rows:
         if row.verdict == "does not agree":
             out.print(f"does not agree: {row.says} ({row.source}): {row.ours}", highlight=False, markup=False)
