@@ -193,7 +193,7 @@ def test_an_inverted_u_rises_above_both_ends():
 
 @pytest.mark.slow
 def test_the_share_within_the_bins_against_a_simulation(done):
-    """scipy's Welch of the 32 runs up to 50 Hz. Bins below 11.7 Hz hold a line and slow noise: the share has an error of 2 %."""
+    """scipy's Welch of the 32 runs up to 50 Hz; few bins of slow noise hold much of the power, so the share errs by 2 %."""
     run = done[0].slifkin.force
     passed = run.filtered()
     power = scipy.signal.welch(passed, 100.0, nperseg=256, detrend="constant")[1].mean(0)
