@@ -35,6 +35,7 @@ from jaxmuscle.paper._verdicts import (
     UNCHECKED,
     Row,
     counted,
+    outcome,
 )
 
 EXACT = 1e-9  # arithmetic, bins and what is put in
@@ -149,6 +150,9 @@ def test_only_what_tests_the_model_is_counted_for_it():
         "Not counted for it: 2 fitted (1 of them not met), 3 put in, 1 arithmetic."
     )
     assert {row.kind for row in rows} == set(KINDS)
+    assert outcome([row(TESTED, GRID), row(TESTED, DIFFERS)]) == (
+        "1 agrees (1 within the grid), 1 does not, 0 cannot be checked"
+    )
 
 
 @pytest.mark.slow

@@ -53,8 +53,8 @@ def page(found: Reproduction, rows: tuple[Row, ...]) -> str:
     body = "\n".join(
         (
             "<h1>Enhancing rheological muscle models with stochastic processes: reproduced</h1>",
-            "<p>The figures and every stated number of Zagrodny, Wojnicz, Ludwicki and Barański (<i>the paper</i>), from "
-            f"jaxmuscle {version('jaxmuscle')}. [30] is Slifkin &amp; Newell 1999, [12] Hamilton, Jones &amp; Wolpert 2004. "
+            "<p>The figures of Zagrodny, Wojnicz, Ludwicki and Barański (<i>the paper</i>) and what is known of its text, "
+            f"by jaxmuscle {version('jaxmuscle')}. [30] is Slifkin &amp; Newell 1999, [12] Hamilton, Jones &amp; Wolpert 2004. "
             "What is stated was taken from texts; the figures were not available as data.</p>",
             f"<p><b>{escape(counted(rows))}</b> As data: <a href='claims.json'>claims.json</a>.</p>",
             "<h2>Figures</h2>",
@@ -98,7 +98,7 @@ def _table(head: tuple[str, ...], body: list[str], kind: str = "stack") -> str:
 
 
 def _claims(kind: Kind, rows: list[Row]) -> str:
-    head = ("Paper says", "We get", "How it was obtained", "Agrees, or why not")
+    head = ("Stated", "We get", "How it was obtained", "Agrees, or why not")
     body = []
     for row in rows:
         says = f"{escape(row.says)} <span class='source'>({escape(row.source)})</span>"

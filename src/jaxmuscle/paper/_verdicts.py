@@ -73,9 +73,9 @@ def counted(rows: Iterable[Row]) -> str:
 def outcome(rows: Iterable[Row]) -> str:
     """How many agree, how many do not, how many cannot be checked."""
     verdicts = [row.verdict for row in rows]
-    agree, within = sum(v in (AGREES, GRID) for v in verdicts), verdicts.count(GRID)
-    told = f"{agree} agree" + (f" ({within} within the grid)" if within else "")
-    return f"{told}, {verdicts.count(DIFFERS)} do not, {verdicts.count(UNCHECKED)} cannot be checked"
+    agree, within, differ = sum(v in (AGREES, GRID) for v in verdicts), verdicts.count(GRID), verdicts.count(DIFFERS)
+    told = f"{agree} {'agrees' if agree == 1 else 'agree'}" + (f" ({within} within the grid)" if within else "")
+    return f"{told}, {differ} {'does' if differ == 1 else 'do'} not, {verdicts.count(UNCHECKED)} cannot be checked"
 
 
 def _failed(rows: Iterable[Row]) -> str:
