@@ -53,9 +53,9 @@ def page(found: Reproduction, rows: tuple[Row, ...]) -> str:
     body = "\n".join(
         (
             "<h1>Enhancing rheological muscle models with stochastic processes: reproduced</h1>",
-            "<p>The figures of Zagrodny, Wojnicz, Ludwicki and Barański (<i>the paper</i>) and what is known of its text, "
-            f"by jaxmuscle {version('jaxmuscle')}. [30] is Slifkin &amp; Newell 1999, [12] Hamilton, Jones &amp; Wolpert 2004. "
-            "What is stated was taken from texts; the figures were not available as data.</p>",
+            "<p>The figures of Zagrodny, Wojnicz, Ludwicki and Barański (<i>the paper</i>) and what its text says, by "
+            f"jaxmuscle {version('jaxmuscle')}. [30] is Slifkin &amp; Newell 1999, [12] Hamilton, Jones &amp; Wolpert "
+            "2004. What is stated was taken from texts; the figures were not available as data.</p>",
             f"<p><b>{escape(counted(rows))}</b> As data: <a href='claims.json'>claims.json</a>.</p>",
             "<h2>Figures</h2>",
             f"<div class='figures'>{''.join(_figure(name, _caption(name, found.experiment)) for name in CAPTIONS)}</div>",
