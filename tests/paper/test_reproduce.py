@@ -183,6 +183,13 @@ def test_the_levels_are_those_of_the_expected_fits():
         assert all(task[name] == values[name]["value"] for name in moved)
 
 
+def test_the_preset_of_figures_2_to_5_is_the_expected_fit_to_four_digits():
+    written = (pages.ROOT / "fitting" / "expected" / "zagrodny-fig4a.json").read_text(encoding="utf-8")
+    values = {name: row["value"] for name, row in json.loads(written)["values"].items() if name in jm.PARAMETERS}
+    preset = jm.load_preset("zagrodny-slifkin")
+    assert {name: preset[name] for name in values} == {name: float(f"{value:.4g}") for name, value in values.items()}
+
+
 def test_an_inverted_u_rises_above_both_ends():
     """Student's t of the smaller of the two rises; nothing where the largest stands at an end."""
     noise = np.random.default_rng(0).normal(size=(3, 16))
