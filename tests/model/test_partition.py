@@ -34,7 +34,8 @@ def test_values_are_arrays_by_name_and_rebuild_the_task(x64, task):
 
 
 def test_precision_is_the_callers():
-    values, _ = jm.partition(TASK, NAMES)
+    """Also for a whole number, which `jax.grad` would refuse."""
+    values, _ = jm.partition(TASK.replace(P_w=5), NAMES)
     assert {value.dtype.name for value in values.values()} == {"float32"}
     with jax.enable_x64(True):
         values, _ = jm.partition(TASK, NAMES)
