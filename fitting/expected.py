@@ -1,4 +1,7 @@
-"""Write expected/NAME.json for every target: medians over noise seeds, and tolerances from their spread."""
+"""Write expected/NAME.json for every target: medians over noise seeds, and tolerances from their spread.
+
+And from those of [30] the parameters that `jaxmuscle reproduce` carries over the levels of contraction.
+"""
 
 import importlib
 import json
@@ -6,6 +9,7 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import tomli_w
 
 import jaxmuscle as jm
 
@@ -17,6 +21,8 @@ SCRIPTS = {
     "hamilton-2004": "hamilton_2004",
     "zagrodny-fig4a": "zagrodny_fig4a",
 }
+FOLDER = Path(__file__).parent / "expected"
+LEVELS = Path(__file__).parents[1] / "src" / "jaxmuscle" / "paper" / "levels.toml"
 SEEDS = (1, 2, 3, 4, 5)
 WHY = "3 times the largest deviation among fresh seeds 1 to 5, at least 2 % of the median (see fitting/README.md)"
 
@@ -44,12 +50,21 @@ def expected(name: str) -> dict:
     return {"target": name, "seeds": list(SEEDS), "tolerance_is": WHY, "values": table}
 
 
+def levels() -> str:
+    """The parameters fitted to [30] at 35 and 95 % MVC, for `jaxmuscle reproduce`, which has no fitting/ beside it."""
+    found = {}
+    for level in ("35", "95"):
+        table = json.loads((FOLDER / f"slifkin-newell-1999-{level}mvc.json").read_text(encoding="utf-8"))["values"]
+        found[level] = {name: row["value"] for name, row in table.items() if name in jm.PARAMETERS}
+    return "# Written by fitting/expected.py from fitting/expected/slifkin-newell-1999-*.json.\n\n" + tomli_w.dumps(found)
+
+
 if __name__ == "__main__":
     from jaxmuscle._common.environment import keep_compiled_programs
 
     keep_compiled_programs()
-    folder = Path(__file__).parent / "expected"
-    folder.mkdir(exist_ok=True)
+    FOLDER.mkdir(exist_ok=True)
     for name in sys.argv[1:] or SCRIPTS:
-        (folder / f"{name}.json").write_text(json.dumps(expected(name), indent=1) + "\n", encoding="utf-8")
+        (FOLDER / f"{name}.json").write_text(json.dumps(expected(name), indent=1) + "\n", encoding="utf-8")
         print(f"written: expected/{name}.json", flush=True)
+    LEVELS.write_text(levels(), encoding="utf-8")

@@ -34,6 +34,7 @@ from .model._noise import BandLimitedNoise as BandLimitedNoise
 from .model._noise import OrnsteinUhlenbeckNoise as OrnsteinUhlenbeckNoise
 from .model._noise import WhiteNoise as WhiteNoise
 from .model._parameters import PARAMETERS as PARAMETERS
+from .model._partition import partition as partition
 from .model._pink_noise import PinkNoise as PinkNoise
 from .model._presets import load_preset as load_preset
 from .model._presets import save_preset as save_preset

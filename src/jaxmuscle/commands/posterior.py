@@ -45,7 +45,7 @@ def posterior(
 ) -> None:
     """Draw from the posterior of the muscle's parameters: how sure is the fit.
 
-    Fits first (unless given a fit.json), then runs NUTS chains with the exact law of the Welch bins. Writes DIR/fit.json,
+    Fits first (unless given a fit.json), then runs NUTS chains with the likelihood of the Welch bins. Writes DIR/fit.json,
     DIR/posterior.nc (for ArviZ), DIR/posterior.json, corner.png, predictive.png and chains.png. Exit code 1 if the fit
     failed or the chains did not mix: then there is no summary.
 

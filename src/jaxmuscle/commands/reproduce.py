@@ -19,7 +19,7 @@ def reproduce(
         typer.Option(metavar="FILE", help="One of three people's recordings, for Figures 7 and 8; three times."),
     ] = None,
 ) -> None:
-    """Draw the figures of the paper and check every number that it states.
+    """Draw the figures of the paper and check what its text states.
 
     Writes DIR/index.html (open it in a browser), DIR/fig2 ... fig8 as .png and .pdf, and DIR/claims.json.
 
@@ -39,12 +39,10 @@ def reproduce(
 
 
 def _reproduce(folder: Path, given) -> None:
-    from collections import Counter
-
     rows = paper.check(jm.reproduce(folder, given, progress=True))
-    count = Counter(row.verdict for row in rows)
-    out.print(f"{len(rows)} statements: " + ", ".join(f"{n} {verdict}" for verdict, n in count.items()), highlight=False)
+    out.print(paper.counted(rows), highlight=False)
     for row in rows:
         if row.verdict == "does not agree":
-            out.print(f"does not agree: {row.says} ({row.source}): {row.ours}", highlight=False, markup=False)
+            says = f"does not agree ({row.kind}): {row.says} ({row.source}): {row.ours}"
+            out.print(says, highlight=False, markup=False)
     out.print(f"Written: {folder}/index.html, fig2 to fig8 (.png, .pdf), claims.json", highlight=False)

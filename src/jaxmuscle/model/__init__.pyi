@@ -11,6 +11,7 @@ from ._noise import OrnsteinUhlenbeckNoise as OrnsteinUhlenbeckNoise
 from ._noise import WhiteNoise as WhiteNoise
 from ._parameters import PARAMETERS as PARAMETERS
 from ._parameters import Parameter as Parameter
+from ._partition import partition as partition
 from ._pink_noise import PinkNoise as PinkNoise
 from ._presets import load_preset as load_preset
 from ._presets import save_preset as save_preset

@@ -13,9 +13,13 @@ from jaxmuscle._common.text import choices
 
 _HAND = "mass of a hand, about 0.6 % of body mass (Winter 2009, Biomechanics, table 4.1); design 2: keeps fits non-stiff"
 _STIFF = "K_0 = k x_ref^2 = 200 N/m, the postural stiffness of a hand (order of Mussa-Ivaldi et al. 1985)"
-_DAMP = "C_0 = c v_ref^2; slow eigenvalue near -K/C = -10/s, the corner seen in measured force spectra"
+_DAMP = (
+    "no measured damping: C_0 = c v_ref^2 of both tissues was chosen so that the slow eigenvalue of isometric force, -10/s "
+    "(1.5 Hz), is near the corner of force spectra (fits of the measured ones: 0.4 and 0.9 Hz)"
+)
 _REF = "sets the range over which the muscle is linear: displacements here are about 0.01 m"
-_HUMAN = "coefficient of variation of isometric force near 1 %, as people show; the paper: 0.0016"
+_HUMAN = "coefficient of variation of isometric force near 1 %, as people show"
+_PAPER_K = f"{_HUMAN}; the paper: 0.16 % of the initial stiffness coefficient"
 _PAPER_C = "the paper: 0.01 % of the initial damping coefficient"
 
 
@@ -73,8 +77,8 @@ PARAMETERS: dict[str, Parameter] = {
         _row("x_ref_z", "x_ref,z", "m", 0.02, "passive reference displacement", _REF),
         _row("v_ref_w", "v_ref,w", "m/s", 1.0, "active reference velocity", _REF),
         _row("v_ref_z", "v_ref,z", "m/s", 1.0, "passive reference velocity", _REF),
-        _row("noise_K_w", "σ_Kw/K_w0", "1", 0.15, "noise on active stiffness", _HUMAN),
-        _row("noise_K_z", "σ_Kz/K_z0", "1", 0.005, "noise on passive stiffness", _HUMAN),
+        _row("noise_K_w", "σ_Kw/K_w0", "1", 0.15, "noise on active stiffness", _PAPER_K),
+        _row("noise_K_z", "σ_Kz/K_z0", "1", 0.005, "noise on passive stiffness", _PAPER_K),
         _row("noise_C_w", "σ_Cw/C_w0", "1", 1e-4, "noise on active damping", _PAPER_C),
         _row("noise_C_z", "σ_Cz/C_z0", "1", 1e-4, "noise on passive damping", _PAPER_C),
         _row("noise_cutoff", "f_c", "Hz", 50.0, "corner of band-limited noise", "Nyquist frequency of the papers' 100 Hz"),

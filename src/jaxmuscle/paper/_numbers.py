@@ -9,29 +9,27 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
-from jaxmuscle._common.arrays import as_arrays
-from jaxmuscle._common.programs import kept
 from jaxmuscle.data._recording import RECORDED, Recording
 from jaxmuscle.ensembles._ensemble import ensemble
 from jaxmuscle.model._noise import OrnsteinUhlenbeckNoise
 from jaxmuscle.model._presets import load_preset
-from jaxmuscle.model._tasks import AbstractTask, Isometric, PrescribedForce
-from jaxmuscle.response._expected import expected_moments, response
-from jaxmuscle.response._scaling import at_level
+from jaxmuscle.model._signals import SmoothStep
+from jaxmuscle.model._tasks import AbstractTask, PrescribedForce
+from jaxmuscle.response._expected import expected_moments
 from jaxmuscle.simulation._trajectory import Trajectory, stack
 from jaxmuscle.spectra._measures import approximate_entropy, peaks, spearman
 from jaxmuscle.spectra._settings import WINDOW
 from jaxmuscle.spectra._welch import Spectrum, lowpass
 
-from ._readings import HIGH_BIN, LOW_BIN, Reading, fast_share, pulled, readings
+from ._levels import Levels, levels
+from ._readings import HIGH_BIN, LOW_BIN, SILENT, Reading, fast_share, pulled, readings, within_bins
 
 SEEDS = 32
-LEVELS = np.array([0.05, 0.15, 0.25, 0.35, 0.45, 0.55, 0.65, 0.75, 0.85, 0.95])
-STEADIEST, SMALLEST = 0.3, 0.017  # Taylor, Christou & Enoka 2003
 PERSON = ("k_w", "c_w", "noise_K_w", "harmonic_amplitude")
 SINES = (1.24, 4.251, 7.0)
+MOVED = 0.005  # m, how far the insertion moves in the concentric phase: our choice
 Progress = Callable[[str, float], Any]
 
 
@@ -39,7 +37,8 @@ class Tuned(eqx.Module):
     """A preset in Task 1 (force) and in Task 2 (displacement).
 
     **Fields:** `force`, 32 seeds of P_w; `spectrum`, its expected one; `sine`, the harmonic's share of every bin;
-    `variation`, the expected coefficient of variation; `fast`, the share of the force's variance above 10 Hz;
+    `variation`, the expected coefficient of variation; `fast`, the share of the force's variance above 10 Hz; `within`,
+    the share of its power that is in the compared bins (`within_bins`);
     `displacement`, one seed of x_z at constant forces, with `moved`, its expected spectrum, and `displacement_variation`;
     `both`, the share of single seeds with the maximum in bin 1 and a local one in bin 11; `swing`, the amplitude of the
     harmonic in the force, relative to the mean, in the first and the last quarter of the window.
@@ -50,6 +49,7 @@ class Tuned(eqx.Module):
     sine: Float[np.ndarray, " bins"]
     variation: float
     fast: float
+    within: float
     displacement: Trajectory
     moved: Spectrum
     displacement_variation: float
@@ -57,29 +57,17 @@ class Tuned(eqx.Module):
     swing: tuple[float, float]
 
 
-class Levels(eqx.Module):
-    """Fits to the reconstructed spectra of [30], carried to other levels of contraction by `at_level`.
+class Concentric(eqx.Module):
+    """Task 1 while the insertion moves by 5 mm against its rising load, and what the force needed does in Task 2.
 
-    **Fields:** `fractions` (levels,) of the MVC; of the fit at 95 %: `power` (levels, bins), `variation` (levels,) with
-    1.7 % at 30 % MVC; `at_35`, the spectrum of the fit at 35 %, and `at_35_moved`, the same muscle at 95 %.
+    **Fields:** `mean` of the held P_w [N]; `low`, `high` [Hz], its maximum and the highest local one; `error`, the largest
+    difference between the insertion's way in Task 2 and the prescribed one, relative to the 5 mm.
     """
 
-    fractions: Float[np.ndarray, " levels"]
-    power: Float[np.ndarray, "levels bins"]
-    variation: Float[np.ndarray, " levels"]
-    at_35: Spectrum
-    at_35_moved: Spectrum
-
-    @property
-    def maxima(self) -> Float[np.ndarray, " levels"]:
-        """Frequency [Hz] of the largest absolute power at every level."""
-        return self.at_35.settings.frequency[np.argmax(self.power, axis=1)]
-
-    @property
-    def shifted(self) -> float:
-        """Largest share of the power that is in other bins than at 95 % MVC, over the levels from 15 % on."""
-        p = self.power / self.power.sum(1, keepdims=True)
-        return float(0.5 * np.max(np.abs(p[1:] - p[-1]).sum(1)))
+    mean: float
+    low: float
+    high: float
+    error: float
 
 
 class Regularity(eqx.Module):
@@ -132,12 +120,26 @@ def tuned(task: AbstractTask) -> Tuned:
         sine=np.asarray(moments.line / moments.power),
         variation=float(moments.variation),
         fast=float(fast),
+        within=within_bins(task),
         displacement=stack([ensemble(second, jax.random.key(0), seeds=1, control=False)], 1),
         moved=Spectrum(second.settings.frequency, np.asarray(moved.power), second.settings, second.output_unit),
         displacement_variation=float(moved.variation),
         both=_both(runs),
         swing=_swing(runs),
     )
+
+
+def concentric(task: AbstractTask) -> Concentric:
+    """A preset of Task 1 with a moving insertion; what its force does in Task 2 without noise and harmonic."""
+    way = SmoothStep(MOVED)
+    moving = task.with_parts(x_z=way)
+    moments, _ = expected_moments(moving, moving.settings, WINDOW)
+    found = peaks(Spectrum(moving.settings.frequency, np.asarray(moments.power), moving.settings, moving.output_unit))
+    high = max(found.local_maxima, key=lambda peak: peak.power, default=found.maximum)
+    back = ensemble(pulled(moving, MOVED).replace(**SILENT), jax.random.key(0), seeds=1, control=False)
+    wanted = np.asarray(jax.vmap(way)(jnp.asarray(back.time)))
+    error = np.abs(np.asarray(back.output)[0] - wanted).max() / MOVED
+    return Concentric(float(moments.mean), found.maximum.frequency, high.frequency, float(error))
 
 
 def _both(runs: Trajectory) -> float:
@@ -158,41 +160,6 @@ def _swing(runs: Trajectory) -> tuple[float, float]:
         return float(np.hypot(found[0], found[1]) / mean.mean())
 
     return amplitude(slice(quarter)), amplitude(slice(-quarter, None))
-
-
-def fitted(level: int) -> AbstractTask:
-    """`Isometric` as fitted to `slifkin-newell-1999-95mvc` or `-35mvc` (fitting/expected, rounded); at 95 % the
-    harmonic is put at the stated 1.24 Hz.
-    """
-    values = {
-        95: {"k_w": 195200.0, "k_z": 605800.0, "c_w": 61.12, "c_z": 1.12, "noise_K_w": 0.242, "noise_K_z": 0.001189,
-             "harmonic_amplitude": 0.007823, "harmonic_frequency": 1.24},
-        35: {"k_w": 110200.0, "k_z": 488900.0, "c_w": 44.95, "c_z": 0.8942, "noise_K_w": 0.3855, "noise_K_z": 0.001228,
-             "harmonic_amplitude": 0.00475, "harmonic_frequency": 7.019},
-    }  # fmt: skip
-    return Isometric().replace(**values[level])
-
-
-@kept
-def _carried(task: AbstractTask, fractions: Float[Array, " levels"], reference: Float[Array, ""]) -> tuple[Array, Array]:
-    """Power and coefficient of variation at every level."""
-
-    def one(fraction):
-        moments, _ = response(as_arrays(at_level(task, fraction, reference=reference)), task.settings, WINDOW)
-        return jnp.asarray(moments.power), jnp.asarray(moments.variation)
-
-    return jax.vmap(one)(fractions)
-
-
-def levels() -> Levels:
-    """The fit at 95 % at the levels of [30], 5 to 95 % MVC; and the fit at 35 %, there and at 95 %."""
-    high, low = fitted(95), fitted(35)
-    fractions = np.append(LEVELS, STEADIEST)
-    power, variation = (np.asarray(v) for v in _carried(as_arrays(high), jnp.asarray(fractions), jnp.asarray(0.95)))
-    louder = SMALLEST / variation[-1]  # to first order amplitudes and variation are proportional
-    beside, _ = _carried(as_arrays(low), jnp.asarray(np.append(np.full(LEVELS.size, 0.35), 0.95)), jnp.asarray(0.35))
-    at_35, moved = (Spectrum(low.settings.frequency, np.asarray(row), low.settings) for row in (beside[0], beside[-1]))
-    return Levels(LEVELS, power[:-1] * louder**2, variation[:-1] * louder, at_35, moved)
 
 
 def regularity(force: Trajectory) -> Regularity:
@@ -263,6 +230,7 @@ class Reproduction(eqx.Module):
 
     slifkin: Tuned
     hamilton: Tuned
+    concentric: Concentric
     levels: Levels
     regularity: Regularity
     experiment: Experiment
@@ -277,6 +245,7 @@ def computed(given: tuple[Recording, ...] | None = None, report: Progress = lamb
         slifkin = tuned(load_preset("zagrodny-slifkin"))
         report("Task 1 and 2, zagrodny-hamilton", 0.15)
         hamilton = tuned(load_preset("zagrodny-hamilton"))
+        moving = concentric(slifkin.force.task)
         report("levels of contraction", 0.3)
         moved = levels()
         report("comparison signals", 0.45)
@@ -286,4 +255,4 @@ def computed(given: tuple[Recording, ...] | None = None, report: Progress = lamb
         tuned_runs = experiment(recorded(slifkin.displacement.task, seeds=3))
         report("three readings", 0.6)
         judged = readings(slifkin.force.task)
-        return Reproduction(slifkin, hamilton, moved, compared, people, tuned_runs, judged)
+        return Reproduction(slifkin, hamilton, moving, moved, compared, people, tuned_runs, judged)

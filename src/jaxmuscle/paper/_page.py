@@ -1,15 +1,15 @@
 """The page of `jaxmuscle reproduce`: figures, the table of statements, the three readings. One file, no network."""
 
-from collections import Counter
 from html import escape
 from importlib.metadata import version
 from pathlib import Path
 
 from jaxmuscle._common.files import write_text
 
-from ._claims import AGREES, DIFFERS, GRID, Row, claims_json
+from ._claims import claims_json
 from ._numbers import SINES, Experiment, Reproduction
 from ._readings import FACTS, conclusion
+from ._verdicts import AGREES, DIFFERS, GRID, KINDS, TESTED, Kind, Row, counted, outcome
 
 CAPTIONS = {
     "fig2": "<b>Figure 2.</b> Force P<sub>w</sub> in Task 1, tuned to [30] at 95 % MVC, over its mean: rise before 5 s, "
@@ -50,19 +50,17 @@ def write_page(found: Reproduction, rows: tuple[Row, ...], out: Path) -> None:
 
 def page(found: Reproduction, rows: tuple[Row, ...]) -> str:
     """The whole page."""
-    count = Counter(row.verdict for row in rows)
-    summary = ", ".join(f"{n} {verdict}" for verdict, n in count.items())
     body = "\n".join(
         (
             "<h1>Enhancing rheological muscle models with stochastic processes: reproduced</h1>",
-            "<p>The figures and every stated number of Zagrodny, Wojnicz, Ludwicki and Barański (<i>the paper</i>), from "
-            f"jaxmuscle {version('jaxmuscle')}. [30] is Slifkin &amp; Newell 1999, [12] Hamilton, Jones &amp; Wolpert 2004. "
-            "What is stated was taken from texts; the figures were not available as data.</p>",
-            f"<p><b>{len(rows)} statements</b>: {escape(summary)}. As data: <a href='claims.json'>claims.json</a>.</p>",
+            "<p>The figures of Zagrodny, Wojnicz, Ludwicki and Barański (<i>the paper</i>) and what its text says, by "
+            f"jaxmuscle {version('jaxmuscle')}. [30] is Slifkin &amp; Newell 1999, [12] Hamilton, Jones &amp; Wolpert "
+            "2004. What is stated was taken from texts; the figures were not available as data.</p>",
+            f"<p><b>{escape(counted(rows))}</b> As data: <a href='claims.json'>claims.json</a>.</p>",
             "<h2>Figures</h2>",
             f"<div class='figures'>{''.join(_figure(name, _caption(name, found.experiment)) for name in CAPTIONS)}</div>",
             "<h2>Statements</h2>",
-            _claims(rows),
+            *(_claims(kind, [row for row in rows if row.kind == kind]) for kind in KINDS),
             "<h2>Where do 0.391 and 4.251 Hz come from? Three readings</h2>",
             _readings(found),
             "<h2>Comparison signals</h2>",
@@ -99,16 +97,18 @@ def _table(head: tuple[str, ...], body: list[str], kind: str = "stack") -> str:
     return f"<div class='scroll'>{table}</div>"
 
 
-def _claims(rows: tuple[Row, ...]) -> str:
-    head = ("Paper says", "We get", "How it was obtained", "Agrees, or why not")
+def _claims(kind: Kind, rows: list[Row]) -> str:
+    head = ("Stated", "We get", "How it was obtained", "Agrees, or why not")
     body = []
     for row in rows:
         says = f"{escape(row.says)} <span class='source'>({escape(row.source)})</span>"
-        verdict = f"<span class='verdict {CLASSES.get(row.verdict, 'open')}'>{row.verdict}</span>"
+        colour = CLASSES.get(row.verdict, "open") if kind == TESTED or row.verdict == DIFFERS else "open"
+        verdict = f"<span class='verdict {colour}'>{row.verdict}</span>"
         cells = (says, escape(row.ours), escape(row.how), verdict + (f": {escape(row.why)}" if row.why else ""))
         filled = "".join(f"<td data-label='{label}'>{cell}</td>" for label, cell in zip(head, cells, strict=True))
         body.append(f"<tr id='{row.key}'>{filled}</tr>")
-    return _table(head, body)
+    title = f"<h3>{kind[0].upper()}{kind[1:]}: {len(rows)}, of which {outcome(rows)}</h3><p>{escape(KINDS[kind])}</p>"
+    return title + _table(head, body)
 
 
 def _readings(found: Reproduction) -> str:

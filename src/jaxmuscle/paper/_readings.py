@@ -21,6 +21,7 @@ LOW_BIN, HIGH_BIN = 1, 11
 LINE = 0.5  # a bin is called a sine if at least half of its power is one
 FAST, FAST_SHARE = 10.0, 0.1  # Hz, and the share of the variance above it that is seen as fast noise
 HELD = 0.001  # m; Task 2 about x_z = 0, as in Task 1, has a displacement that cannot be normalised
+SILENT = {f"noise_{channel}": 0.0 for channel in CHANNELS} | {"harmonic_amplitude": 0.0}
 PAPER_NOISE = [0.0016, 0.0016, 0.0001, 0.0001]
 SEEDS = 16
 
@@ -38,6 +39,13 @@ def fast_share(samples: Float[np.ndarray, " times"], rate: float) -> float:
     """Share of a signal's variance above 10 Hz, up to half the sampling rate (nothing is filtered)."""
     power = np.abs(np.fft.rfft(samples - samples.mean())) ** 2
     return float(power[np.fft.rfftfreq(samples.size, 1 / rate) > FAST].sum() / power.sum())
+
+
+def within_bins(task: AbstractTask) -> float:
+    """Share of the expected power, after the low-pass, from bin 1 to half the sampling rate that is in the compared bins."""
+    settings = task.settings.replace(last_bin=task.settings.length // 2)
+    power = np.asarray(expected_moments(task, settings, WINDOW)[0].power)
+    return float(power[: task.settings.last_bin].sum() / power.sum())
 
 
 class Reading(eqx.Module):
@@ -64,16 +72,15 @@ class Reading(eqx.Module):
         return tuple(FACTS[key] for key, holds in self.facts.items() if not holds)
 
 
-def pulled(task: AbstractTask) -> AbstractTask:
+def pulled(task: AbstractTask, x_z: float = HELD) -> AbstractTask:
     """The same muscle in Task 2, constant forces from 5 s on.
 
-    For Task 1 the P_w(t) that it needs, without noise and harmonic, to hold the insertion at 1 mm against its load: so
-    nothing else than noise and harmonic moves x_z in the window. For another task its own P_w without load.
+    For Task 1 the P_w(t) that it needs, without noise and harmonic, to hold the insertion at `x_z` [m] against its load: so
+    nothing else than noise and harmonic moves it in the window. For another task its own P_w without load.
     """
     if not isinstance(task, PrescribedMotion):
         return task.as_task(PrescribedForce, P_w=float(task["P_w"]))
-    silent = {f"noise_{channel}": 0.0 for channel in CHANNELS} | {"harmonic_amplitude": 0.0}
-    needed = ensemble(task.replace(x_z=HELD, **silent), jax.random.key(0), seeds=1, control=False)
+    needed = ensemble(task.replace(x_z=x_z, **SILENT), jax.random.key(0), seeds=1, control=False)
     force = Sampled.through(needed.time, np.asarray(needed.output)[0])
     return task.as_task(PrescribedForce, P_w=force, F_ext=task.F_ext)
 
