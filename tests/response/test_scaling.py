@@ -288,3 +288,27 @@ def test_the_preset_is_smoother_and_its_amplitude_falls(x64, hamilton):
     # Three cycles of 0.391 Hz at either end of the analysed window.
     early, late = (force[:, a:b].std(axis=1).mean() for a, b in ((500, 1267), (733, 1500)))
     assert late < early
+
+
+# --- another mean force
+
+
+@pytest.mark.parametrize("name", ["isometric", "ornstein-uhlenbeck", "absolute noise", "prescribed-motion"])
+def test_a_muscle_carried_to_another_force_has_the_same_spectrum(name, x64):
+    """Every force, mass, stiffness and damping times one number: the equations divided by it are the same."""
+    before = moments(TASKS[name])
+    mean = 40.0 * float(before.mean)
+    after = moments(jm.at_force(TASKS[name], mean))
+    assert float(after.mean) == pytest.approx(mean, rel=EXACT)
+    np.testing.assert_allclose(after.proportional, before.proportional, rtol=1e-8)
+    np.testing.assert_allclose(after.variation, before.variation, rtol=1e-8)
+
+
+def test_carrying_back_is_the_task_and_a_displacement_cannot_be_carried(x64):
+    task = TASKS["isometric"]
+    there = jm.at_force(task, 100.0)
+    assert_same(jm.at_force(there, float(moments(task).mean)), task)
+    with pytest.raises(ValueError, match="the output of PrescribedForce is x_z in m, not a force"):
+        jm.at_force(TASKS["prescribed-force"], 10.0)
+    with pytest.raises(ValueError, match="give one of the same sign"):
+        jm.at_force(task, -3.0)

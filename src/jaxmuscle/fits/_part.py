@@ -35,6 +35,12 @@ class Estimate(eqx.Module):
             return f"{self.value:.3g}"
         return " ± ".join(rounded(self.value, self.stderr))
 
+    def error_in_words(self) -> str:
+        """The standard error, or why there is none."""
+        if self.stderr is not None:
+            return rounded(self.value, self.stderr)[1]
+        return "not determined" if self.free else "fixed"
+
     def interval_in_words(self) -> str:
         """The 95 % interval, empty where there is none."""
         if self.interval is None:
