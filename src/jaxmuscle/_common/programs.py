@@ -12,7 +12,7 @@ import threading
 import time
 import weakref
 from collections.abc import Callable, Iterator
-from importlib.metadata import version
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, NamedTuple, ParamSpec, TypeVar
 
@@ -27,7 +27,7 @@ from .files import replacing
 P = ParamSpec("P")
 R = TypeVar("R")
 # What a program may be made of: code whose version is part of the key. Another's class may change without a sign.
-OTHERS = ("jax", "jaxlib", "numpy", "equinox", "diffrax", "optimistix", "lineax", "jaxtyping")
+OTHERS = ("jax", "jaxlib", "numpy", "equinox", "diffrax", "optimistix", "lineax", "jaxtyping", "scipy", "blackjax")
 KNOWN = ("jaxmuscle", "builtins", "collections", *OTHERS)
 ADDRESS = re.compile(r" at 0x[0-9a-f]+")
 CONFIG = ("jax_enable_x64", "jax_numpy_dtype_promotion", "jax_default_matmul_precision", "jax_default_prng_impl",
@@ -228,7 +228,14 @@ def _code() -> str:
 
 @functools.cache
 def _versions() -> tuple[str, ...]:
-    return tuple(version(name) for name in OTHERS)
+    return tuple(map(_version, OTHERS))
+
+
+def _version(name: str) -> str:
+    try:
+        return version(name)
+    except PackageNotFoundError:  # of an extra
+        return ""
 
 
 @functools.cache
