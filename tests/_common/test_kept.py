@@ -166,6 +166,19 @@ def test_fixed_outputs_and_modules_come_back(x64, folder):
         assert task.settings == jm.Isometric().settings
 
 
+def test_what_a_loaded_program_gives_is_the_same_argument_for_the_next(x64, folder):
+    """A module's `repr` leaves out a field that is the default object; what was read from a file is another object."""
+
+    def stiffer(task):
+        return task.replace(k_w=2.0 * task["k_w"])
+
+    made, loaded = Kept(stiffer)(TASK), Kept(stiffer)(TASK)
+    Kept(solved)(made, MATRIX)
+    program = Kept(solved)
+    program(loaded, MATRIX)
+    assert program.traces == 0
+
+
 def test_threads_make_one_result(x64, folder):
     program, found = Kept(solved), []
     threads = [threading.Thread(target=lambda: found.append(program(TASK, MATRIX))) for _ in range(4)]

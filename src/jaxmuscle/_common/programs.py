@@ -209,11 +209,23 @@ def _told(structure: Any) -> str | None:
     if node is None:
         return "*"
     kind, data = node
-    name, text = f"{kind.__module__}.{kind.__qualname__}", repr(data)
-    if not _known(kind) or ADDRESS.search(text):
+    name, text = f"{kind.__module__}.{kind.__qualname__}", _text(data)
+    if not _known(kind) or text is None or ADDRESS.search(text):
         return None
     children = [_told(child) for child in structure.children()]
     return None if None in children else f"{name}|{text}({','.join(map(str, children))})"
+
+
+def _text(data: Any) -> str | None:
+    """As `repr`; but that of a module leaves out what *is* its default, which the same number read from a file is not."""
+    if isinstance(data, eqx.Module):
+        leaves, structure = jax.tree.flatten(data)
+        told = _told(structure)
+        return None if told is None else f"{told}{leaves}"
+    if isinstance(data, tuple):
+        parts = [_text(part) for part in data]
+        return None if None in parts else f"({','.join(map(str, parts))})"
+    return repr(data)
 
 
 @functools.cache
