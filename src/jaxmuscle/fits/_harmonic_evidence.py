@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.special import gammaincinv, ndtr
 
+from jaxmuscle._common.keys import fold_in
 from jaxmuscle.objective._consequences import consequences, expand
 from jaxmuscle.objective._least_squares import Minima, least_squares
 from jaxmuscle.objective._problem import FitProblem
@@ -120,7 +121,7 @@ def _p_value(problem: FitProblem, objective: Residuals, final: Minima) -> float:
 
 
 def _generator(problem: FitProblem, number: int) -> np.random.Generator:
-    return np.random.default_rng(np.asarray(jax.random.key_data(jax.random.fold_in(problem.key, number))))
+    return np.random.default_rng(np.asarray(jax.random.key_data(fold_in(problem.key, number))))
 
 
 def _scatter(problem: FitProblem, n: int) -> np.ndarray:

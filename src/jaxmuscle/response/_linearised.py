@@ -82,10 +82,16 @@ def settled(task: AbstractTask, time: float = HOLD) -> AbstractTask:
     """
     traced = not all(is_concrete(leaf) for leaf in jax.tree.leaves(task))
     point = equilibrium(task, time) if traced else np.asarray(linearised(task, time).system.point).tolist()
-    held = {field.name: Constant(getattr(task, field.name)(jnp.asarray(time))) for field in dataclasses.fields(task)
-            if isinstance(getattr(task, field.name), AbstractSignal)}  # fmt: skip
+    held = {name: Constant(level) for name, level in _inputs(as_arrays(task), time).items()}
     found = task.with_parts(**held, initial=tuple(point))
     return found if traced else as_numbers(found)
+
+
+@kept
+def _inputs(task: AbstractTask, time: float) -> dict[str, Scalar]:
+    """Value at `time` of every input that is a function of time."""
+    fields = {field.name: getattr(task, field.name) for field in dataclasses.fields(task)}
+    return {name: signal(jnp.asarray(time)) for name, signal in fields.items() if isinstance(signal, AbstractSignal)}
 
 
 @kept
