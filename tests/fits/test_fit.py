@@ -21,7 +21,7 @@ from jaxmuscle.fits._checks import AMBIGUOUS, rivals
 from jaxmuscle.model._parameters import DEFAULT_FREE, PARAMETERS
 from jaxmuscle.model._tasks import with_noise
 from jaxmuscle.objective._arguments import DT, RESIDUALS, free_names
-from jaxmuscle.objective._consequences import BATCH, _moments_and_slopes, consequences, derived, expand
+from jaxmuscle.objective._consequences import BATCH, _of_rows, consequences, derived, expand
 from jaxmuscle.objective._coordinates import Coordinates
 from jaxmuscle.objective._covariance import identifiability, undetermined_directions
 from jaxmuscle.objective._least_squares import Minima, _residuals, least_squares
@@ -762,9 +762,9 @@ def test_any_number_of_points_is_one_compiled_program(x64):
     objective = problem.linear()
     theta = np.random.default_rng(0).normal(size=(BATCH + 5, 3))
     seen = expand(objective, theta)
-    traces = len(_moments_and_slopes.programs)
+    traces = len(_of_rows.programs)
     single = expand(objective, theta[-2:])
-    assert len(_moments_and_slopes.programs) == traces
+    assert len(_of_rows.programs) == traces
     np.testing.assert_allclose(seen.moments[0].power[-2:], single.moments[0].power, rtol=1e-12)
     assert seen.slopes[0].power.shape == (BATCH + 5, 30, 3)
 
