@@ -25,7 +25,7 @@ from jaxmuscle.model._parameters import DEFAULT_FREE
 from jaxmuscle.objective._problem import target_variation
 from jaxmuscle.response._expected import expected_moments
 from jaxmuscle.simulation._batch import respond
-from jaxmuscle.simulation._integrator import Grid
+from jaxmuscle.simulation._grid import Grid
 from jaxmuscle.spectra._bin_law import bin_statistics, standardised
 from jaxmuscle.spectra._settings import WINDOW
 

@@ -14,7 +14,8 @@ from measure import DTYPES, Program, Row, Unequal, require_equal, seconds, speed
 import jaxmuscle as jm
 from jaxmuscle._common.arrays import as_arrays
 from jaxmuscle.simulation._batch import draw
-from jaxmuscle.simulation._integrator import Grid, solve
+from jaxmuscle.simulation._grid import Grid
+from jaxmuscle.simulation._integrator import solve
 
 SEEDS, DT, EVERY, STEPS = 64, 1e-3, 10, 15_000
 GRID = Grid(DT, STEPS, EVERY, reverse=False)

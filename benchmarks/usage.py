@@ -13,7 +13,7 @@ import jaxmuscle as jm
 from jaxmuscle._common.arrays import as_arrays
 from jaxmuscle.model._parameters import DEFAULT_FREE
 from jaxmuscle.simulation._batch import draw, respond
-from jaxmuscle.simulation._integrator import Grid
+from jaxmuscle.simulation._grid import Grid
 
 GRADIENT_SEEDS = 8
 

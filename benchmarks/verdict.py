@@ -146,8 +146,8 @@ def harmonic(count: int) -> None:
         made = targets(*recordings(still, segments, count, 7), segments)
         plans = [planned(TASK, target, FitOptions(starts=STARTS)) for target in made]
         problems = [plan.problem for plan in plans]
-        ended = _together([problem.linear() for problem in problems], [starting_points(problem, 8) for problem in problems], 40,
-                          "fits", lambda text, share: None, (0, 1))  # fmt: skip
+        starts = [starting_points(problem, 8) for problem in problems]
+        ended = _together([p.linear() for p in problems], starts, 40, "fits", lambda text, share: None, (0, 1))
         found = [harmonic_test(problem, stage.minima) for problem, stage in zip(problems, ended, strict=True)]
     p = np.array([test.p_value for test in found if test is not None and test.p_value is not None])
     print(f"{len(p)} recordings without harmonic: {100 * np.mean(p < 0.05):.1f} % significant at 5 %", flush=True)

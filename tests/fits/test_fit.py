@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import references
 import scipy.signal
+import scipy.stats
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -20,18 +21,18 @@ from jaxmuscle.fits._checks import AMBIGUOUS, Stage, rivals
 from jaxmuscle.model._parameters import DEFAULT_FREE, PARAMETERS
 from jaxmuscle.model._tasks import with_noise
 from jaxmuscle.objective._arguments import DT, RESIDUALS, free_names
-from jaxmuscle.objective._consequences import BATCH, _moments_and_slopes, consequences, derived, expand
+from jaxmuscle.objective._consequences import BATCH, _of_rows, consequences, derived, expand
 from jaxmuscle.objective._coordinates import Coordinates
 from jaxmuscle.objective._covariance import common_scales, identifiability
 from jaxmuscle.objective._least_squares import Minima, _residuals, least_squares
 from jaxmuscle.objective._moment_models import MonteCarlo, welch_operator
 from jaxmuscle.objective._problem import FitProblem, Part, target_variation
 from jaxmuscle.objective._residuals import residual_sigma
-from jaxmuscle.objective._starts import contenders
+from jaxmuscle.objective._starts import contenders, halton
 from jaxmuscle.response._equilibrium import slowest_rate
 from jaxmuscle.response._expected import Moments
 from jaxmuscle.simulation._batch import draw
-from jaxmuscle.simulation._integrator import Grid
+from jaxmuscle.simulation._grid import Grid
 from jaxmuscle.spectra._bin_law import bin_statistics
 from jaxmuscle.spectra._settings import WINDOW
 
@@ -186,6 +187,11 @@ def test_starts_outside_the_bounds_are_clipped_into_them(theta):
         values = given.values(given.theta(jnp.asarray(given.from_theta(np.array(theta)))))
         for name, (low, high) in BOUNDS.items():
             assert low < float(values[name]) < high
+
+
+@pytest.mark.parametrize(("size", "count"), [(1, 1), (8, 100), (20, 32)])
+def test_halton_points_are_scipys_to_the_last_bit(size, count):
+    np.testing.assert_array_equal(halton(size, count), scipy.stats.qmc.Halton(size, rng=0).random(count))
 
 
 def test_slope_is_the_derivative_of_the_values(x64):
@@ -756,9 +762,9 @@ def test_any_number_of_points_is_one_compiled_program(x64):
     objective = problem.linear()
     theta = np.random.default_rng(0).normal(size=(BATCH + 5, 3))
     seen = expand(objective, theta)
-    traces = len(_moments_and_slopes.programs)
+    traces = len(_of_rows.programs)
     single = expand(objective, theta[-2:])
-    assert len(_moments_and_slopes.programs) == traces
+    assert len(_of_rows.programs) == traces
     np.testing.assert_allclose(seen.moments[0].power[-2:], single.moments[0].power, rtol=1e-12)
     assert seen.slopes[0].power.shape == (BATCH + 5, 30, 3)
 

@@ -12,7 +12,8 @@ import scipy.integrate
 import jaxmuscle as jm
 from jaxmuscle.model import QuadraticDamping, QuadraticStiffness
 from jaxmuscle.model._noise import Realisation
-from jaxmuscle.simulation._integrator import Grid, observe, solve
+from jaxmuscle.simulation._grid import Grid
+from jaxmuscle.simulation._integrator import observe, solve
 
 KEY = jax.random.key(23)
 MASS, K, C_W, C_Z, FORCE = 0.5, 200.0, 3.0, 1.0, 5.0

@@ -122,7 +122,7 @@ def test_an_input_that_is_held_in_the_window_is_not():
     for signal in (5.0, jm.model.RampHold(5.0, start=0.5, ramp=4.0), jm.model.SmoothStep(5.0, start=3.0, rise=1.9)):
         held = jm.expected_spectrum(jm.Isometric(P_w=signal)).power
         np.testing.assert_allclose(held, jm.expected_spectrum(jm.Isometric()).power, rtol=1e-4)
-    with pytest.raises(OperatingPointError, match="at 0.5 s it is 0, at the end 5"):
+    with pytest.raises(OperatingPointError, match=r"at 0\.5 s it is 0, at the end 5"):
         jm.expected_spectrum(jm.Isometric(), window=(0.5, 10.5))
 
 

@@ -12,7 +12,7 @@ from jaxmuscle._common.arrays import as_arrays
 from jaxmuscle.model._noise import Realisation
 from jaxmuscle.response._linearised import LinearTask, linearised
 from jaxmuscle.simulation._batch import respond
-from jaxmuscle.simulation._integrator import Grid
+from jaxmuscle.simulation._grid import Grid
 
 KEY = jax.random.key(41)
 WINDOW = (5.0, 15.0)

@@ -9,7 +9,8 @@ import references
 
 import jaxmuscle as jm
 from jaxmuscle.model._noise import Realisation
-from jaxmuscle.simulation._integrator import Grid, observe, solve
+from jaxmuscle.simulation._grid import Grid
+from jaxmuscle.simulation._integrator import observe, solve
 
 KEY = jax.random.key(5)
 FINE, SECONDS, SEEDS = 2**14, 0.25, 400

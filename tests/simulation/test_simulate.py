@@ -15,7 +15,8 @@ from jaxmuscle._common.types import Scalar
 from jaxmuscle.model import Decay, RampHold, Sampled, SmoothStep
 from jaxmuscle.model._noise import Realisation
 from jaxmuscle.simulation._batch import draw
-from jaxmuscle.simulation._integrator import Grid, solve
+from jaxmuscle.simulation._grid import Grid
+from jaxmuscle.simulation._integrator import solve
 
 KEY = jax.random.key(11)
 HARMONIC = jm.Harmonic(0.1, 4.25, 0.3)

@@ -15,7 +15,7 @@ import scipy.signal
 import scipy.stats
 from hypothesis import given, settings
 
-from jaxmuscle.spectra._settings import SpectrumSettings
+from jaxmuscle.spectra._settings import SpectrumSettings, taper_of
 from jaxmuscle.spectra._welch import Spectrum, lowpass, periodogram, spectrum_of, welch
 
 ROUNDING = 1e-10  # float64: what the design promises; the transforms themselves are within 1e-13
@@ -179,6 +179,12 @@ def test_jit_and_vmap_change_nothing(x64):
 def test_whole_numbers_are_samples_too(x64):
     counts = np.arange(300) % 7
     np.testing.assert_array_equal(welch(counts, SpectrumSettings()), welch(counts.astype(float), SpectrumSettings()))
+
+
+@pytest.mark.parametrize("window", ["hann", "hamming", "boxcar"])
+@pytest.mark.parametrize("samples", [8, 255, 1000])
+def test_the_taper_is_scipys_to_the_last_bit(window, samples):
+    np.testing.assert_array_equal(taper_of(window, samples), scipy.signal.get_window(window, samples))
 
 
 def test_degrees_of_freedom_of_the_design():

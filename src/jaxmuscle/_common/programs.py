@@ -12,7 +12,7 @@ import threading
 import time
 import weakref
 from collections.abc import Callable, Iterator
-from importlib.metadata import version
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, NamedTuple, ParamSpec, TypeVar
 
@@ -27,7 +27,7 @@ from .files import replacing
 P = ParamSpec("P")
 R = TypeVar("R")
 # What a program may be made of: code whose version is part of the key. Another's class may change without a sign.
-OTHERS = ("jax", "jaxlib", "numpy", "equinox", "diffrax", "optimistix", "lineax", "jaxtyping")
+OTHERS = ("jax", "jaxlib", "numpy", "equinox", "diffrax", "optimistix", "lineax", "jaxtyping", "scipy", "blackjax")
 KNOWN = ("jaxmuscle", "builtins", "collections", *OTHERS)
 ADDRESS = re.compile(r" at 0x[0-9a-f]+")
 CONFIG = ("jax_enable_x64", "jax_numpy_dtype_promotion", "jax_default_matmul_precision", "jax_default_prng_impl",
@@ -209,11 +209,23 @@ def _told(structure: Any) -> str | None:
     if node is None:
         return "*"
     kind, data = node
-    name, text = f"{kind.__module__}.{kind.__qualname__}", repr(data)
-    if not _known(kind) or ADDRESS.search(text):
+    name, text = f"{kind.__module__}.{kind.__qualname__}", _text(data)
+    if not _known(kind) or text is None or ADDRESS.search(text):
         return None
     children = [_told(child) for child in structure.children()]
     return None if None in children else f"{name}|{text}({','.join(map(str, children))})"
+
+
+def _text(data: Any) -> str | None:
+    """As `repr`; but that of a module leaves out what *is* its default, which the same number read from a file is not."""
+    if isinstance(data, eqx.Module):
+        leaves, structure = jax.tree.flatten(data)
+        told = _told(structure)
+        return None if told is None else f"{told}{leaves}"
+    if isinstance(data, tuple):
+        parts = [_text(part) for part in data]
+        return None if None in parts else f"({','.join(map(str, parts))})"
+    return repr(data)
 
 
 @functools.cache
@@ -228,7 +240,14 @@ def _code() -> str:
 
 @functools.cache
 def _versions() -> tuple[str, ...]:
-    return tuple(version(name) for name in OTHERS)
+    return tuple(map(_version, OTHERS))
+
+
+def _version(name: str) -> str:
+    try:
+        return version(name)
+    except PackageNotFoundError:  # of an extra
+        return ""
 
 
 @functools.cache

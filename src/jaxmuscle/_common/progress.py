@@ -6,9 +6,10 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from rich.console import Console
+if TYPE_CHECKING:
+    from rich.console import Console
 
 LOG = logging.getLogger("jaxmuscle")
 EVERY = 10.0  # seconds between lines
@@ -30,13 +31,15 @@ def told(progress: bool | Tell, title: str) -> Iterator[Tell]:
     elif not progress or _quiet():
         yield nothing
     else:
+        from rich.console import Console
+
         screen = Console(stderr=True)
         with (_bar if screen.is_terminal or screen.is_jupyter else _lines)(title, screen) as tell:
             yield tell
 
 
 @contextlib.contextmanager
-def _bar(title: str, screen: Console) -> Iterator[Tell]:
+def _bar(title: str, screen: "Console") -> Iterator[Tell]:
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
     columns = (TextColumn("{task.fields[title]}"), BarColumn(), TextColumn("{task.description}"), TimeElapsedColumn())
@@ -46,7 +49,7 @@ def _bar(title: str, screen: Console) -> Iterator[Tell]:
 
 
 @contextlib.contextmanager
-def _lines(title: str, screen: Console) -> Iterator[Tell]:
+def _lines(title: str, screen: "Console") -> Iterator[Tell]:
     """A line every ten seconds, by a thread of its own."""
     state: dict[str, Any] = {"text": "starting", "share": 0.0}
     start, ended = time.monotonic(), threading.Event()

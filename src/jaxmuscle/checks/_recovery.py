@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import numpy as np
-import scipy.stats
+import scipy
 from jaxtyping import Float
 
 from jaxmuscle import plot

@@ -8,7 +8,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import numpy as np
-import scipy.signal
+import scipy
 from jaxtyping import Float
 
 from jaxmuscle import plot

@@ -6,7 +6,7 @@ from typing import Any
 
 import equinox as eqx
 import numpy as np
-import scipy.ndimage
+import scipy
 from jaxtyping import Bool, Float, Int
 
 from jaxmuscle.spectra._measures import Peaks

@@ -5,12 +5,12 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-import scipy.signal
 from jaxtyping import Float
 from scipy.linalg import block_diag
 from scipy.special import gammaincinv, ndtr
 
 from jaxmuscle._common.arrays import as_arrays
+from jaxmuscle._common.keys import fold_in
 from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.objective._consequences import Consequences, Expansion, consequences
 from jaxmuscle.objective._covariance import residual_covariance
@@ -140,7 +140,7 @@ def without_fitted(jacobian: Float[np.ndarray, "all fitted"]) -> Float[np.ndarra
 
 def generator_of(problem: FitProblem, number: int) -> np.random.Generator:
     """Random numbers of one purpose, by the key of the fit."""
-    return np.random.default_rng(np.asarray(jax.random.key_data(jax.random.fold_in(problem.key, number))))
+    return np.random.default_rng(np.asarray(jax.random.key_data(fold_in(problem.key, number))))
 
 
 def drawn_log_residuals(part: PartResiduals, generator: np.random.Generator, count: int) -> Float[np.ndarray, "rows bins"]:
@@ -210,7 +210,8 @@ def _gain(task: AbstractTask, frequency: Any) -> Float[np.ndarray, " lines"]:
     inside = np.linalg.solve(s[:, None, None] * np.eye(len(system.A)) - system.A, (system.B @ base)[:, None])[..., 0]
     reply = inside @ system.C + system.D @ base + s * (system.E @ base)
     if settings.sections is not None:
-        passed = scipy.signal.sosfreqz(settings.sections, worN=np.asarray(frequency), fs=settings.rate)[1]
+        back = np.exp(-s / settings.rate) ** np.arange(3)[:, None]
+        passed = np.prod((settings.sections[:, :3] @ back) / (settings.sections[:, 3:] @ back), axis=0)
         reply = reply * passed ** (2 if settings.filter_direction == "both" else 1)
     return np.abs(reply) ** 2
 

@@ -58,7 +58,7 @@ def controlled_moments(runs: Trajectory, target: Target) -> tuple[Moments, Momen
 
 def seen_best(objective: Residuals, minima: Minima) -> Expansion:
     """What the model gives at the best point."""
-    return expand(objective, np.asarray(objective.theta(minima.s))).row(minima.best)
+    return expand(objective, np.asarray(objective.theta(minima.s))[[minima.best]]).row(0)
 
 
 def linear_check(each: np.ndarray, expected: np.ndarray, statistics: BinStatistics) -> dict[str, float | int]:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import equinox as eqx
 import jax
 import numpy as np
-import scipy.stats
+import scipy
 from jaxtyping import PRNGKeyArray
 
 from jaxmuscle import plot

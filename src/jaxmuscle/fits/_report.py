@@ -7,6 +7,7 @@ import numpy as np
 
 from jaxmuscle._common.environment import versions
 from jaxmuscle._common.errors import SimulationError
+from jaxmuscle._common.keys import fold_in
 from jaxmuscle.ensembles._ensemble import ensemble
 from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.objective._arguments import Plan, base_of
@@ -148,7 +149,7 @@ class _Made(NamedTuple):
 def _simulated(problem: FitProblem, part: Part, task: AbstractTask, seeds: int) -> _Made:
     """Of fresh seeds of the nonlinear model."""
     still = settled(task) if problem.control else task
-    runs = ensemble(still, jax.random.fold_in(problem.key, 1), seeds=seeds)
+    runs = ensemble(still, fold_in(problem.key, 1), seeds=seeds)
     each, expected = controlled_moments(runs, part.target)
     each = each._replace(power=np.asarray(each.power)[:, part.chosen])
     start = round((runs.time[-1] - STRETCH) * runs.rate)

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxmuscle._common.errors import SimulationError
+from jaxmuscle._common.keys import fold_in
 from jaxmuscle.ensembles._ensemble import ensemble
 from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.objective._arguments import Plan
@@ -178,7 +179,7 @@ def _with_recombined(plan: Plan, objective: Residuals, found: Minima) -> Minima:
 def correction_at(problem: FitProblem, part: Part, task: AbstractTask) -> Moments | None:
     """Moments of the nonlinear model over those of the linear response; None if the task cannot be simulated."""
     try:
-        runs = ensemble(settled(task), jax.random.fold_in(problem.key, 2), seeds=problem.seeds)
+        runs = ensemble(settled(task), fold_in(problem.key, 2), seeds=problem.seeds)
     except (SimulationError, ValueError):
         return None  # the check on fresh seeds meets the same error and reports it
     each, expected = controlled_moments(runs, part.target)

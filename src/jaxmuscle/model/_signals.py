@@ -9,8 +9,8 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy
 from jaxtyping import Array, Float
-from scipy.interpolate import PPoly, make_interp_spline
 
 from jaxmuscle._common.arrays import require
 from jaxmuscle._common.types import Scalar
@@ -166,7 +166,7 @@ class Sampled(AbstractSignal):
             )
         if not (np.all(np.isfinite(times)) and np.all(np.isfinite(values)) and np.all(np.diff(times) > 0)):
             raise ValueError("times must increase and both times and values be finite")
-        pieces = PPoly.from_spline(make_interp_spline(times, values, k=5))
+        pieces = scipy.interpolate.PPoly.from_spline(scipy.interpolate.make_interp_spline(times, values, k=5))
         keep = np.diff(pieces.x) > 0
         breaks = np.append(pieces.x[:-1][keep], pieces.x[-1])
         return cls(breaks=breaks, coefficients=pieces.c[:, keep].T.copy())

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import PRNGKeyArray
 
 from jaxmuscle._common.arrays import as_numbers
+from jaxmuscle._common.keys import key_of
 from jaxmuscle._common.progress import Tell, nothing
 from jaxmuscle._common.text import choices
 from jaxmuscle.data._target import Target
@@ -128,7 +129,7 @@ def planned(task: AbstractTask, target: Target, options: FitOptions) -> Plan:
     coordinates = Coordinates.of({n: float(task[n]) for n in names}, bounds, {n: sd or 1.0 for n, sd in sds.items()})
     variation = target_variation(target) if options.coefficient_of_variation else None
     part = Part("", task, target, coordinates, tuple(range(len(names))), variation, options.mean_force)
-    key = jax.random.key(options.key) if isinstance(options.key, int) else options.key
+    key = key_of(options.key) if isinstance(options.key, int) else options.key
     problem = FitProblem((part,), coordinates, np.array([0.0 if sds[n] is None else 1.0 for n in names]), options.residual,
                          options.method, options.dt, key, counts["seeds"], control, options.progress)  # fmt: skip
     settings = {

@@ -82,6 +82,7 @@ def unit_of(name: str, output: str = "") -> str:
 
 
 BATCH = 32
+POINTS, EACH = 128, 8
 
 
 class Expansion(NamedTuple):
@@ -190,6 +191,19 @@ def _moments_and_slopes(part: Any, theta: Float[Array | np.ndarray, "points free
     return jax.vmap(one)(theta)
 
 
+@kept
+def _of_rows(part: Any, theta: Float[Array | np.ndarray, "points free"], count: Any) -> tuple[Any, Any]:
+    """Moments and slopes of the first `count` points, `EACH` at a time; zeros for the others, which so take no time."""
+
+    def some(i: Any, found: Any) -> Any:
+        new = _moments_and_slopes(part, jax.lax.dynamic_slice_in_dim(theta, i * EACH, EACH))
+        return jax.tree.map(lambda all, new: jax.lax.dynamic_update_slice_in_dim(all, new, i * EACH, 0), found, new)
+
+    one = jax.eval_shape(_moments_and_slopes, part, theta[:EACH])
+    nothing = jax.tree.map(lambda x: jnp.zeros((len(theta), *x.shape[1:]), x.dtype), one)
+    return jax.lax.fori_loop(0, (count + EACH - 1) // EACH, some, nothing)
+
+
 def expand(objective: Any, theta: Float[np.ndarray, "points free"]) -> Expansion:
     """The moments of every part and their slopes at every θ, as numbers.
 
@@ -203,18 +217,18 @@ def expand(objective: Any, theta: Float[np.ndarray, "points free"]) -> Expansion
 def _expanded(part: Any, theta: Float[np.ndarray, "points own"]) -> tuple[Any, Any]:
     """Moments of one part and their slopes.
 
-    A linear response is computed for `BATCH` points at a time and with slopes also for what a fit usually leaves free, so
-    that one compiled program serves any number of points and nearly any choice of free parameters; a Monte Carlo
+    A linear response is computed for at most `POINTS` points at a time and with slopes also for what a fit usually leaves
+    free, so that one compiled program serves any number of points and nearly any choice of free parameters; a Monte Carlo
     simulation for all points together, with the slopes that are asked for.
     """
     if not isinstance(part.model, Linear):
         return jax.tree.map(np.asarray, _moments_and_slopes(part, theta))
     count, wide = len(theta), _with_the_usual(part.coordinates, part.task)
     own = np.array([wide.names.index(name) for name in part.coordinates.names], dtype=int)
-    padded = np.zeros((-(-count // BATCH) * BATCH, len(wide.names)))
+    padded = np.zeros((-(-count // POINTS) * POINTS, len(wide.names)))
     padded[:, own] = np.concatenate([theta, np.broadcast_to(theta[-1], (len(padded) - count, len(own)))])
     response = _Response(part.model, part.task, wide)
-    parts = [_moments_and_slopes(response, batch) for batch in np.split(padded, len(padded) // BATCH)]
+    parts = [_of_rows(response, padded[i : i + POINTS], np.asarray(min(count - i, POINTS))) for i in range(0, count, POINTS)]
     moments, slopes = jax.tree.map(lambda *x: np.concatenate(x)[:count], *parts)
     return moments, jax.tree.map(lambda slope: slope[..., own], slopes)
 

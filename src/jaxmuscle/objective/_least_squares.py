@@ -6,7 +6,6 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import numpy as np
-import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxmuscle._common.programs import kept
@@ -40,20 +39,22 @@ def _residuals(s: Float[Array, " free"], given: tuple[Any, Any, Expansion]) -> t
     return objective.residuals(theta, seen.near(theta), data), None
 
 
-SOLVER = optx.LevenbergMarquardt(rtol=1e-9, atol=1e-9)
+def _solver() -> Any:
+    import optimistix as optx  # only here, since a program that is loaded does without
+
+    return optx.LevenbergMarquardt(rtol=1e-9, atol=1e-9)
 
 
 def _initial(objective, data, s, seen):
     given = (objective, data, seen)
     shape = jax.eval_shape(lambda s: _residuals(s, given)[0], s)
-    return SOLVER.init(_residuals, s, given, {}, shape, None, frozenset())
+    return _solver().init(_residuals, s, given, {}, shape, None, frozenset())
 
 
-# The solver's state holds functions, which no file can keep: only its arrays go from program to program.
 @kept
 def _start(objective, data, starts, seen):
     def one(data, s, seen):
-        return eqx.filter(_initial(objective, data, s, seen), eqx.is_array)
+        return _arrays(_initial(objective, data, s, seen))
 
     return eqx.filter_vmap(one)(data, starts, seen)
 
@@ -61,12 +62,17 @@ def _start(objective, data, starts, seen):
 @kept
 def _step(objective, data, s, state, seen):
     def one(data, s, state, seen):
-        functions = eqx.filter(eqx.filter_eval_shape(_initial, objective, data, s, seen), _is_shape, inverse=True)
-        state = eqx.combine(state, functions)
-        s, state, _ = SOLVER.step(_residuals, s, (objective, data, seen), {}, state, frozenset())
-        return s, eqx.filter(state, eqx.is_array), 0.5 * (state.f_info.residual**2).sum(), state.num_accepted_steps
+        shapes, functions = eqx.partition(eqx.filter_eval_shape(_initial, objective, data, s, seen), _is_shape)
+        state = eqx.combine(jax.tree.unflatten(jax.tree.structure(shapes), state), functions)
+        s, state, _ = _solver().step(_residuals, s, (objective, data, seen), {}, state, frozenset())
+        return s, _arrays(state), state.y_eval, 0.5 * (state.f_info.residual**2).sum(), state.num_accepted_steps
 
     return eqx.filter_vmap(one)(data, s, state, seen)
+
+
+def _arrays(state):
+    """The arrays of a solver's state, all that goes from program to program: no file can keep its functions."""
+    return jax.tree.leaves(eqx.filter(state, eqx.is_array))
 
 
 def _is_shape(leaf):
@@ -146,8 +152,8 @@ def least_squares(
             state = _start(objective, data, now.s, seen)
         else:
             seen = jax.tree.map(lambda old, x, rows=rows: _put(old, rows, x), seen, new)
-        s, state, cost, accepted = _step(objective, data, now.s, state, seen)
-        now = now.advanced(*map(np.asarray, (s, state.y_eval, cost, accepted)))
+        s, state, ahead, cost, accepted = _step(objective, data, now.s, state, seen)
+        now = now.advanced(*map(np.asarray, (s, ahead, cost, accepted)))
         report(now.minima(count))
         if not np.any(now.active):
             break

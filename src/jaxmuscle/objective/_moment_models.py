@@ -6,7 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy.signal
+import scipy
 from jaxtyping import Array, Float, Int
 
 from jaxmuscle.model._noise import Realisation
@@ -15,7 +15,7 @@ from jaxmuscle.response._equilibrium import slowest, slowest_rate
 from jaxmuscle.response._expected import Moments, expected_moments, response
 from jaxmuscle.response._linearised import LinearTask, settled
 from jaxmuscle.simulation._batch import respond
-from jaxmuscle.simulation._integrator import Grid
+from jaxmuscle.simulation._grid import Grid
 from jaxmuscle.spectra._settings import SpectrumSettings, samples_in
 from jaxmuscle.spectra._welch import lowpass
 

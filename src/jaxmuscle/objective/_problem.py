@@ -10,14 +10,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from jaxmuscle._common.arrays import as_arrays, as_numbers, is_concrete
+from jaxmuscle._common.arrays import all_concrete, as_arrays, as_numbers, is_concrete
 from jaxmuscle.data._target import Target
 from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.response._equilibrium import fastest_rate
 from jaxmuscle.response._expected import Moments, log_variation_sd
 from jaxmuscle.response._linearised import has_response
 from jaxmuscle.simulation._batch import draw
-from jaxmuscle.simulation._integrator import Grid
+from jaxmuscle.simulation._grid import Grid
 from jaxmuscle.simulation._simulate import DURATION, MAX_RATE_STEP, whole
 from jaxmuscle.spectra._bin_law import bin_statistics, samples_of, trial_samples
 from jaxmuscle.spectra._settings import WINDOW
@@ -45,9 +45,10 @@ def target_variation(target: Target, task: AbstractTask | None = None) -> tuple[
     if task is not None and target.segments is not None:
         settings, counts, arrays = target.settings, target.segments, as_arrays(task)
         each = {k: log_variation_sd(arrays, settings, samples_of(k, settings)) for k in set(counts)}
+        each = as_numbers(each) if all_concrete(each) else each
         sd = sum(each[k] ** 2 for k in counts) ** 0.5 / len(counts)
     if len(logs) > 1:
-        sd = jnp.maximum(sd, logs.std(ddof=1) / np.sqrt(len(logs)))
+        sd = (np if is_concrete(sd) else jnp).maximum(sd, logs.std(ddof=1) / np.sqrt(len(logs)))
     return float(logs.mean()), float(sd) if is_concrete(sd) else sd
 
 

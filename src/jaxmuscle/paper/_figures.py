@@ -5,7 +5,7 @@ from pathlib import Path
 
 import matplotlib.pyplot as plt
 import numpy as np
-import scipy.signal
+import scipy
 from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure

@@ -3,7 +3,6 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optimistix as optx
 from jaxtyping import Array, Float
 
 from jaxmuscle._common.arrays import as_arrays
@@ -21,6 +20,8 @@ def equilibrium(task: AbstractTask, time: float = HOLD) -> Float[Array, " states
 
     Not finite where there is none: `operating_point` turns that into an error.
     """
+    import optimistix as optx  # only here, since a program that is loaded does without
+
     task = as_arrays(task)
     dtype = jnp.result_type(float)
     tolerance = 1e-12 if dtype == jnp.float64 else 1e-6

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy.signal
+import scipy
 from jaxtyping import Array, Float, Int
 
 from jaxmuscle._common.arrays import as_arrays
@@ -237,7 +237,7 @@ def expected_moments(
 ) -> tuple[Moments, Linearisation]:
     """`response`, compiled once for all numbers of samples."""
     samples = samples_in(window, settings) if samples is None else samples
-    return _compiled_response(as_arrays(task), settings, window, jnp.asarray(samples))
+    return _compiled_response(as_arrays(task), settings, window, as_arrays(samples, int))
 
 
 @kept

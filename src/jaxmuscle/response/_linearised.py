@@ -83,10 +83,20 @@ def settled(task: AbstractTask, time: float = HOLD) -> AbstractTask:
     """
     traced = not all(is_concrete(leaf) for leaf in jax.tree.leaves(task))
     point = equilibrium(task, time) if traced else np.asarray(linearised(task, time).system.point).tolist()
-    held = {field.name: Constant(getattr(task, field.name)(jnp.asarray(time))) for field in dataclasses.fields(task)
-            if isinstance(getattr(task, field.name), AbstractSignal)}  # fmt: skip
+    held = {name: Constant(level) for name, level in _inputs(as_arrays(task), time).items()}
     found = task.with_parts(**held, initial=tuple(point))
     return found if traced else as_numbers(found)
+
+
+@kept
+def _inputs(task: AbstractTask, time: float) -> dict[str, Scalar]:
+    """Value at `time` of every input that is a function of time."""
+    return {name: signal(jnp.asarray(time)) for name, signal in _signals(task).items()}
+
+
+def _signals(task: AbstractTask) -> dict[str, AbstractSignal]:
+    found = {field.name: getattr(task, field.name) for field in dataclasses.fields(task)}
+    return {name: value for name, value in found.items() if isinstance(value, AbstractSignal)}
 
 
 @kept
@@ -124,15 +134,10 @@ LOOKS = 33
 
 
 @kept
-def _inputs(task: AbstractTask, window: tuple[float, float]) -> dict[str, Array]:
+def _looked_at(task: AbstractTask, window: tuple[float, float]) -> dict[str, Array]:
     """Every input at times across the window, then its held value."""
     times = jnp.append(jnp.linspace(*window, LOOKS), HOLD)
     return {name: jax.vmap(signal)(times) for name, signal in _signals(task).items()}
-
-
-def _signals(task: AbstractTask) -> dict[str, AbstractSignal]:
-    found = {field.name: getattr(task, field.name) for field in dataclasses.fields(task)}
-    return {name: value for name, value in found.items() if isinstance(value, AbstractSignal)}
 
 
 def check_inputs(task: AbstractTask, window: tuple[float, float] = WINDOW) -> None:
@@ -140,7 +145,7 @@ def check_inputs(task: AbstractTask, window: tuple[float, float] = WINDOW) -> No
     if all(isinstance(signal, Constant) for signal in _signals(task).values()):
         return
     with jax.ensure_compile_time_eval(), jax.enable_x64(True):
-        seen = {name: np.asarray(values) for name, values in _inputs(as_arrays(task), window).items()}
+        seen = {name: np.asarray(values) for name, values in _looked_at(as_arrays(task), window).items()}
     for name, values in seen.items():
         off = np.abs(values[:-1] - values[-1])
         if np.max(off) > MOVING * np.max(np.abs(values)):

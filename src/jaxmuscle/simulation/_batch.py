@@ -18,7 +18,7 @@ from jaxmuscle.spectra._measures import coefficient_of_variation
 from jaxmuscle.spectra._settings import SpectrumSettings
 from jaxmuscle.spectra._welch import lowpass, welch
 
-from ._integrator import Grid, observe, solve
+from ._grid import Grid
 
 DRAWN = 8
 LANES = 1024
@@ -58,6 +58,8 @@ def _drawn(noise: AbstractNoise, key: PRNGKeyArray, seeds: Int[Array, " seeds"],
 
 def respond(task: AbstractTask, path: Realisation, grid: Grid, sampling: str) -> tuple[Array, Array]:
     """States (samples, states) and sampled output (samples) of one noise path."""
+    from ._integrator import observe, solve  # and diffrax, which a program that is loaded does without
+
     if sampling == "instant":
         states = solve(task, path, grid)
         return states, observe(task, path, grid, states)

@@ -10,6 +10,7 @@ from jaxtyping import Array, Int, PRNGKeyArray
 
 from jaxmuscle._common.arrays import all_concrete, as_arrays, as_numbers
 from jaxmuscle._common.errors import OperatingPointError, SimulationError
+from jaxmuscle._common.programs import kept
 from jaxmuscle._common.text import listed
 from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.response._equilibrium import fastest_rate
@@ -17,7 +18,7 @@ from jaxmuscle.response._linearised import LinearTask, check_equilibrium, check_
 from jaxmuscle.spectra._settings import WINDOW
 
 from ._batch import Recipe, run_seeds
-from ._integrator import Grid
+from ._grid import Grid
 from ._trajectory import Trajectory, one
 
 MAX_RATE_STEP = 0.5
@@ -68,7 +69,7 @@ def companion(task: AbstractTask, duration: float, *, required: bool) -> LinearT
             if required:
                 raise
             return None
-        moved = np.abs(np.asarray(as_arrays(task).initial_state()) - np.asarray(linear.system.point))
+        moved = np.abs(np.asarray(_start(as_arrays(task))) - np.asarray(linear.system.point))
     # A task that starts settled has nothing to forget.
     left = math.exp(-slowest * WINDOW[0]) if np.max(moved) > 1e-9 else 0.0
     if duration < WINDOW[1] or left > TRANSIENT:
@@ -79,6 +80,11 @@ def companion(task: AbstractTask, duration: float, *, required: bool) -> LinearT
             )
         return None
     return linear
+
+
+@kept
+def _start(task: AbstractTask) -> Array:
+    return task.initial_state()
 
 
 class Schedule(NamedTuple):

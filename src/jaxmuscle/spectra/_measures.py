@@ -6,9 +6,8 @@ import equinox as eqx
 import jax.core
 import jax.numpy as jnp
 import numpy as np
-import scipy.stats
+import scipy
 from jaxtyping import Array, Float, Real
-from scipy.spatial import KDTree
 
 from ._settings import require
 from ._welch import Spectrum, floating
@@ -70,7 +69,7 @@ def _templates(x: Float[np.ndarray, " times"], m: int) -> Float[np.ndarray, "tem
 def _matches(templates: Float[np.ndarray, "templates m"], radius: float) -> np.ndarray:
     """For each template how many lie within `radius` of it in the maximum norm, itself included."""
     # Counting without listing the neighbours: memory grows with the number of samples, not its square.
-    return KDTree(templates).query_ball_point(templates, radius, p=np.inf, return_length=True)
+    return scipy.spatial.KDTree(templates).query_ball_point(templates, radius, p=np.inf, return_length=True)
 
 
 def approximate_entropy(signal: Real[Array | np.ndarray, "..."], m: int = 2, tolerance: float = 0.2) -> float:

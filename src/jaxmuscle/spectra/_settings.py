@@ -9,7 +9,7 @@ from typing import Any, Literal, get_args
 
 import equinox as eqx
 import numpy as np
-import scipy.signal
+import scipy
 from jaxtyping import Float
 
 Window = Literal["hann", "hamming", "boxcar"]
@@ -17,6 +17,15 @@ Detrend = Literal["constant", "linear", "none"]
 FilterDirection = Literal["forward", "both"]
 Sampling = Literal["instant", "average"]
 _CHOICES = {"window": Window, "detrend": Detrend, "filter_direction": FilterDirection, "sampling": Sampling}
+
+
+COSINES: dict[Window, float] = {"hann": 0.5, "hamming": 0.54, "boxcar": 1.0}
+
+
+def taper_of(window: Window, samples: int) -> Float[np.ndarray, " samples"]:
+    """`a + (1 - a) cos x`, x from -π to π in so many steps: that of `scipy.signal`, which takes long to import."""
+    a = COSINES[window]
+    return a + (1 - a) * np.cos(np.linspace(-np.pi, np.pi, samples + 1)[:-1])
 
 
 def _python(value: Any) -> Any:
@@ -108,7 +117,7 @@ class SpectrumSettings(eqx.Module):
     @property
     def taper(self) -> Float[np.ndarray, " length"]:
         """The window's values, one per sample of a segment."""
-        return np.asarray(scipy.signal.get_window(self.window, self.length))
+        return taper_of(self.window, self.length)
 
     @property
     def sections(self) -> Float[np.ndarray, "sections 6"] | None:

@@ -6,13 +6,13 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy.signal
+import scipy
 from jaxtyping import Array, Float, Real
 
 from jaxmuscle import plot
 from jaxmuscle._common.programs import kept
 
-from ._settings import SpectrumSettings, require
+from ._settings import SpectrumSettings, require, taper_of
 
 
 class Spectrum(eqx.Module):
@@ -78,13 +78,14 @@ def lowpass(signal: Real[Array | np.ndarray, "*batch times"], settings: Spectrum
 
     **Raises:** `ValueError` if the signal is too short for the extension that `"both"` needs.
     """
-    signal = floating(signal)
-    return signal if settings.sections is None else _lowpass(signal, settings)
+    if settings.filter_cutoff is None:
+        return floating(signal)
+    return _lowpass(signal if isinstance(signal, jax.Array) else np.asarray(signal), settings)
 
 
 @kept
-def _lowpass(signal: Float[Array, "*batch times"], settings: SpectrumSettings) -> Float[Array, "*batch times"]:
-    sections = settings.sections
+def _lowpass(signal: Real[Array | np.ndarray, "*batch times"], settings: SpectrumSettings) -> Float[Array, "*batch times"]:
+    signal, sections = floating(signal), settings.sections
     assert sections is not None
     if settings.filter_direction == "both":
         return _forward_and_backward(signal, sections)
@@ -122,7 +123,7 @@ def _density(segments: Float[Array, "*batch length"], settings: SpectrumSettings
         line = np.arange(samples) - (samples - 1) / 2
         line = jnp.asarray(line / np.linalg.norm(line), dtype)
         segments = segments - jnp.sum(segments * line, axis=-1, keepdims=True) * line
-    taper = scipy.signal.get_window(settings.window, samples)
+    taper = taper_of(settings.window, samples)
     taper = jnp.asarray(taper / np.sqrt(settings.rate * np.sum(taper**2)), dtype)
     transform = jnp.fft.rfft(segments * taper)
     sides = np.full(transform.shape[-1], 2.0)

@@ -32,17 +32,24 @@ class Chains(NamedTuple):
 
 
 class _State(NamedTuple):
+    """Of every chain position, log density and its gradient; and how far the step size is adapted.
+
+    The fields of blackjax's own states without their classes, so that a program is kept, and loaded without blackjax.
+    """
+
     chains: Any
     adaptation: Any
 
 
-def _tools() -> tuple[Any, Any]:
+def _tools() -> tuple[Any, Any, Any, Any]:
+    """NUTS and the class of its states, dual averaging and the class of its states."""
     try:
         import blackjax
-        from blackjax.adaptation.step_size import dual_averaging_adaptation
+        from blackjax.adaptation.step_size import DualAveragingAdaptationState, dual_averaging_adaptation
+        from blackjax.mcmc.hmc import HMCState
     except ImportError as error:
         raise ImportError("posterior needs blackjax and arviz-stats: pip install 'jaxmuscle[posterior]'") from error
-    return blackjax.nuts, dual_averaging_adaptation(TARGET_ACCEPTANCE)
+    return blackjax.nuts, HMCState, dual_averaging_adaptation(TARGET_ACCEPTANCE), DualAveragingAdaptationState
 
 
 def _strong(tree: Any) -> Any:
@@ -52,16 +59,17 @@ def _strong(tree: Any) -> Any:
 
 @kept
 def _first(density: Density, positions: Array) -> Any:
-    nuts, (start, _, _) = _tools()
-    made = _State(jax.vmap(lambda x: nuts.init(x, density.log_density))(positions), start(jnp.asarray(0.5)))
-    return _strong(made)
+    nuts, _, (start, _, _), _ = _tools()
+    chains = jax.vmap(lambda x: nuts.init(x, density.log_density))(positions)
+    return _strong(_State(tuple(chains), tuple(start(jnp.asarray(0.5)))))
 
 
 @kept
 def _block(density: Density, key: Array, state: Any, adapting: Array) -> tuple[Any, Any]:
     """`BLOCK` draws of every chain; while `adapting` the step size follows the mean acceptance of all chains."""
-    nuts, (_, update, final) = _tools()
+    nuts, chain_state, (_, update, final), step_state = _tools()
     kernel = nuts.build_kernel()
+    state = _State(chain_state(*state.chains), step_state(*state.adaptation))
     settled = final(state.adaptation)
 
     def one(state, key):
@@ -77,7 +85,7 @@ def _block(density: Density, key: Array, state: Any, adapting: Array) -> tuple[A
         return _State(chains, adaptation), (*made, size)
 
     state, made = jax.lax.scan(one, state, jax.random.split(key, BLOCK))
-    return _strong(state), made
+    return _strong(_State(tuple(state.chains), tuple(state.adaptation))), made
 
 
 def _learnt(density: Density, white: np.ndarray) -> Density:
@@ -126,7 +134,7 @@ def _sample(
         elif number + 1 in renewals:
             recent.append(white)
             new = _learnt(density, np.concatenate(recent[-2:]).reshape(-1, white.shape[-1]))
-            state = _first(new, jnp.asarray(_moved(density, new, state.chains.position)))
+            state = _first(new, jnp.asarray(_moved(density, new, state.chains[0])))
             density, recent = new, []
         else:
             recent.append(white)
@@ -141,7 +149,7 @@ def _dispersed(density: Density, key: Array, chains: int) -> Array:
     """Starts about the maximum, wider than the posterior; nearer where the density is not finite."""
     away = SPREAD * jax.random.normal(key, (chains, density.size))
     for _ in range(6):
-        height = _first(density, away).chains.logdensity
+        _, height, _ = _first(density, away).chains
         if bool(jnp.all(jnp.isfinite(height))):
             return away
         away = jnp.where(jnp.isfinite(height)[:, None], away, 0.5 * away)
