@@ -51,14 +51,21 @@ class Adequacy(NamedTuple):
         return 1.0 if self.adequate else max(1.0, float(np.sqrt(self.chi2 / self.expected)))
 
 
-class _Lines(NamedTuple):
-    """What the residuals lose if the fitted line is replaced by another one, what that costs by the prior, and which
-    coordinates it uses."""
+class _Refit(NamedTuple):
+    """What a refit leaves of residuals: data rows, then those of the prior.
 
-    change: Float[np.ndarray, "lines residuals"]
+    `left` removes what the fitted directions take up. `change`, so reduced, is what residuals lose if another line takes the
+    place of the fitted one (the last row: that itself, which changes nothing), at the `penalty` of the frequency's prior;
+    `frequency` of each, and which coordinates, amplitude and frequency, that uses: none where no line is sought. `prior` are
+    the prior's rows at the fit.
+    """
+
+    left: Float[np.ndarray, "all all"]
+    change: Float[np.ndarray, "lines all"]
     penalty: Float[np.ndarray, " lines"]
-    frequency: Float[np.ndarray, " grid"]
-    used: list[int]
+    prior: Float[np.ndarray, " rows"]
+    frequency: Float[np.ndarray, " lines"]
+    used: tuple[int, ...]
 
 
 def adequacy(
@@ -73,23 +80,18 @@ def adequacy(
     """
     if not all(part.statistics.known for part in objective.parts):
         return None
-    generator = generator_of(problem, 5)
-    count, prior = len(found.residuals), problem.prior
-    lines = _lines(problem, objective, seen)
-    kept = np.delete(np.arange(len(prior)), lines.used)
-    pull = np.diag(np.sqrt(prior[kept]))
-    left = without_fitted(np.concatenate([found.jacobian[:, kept], pull]))
-    change = np.concatenate([lines.change, np.zeros((len(lines.change), len(kept)))], axis=1) @ left
+    generator, refit = generator_of(problem, 5), _refit(problem, objective, seen, found)
+    count, rows = len(found.residuals), len(refit.prior)
     chi2 = np.empty(0)
-    drawn = np.concatenate([_drawn(objective, scatter, generator), generator.normal(size=(REPLICATES, len(kept)))], axis=1)
+    drawn = np.concatenate([_drawn(objective, scatter, generator), generator.normal(size=(REPLICATES, rows))], axis=1)
     for some in np.split(drawn, np.arange(CHUNK, REPLICATES, CHUNK)):
-        rest = some @ left
-        cost = np.sum(change**2, axis=1) + lines.penalty - 2 * rest @ change.T
-        rest -= change[np.argmin(cost, axis=1)]
+        rest = some @ refit.left
+        cost = np.sum(refit.change**2, axis=1) + refit.penalty - 2 * rest @ refit.change.T
+        rest -= refit.change[np.argmin(cost, axis=1)]
         chi2 = np.append(chi2, np.sum(rest[:, :count] ** 2, axis=1))
     here = float(np.sum(found.residuals**2))
     p = (1 + np.sum(chi2 >= here)) / (1 + REPLICATES)
-    inner = left[:count, :count] @ scatter @ left[:count, :count]
+    inner = refit.left[:count, :count] @ scatter @ refit.left[:count, :count]
     return Adequacy(here, float(np.mean(chi2)), float(p), _misfit(problem, objective, found.residuals, inner))
 
 
@@ -111,22 +113,19 @@ def elsewhere(problem: FitProblem, objective: Residuals, seen: Expansion, found:
     The lines of `adequacy`'s grid, all else refitted to first order, against the fitted one by its curvature; `sizes` is the
     covariance of the estimates, larger than the inverse curvature since neighbouring bins correlate: costs count for less.
     """
-    lines = _lines(problem, objective, seen)
-    if not lines.used:
+    refit = _refit(problem, objective, seen, found)
+    if not refit.used:
         return 0.0
-    (a, f), prior = lines.used, problem.prior
-    kept = np.delete(np.arange(len(prior)), lines.used)
-    left = without_fitted(np.concatenate([found.jacobian[:, kept], np.diag(np.sqrt(prior[kept]))]))
-    change = np.concatenate([lines.change, np.zeros((len(lines.change), len(kept)))], axis=1)[:-1] @ left
-    residual = np.concatenate([found.residuals, np.sqrt(prior[kept]) * seen.theta[kept]])
-    gain = np.linalg.pinv(found.jacobian.T @ found.jacobian + np.diag(prior), hermitian=True)
+    (a, f), sd = refit.used, problem.coordinates.sd
+    residual = np.concatenate([found.residuals, refit.prior])
+    gain = np.linalg.pinv(found.jacobian.T @ found.jacobian + np.diag(problem.prior), hermitian=True)
     dull = max(1.0, float(sizes[f, f] / gain[f, f]))
-    cost = (np.sum(change**2, axis=1) - 2 * change @ residual) / dull + lines.penalty[:-1]
-    frequency, sd = lines.frequency, problem.coordinates.sd
-    apart = np.abs(frequency - float(problem.parts[0].task_at(seen.theta)["harmonic_frequency"]))
-    cell = np.gradient(frequency[:LINES]) / frequency[:LINES] / sd[f] * 0.5 * np.log(STRENGTHS[1] / STRENGTHS[0]) / sd[a]
+    cost = (np.sum(refit.change**2, axis=1) - 2 * refit.change @ residual) / dull + refit.penalty
+    apart = np.abs(refit.frequency - refit.frequency[-1])
     weight = np.where(apart >= problem.parts[0].target.settings.resolution, np.exp(-0.5 * np.clip(cost, -700, 700)), 0.0)
-    there = float(np.sum(weight.reshape(-1, LINES) * cell))
+    grid = refit.frequency[:LINES]
+    cell = np.gradient(grid) / grid / sd[f] * 0.5 * np.log(STRENGTHS[1] / STRENGTHS[0]) / sd[a]
+    there = float(np.sum(weight[:-1].reshape(-1, LINES) * cell))
     here = 2 * np.pi * np.sqrt(max(np.linalg.det(sizes[np.ix_([a, f], [a, f])]), 1e-300))
     return there / (there + here)
 
@@ -170,36 +169,42 @@ def _rows_of(part: PartResiduals) -> int:
     return bins + (part.data.variation is not None) + (part.data.mean is not None)
 
 
-def _lines(problem: FitProblem, objective: Residuals, seen: Expansion) -> _Lines:
+def _refit(problem: FitProblem, objective: Residuals, seen: Expansion, found: Consequences) -> _Refit:
     """Lines of every frequency and strength in place of the fitted one, where a fit would have found them."""
-    names = problem.coordinates.names
-    free = [names.index(n) for n in HARMONIC if n in names]
-    none = _Lines(np.zeros((1, sum(map(_rows_of, objective.parts)))), np.zeros(1), np.zeros(0), [])
-    if len(problem.parts) != 1 or len(objective.parts) != 1 or len(free) < 2 or problem.residual != "log":
-        return none
-    part, own, moments = problem.parts[0], objective.parts[0], seen.moments[0]
+    names, prior = problem.coordinates.names, np.sqrt(problem.prior)
+    free = tuple(names.index(n) for n in HARMONIC if n in names)
+    moments, own = seen.moments[0], objective.parts[0]
     power, line = np.asarray(moments.power), np.asarray(moments.line)
-    if not (np.all(power > line) and np.any(line > 0)):
-        return none
+    alone = len(problem.parts) == 1 and len(free) == 2 and problem.residual == "log"
+    if not (alone and np.all(power > line) and np.any(line > 0)):
+        left = without_fitted(np.concatenate([found.jacobian, np.diag(prior)]))
+        return _Refit(left, np.zeros((1, len(left))), np.zeros(1), prior * seen.theta, np.zeros(1), ())
+    part, (a, f), sd = problem.parts[0], free, problem.coordinates.sd
     frequency, each, square = line_grid(part, power - line)
-    # Last the fitted line itself, which changes nothing.
-    ratio = np.concatenate([(power - line + square[:, None] * each) / power, np.ones((1, len(line)))])
-    change = np.zeros((len(ratio), _rows_of(own)))
-    logs = np.log(ratio)
-    change[:, : len(line)] = (logs - logs.mean(axis=1, keepdims=True)) / np.asarray(own.data.sd)
     task = part.task_at(seen.theta)
     here = float(task["harmonic_frequency"])
     held = float(np.sum(line) / np.sum(line_spectra(part, np.array([here]))))
+    frequency, square = np.append(frequency, here), np.append(square, held)
+    ratio = np.concatenate([(power - line + square[:-1, None] * each) / power, np.ones((1, len(line)))])
+    kept = np.delete(np.arange(len(names)), free)
+    count, bins = len(found.residuals), len(line)
+    change = np.zeros((len(ratio), count + len(kept) + 1))
+    logs = np.log(ratio)
+    change[:, :bins] = (logs - logs.mean(axis=1, keepdims=True)) / np.asarray(own.data.sd)
     if own.data.variation is not None:
-        variance = 1 + (np.append(square, held) - held) / float(moments.variance)
-        change[:, len(line)] = -0.5 * np.log(np.maximum(variance, 1e-6)) / float(own.data.variation[1])
-    # The prior of amplitude and frequency; of two lines of one frequency the mean square goes with the squared amplitude.
-    louder = np.log(np.append(square, held) / held) - np.log(_gain(task, np.append(frequency, here)) / _gain(task, [here]))
-    higher = np.log(np.append(frequency, here) / here)
-    moved = 0.5 * louder / problem.coordinates.sd[free[0]], higher / problem.coordinates.sd[free[1]]
-    theta = [seen.theta[i] + step for i, step in zip(free, moved, strict=True)]
-    penalty = sum(problem.prior[i] * (t**2 - seen.theta[i] ** 2) for i, t in zip(free, theta, strict=True))
-    return _Lines(change, np.asarray(penalty), frequency, free)
+        variance = 1 + (square - held) / float(moments.variance)
+        change[:, bins] = -0.5 * np.log(np.maximum(variance, 1e-6)) / float(own.data.variation[1])
+    # Of two lines of one frequency the mean square goes with the squared amplitude.
+    louder = 0.5 * (np.log(square / held) - np.log(_gain(task, frequency) / _gain(task, [here]))) / sd[a]
+    change[:, -1] = -prior[a] * louder
+    # With a line's level held, the amplitude follows what the other parameters do to that level.
+    level = 0.5 * np.sum(seen.slopes[0].line, axis=0)[kept] / np.sum(line) / sd[a]
+    data = found.jacobian[:, kept] - np.outer(found.jacobian[:, a], level)
+    jacobian = np.concatenate([data, np.diag(prior[kept]), -prior[a] * level[None]])
+    theta = seen.theta[f] + np.log(frequency / here) / sd[f]
+    left = without_fitted(jacobian)
+    return _Refit(left, change @ left, problem.prior[f] * (theta**2 - seen.theta[f] ** 2),
+                  np.append(prior[kept] * seen.theta[kept], prior[a] * seen.theta[a]), frequency, free)  # fmt: skip
 
 
 def _gain(task: AbstractTask, frequency: Any) -> Float[np.ndarray, " lines"]:
