@@ -131,7 +131,7 @@ def second_order(task: AbstractTask, settings: SpectrumSettings | None = None) -
 
     by Isserlis' theorem, R the autocovariance of x. The cross term of first and third order, of the same size, is left out,
     and the harmonic counts as a narrow resonance, which doubles its overtone: an indicator, good to a factor of two or so
-    (docs/linear-response.md has it beside simulations). White noise counts as its samples do.
+    (docs/model.md has it beside simulations). White noise counts as its samples do.
 
     **Returns:** a `SecondOrder`. **Raises:** as `expected_spectrum` does.
     """
