@@ -21,7 +21,7 @@ TRUTH = jm.Isometric().replace(harmonic_frequency=6.0, harmonic_amplitude=0.012)
 ELSEWHERE = {"docs/digitise.md": "data/test_digitised.py", "docs/own-muscle.md": "whole/test_hill.py"}
 BELOW = {"docs/gallery.md"}  # its program is read instead
 RUN_HERE = {
-    "README.md", "docs/coming-from-diffrax.md", "docs/coming-from-matlab.md", "docs/ensembles.md", "docs/fit-a-csv.md",
+    "README.md", "docs/coming-from-diffrax.md", "docs/coming-from-matlab.md", "docs/ensembles.md", "docs/fit-a-csv.md", "docs/fitting.md",
     "docs/identifiability.md", "docs/index.md", "docs/recordings.md", "docs/reference/figures.md", "docs/scaling.md",
     "docs/tutorial.md", "docs/uncertainty.md",
 }  # fmt: skip
@@ -132,6 +132,7 @@ def test_tutorial_and_front_page():
     names = pages.run("docs/tutorial.md")
     assert "harmonic_frequency" in names["sharper"].free and jm.load_result("mine.json").success
     assert pages.run("docs/index.md")["result"].success
+    assert pages.run("docs/fitting.md")["in_newtons"].derived["mean"].value == pytest.approx(40.5, abs=3 * 0.8)
 
 
 @pytest.mark.slow

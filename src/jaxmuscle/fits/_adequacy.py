@@ -52,20 +52,35 @@ class Adequacy(NamedTuple):
 
 
 class _Refit(NamedTuple):
-    """What a refit leaves of residuals: data rows, then those of the prior.
+    """What a refit leaves of residuals, data rows and then those of the prior, with any of several lines as the harmonic.
 
-    `left` removes what the fitted directions take up. `change`, so reduced, is what residuals lose if another line takes the
-    place of the fitted one (the last row: that itself, which changes nothing), at the `penalty` of the frequency's prior;
-    `frequency` of each, and which coordinates, amplitude and frequency, that uses: none where no line is sought. `prior` are
-    the prior's rows at the fit.
+    With line i residuals lose `change[i]`, and what lies in `taken[i]`, orthonormal columns, is taken up by the other
+    parameters, at the `penalty` of the frequency's prior. The last line is the fitted one, which changes nothing.
+    `frequency` of each; `used`, the coordinates of amplitude and frequency, none where no line is sought; `prior`, the
+    prior's rows at the fit.
     """
 
-    left: Float[np.ndarray, "all all"]
     change: Float[np.ndarray, "lines all"]
+    taken: Float[np.ndarray, "lines all fitted"]
     penalty: Float[np.ndarray, " lines"]
     prior: Float[np.ndarray, " rows"]
     frequency: Float[np.ndarray, " lines"]
     used: tuple[int, ...]
+
+    def cost(self, residuals: Float[np.ndarray, "rows all"]) -> Float[np.ndarray, "rows lines"]:
+        """`|(1 - U Uᵀ) (r - change)|²` with the penalty, less `|r|²`."""
+        lines, size, fitted = self.taken.shape
+        basis = np.moveaxis(self.taken, 1, 0).reshape(size, -1)
+        held = np.einsum("la,lak->lk", self.change, self.taken)
+        inside = (residuals @ basis).reshape(len(residuals), lines, fitted) - held
+        outside = np.sum(self.change**2, axis=1) + self.penalty - 2 * residuals @ self.change.T
+        return outside - np.sum(inside**2, axis=2)
+
+    def left(self, residuals: Float[np.ndarray, "rows all"], line: np.ndarray | int = -1) -> Float[np.ndarray, "rows all"]:
+        """What is left of every row with its line."""
+        rest = residuals - self.change[line]
+        taken = np.broadcast_to(self.taken[line], (len(rest), *self.taken.shape[1:]))
+        return rest - np.einsum("rak,rk->ra", taken, np.einsum("rak,ra->rk", taken, rest))
 
 
 def adequacy(
@@ -85,13 +100,11 @@ def adequacy(
     chi2 = np.empty(0)
     drawn = np.concatenate([_drawn(objective, scatter, generator), generator.normal(size=(REPLICATES, rows))], axis=1)
     for some in np.split(drawn, np.arange(CHUNK, REPLICATES, CHUNK)):
-        rest = some @ refit.left
-        cost = np.sum(refit.change**2, axis=1) + refit.penalty - 2 * rest @ refit.change.T
-        rest -= refit.change[np.argmin(cost, axis=1)]
+        rest = refit.left(some, np.argmin(refit.cost(some), axis=1))
         chi2 = np.append(chi2, np.sum(rest[:, :count] ** 2, axis=1))
     here = float(np.sum(found.residuals**2))
     p = (1 + np.sum(chi2 >= here)) / (1 + REPLICATES)
-    inner = refit.left[:count, :count] @ scatter @ refit.left[:count, :count]
+    inner = refit.left(refit.left(np.pad(scatter, (0, rows))).T)[:count, :count]
     return Adequacy(here, float(np.mean(chi2)), float(p), _misfit(problem, objective, found.residuals, inner))
 
 
@@ -120,7 +133,8 @@ def elsewhere(problem: FitProblem, objective: Residuals, seen: Expansion, found:
     residual = np.concatenate([found.residuals, refit.prior])
     gain = np.linalg.pinv(found.jacobian.T @ found.jacobian + np.diag(problem.prior), hermitian=True)
     dull = max(1.0, float(sizes[f, f] / gain[f, f]))
-    cost = (np.sum(refit.change**2, axis=1) - 2 * refit.change @ residual) / dull + refit.penalty
+    cost = refit.cost(residual[None])[0]
+    cost = (cost - cost[-1]) / dull
     apart = np.abs(refit.frequency - refit.frequency[-1])
     weight = np.where(apart >= problem.parts[0].target.settings.resolution, np.exp(-0.5 * np.clip(cost, -700, 700)), 0.0)
     grid = refit.frequency[:LINES]
@@ -132,9 +146,14 @@ def elsewhere(problem: FitProblem, objective: Residuals, seen: Expansion, found:
 
 def without_fitted(jacobian: Float[np.ndarray, "all fitted"]) -> Float[np.ndarray, "all all"]:
     """The projection that removes from residuals what the fitted directions take up."""
-    basis, size, _ = np.linalg.svd(np.nan_to_num(jacobian), full_matrices=False)
-    basis = basis[:, size > 1e-9 * np.max(size, initial=1e-300)]
+    basis = taken_up(jacobian)
     return np.eye(len(jacobian)) - basis @ basis.T
+
+
+def taken_up(jacobian: Float[np.ndarray, "*lines all fitted"]) -> Float[np.ndarray, "*lines all fitted"]:
+    """Orthonormal columns that span what the fitted directions take up; zero where two of them are one."""
+    basis, size, _ = np.linalg.svd(np.nan_to_num(jacobian), full_matrices=False)
+    return basis * (size > 1e-9 * np.max(size, axis=-1, keepdims=True, initial=1e-300))[..., None, :]
 
 
 def generator_of(problem: FitProblem, number: int) -> np.random.Generator:
@@ -173,37 +192,44 @@ def _refit(problem: FitProblem, objective: Residuals, seen: Expansion, found: Co
     """Lines of every frequency and strength in place of the fitted one, where a fit would have found them."""
     names, prior = problem.coordinates.names, np.sqrt(problem.prior)
     free = tuple(names.index(n) for n in HARMONIC if n in names)
-    moments, own = seen.moments[0], objective.parts[0]
+    moments, slopes, own = seen.moments[0], seen.slopes[0], objective.parts[0]
     power, line = np.asarray(moments.power), np.asarray(moments.line)
     alone = len(problem.parts) == 1 and len(free) == 2 and problem.residual == "log"
     if not (alone and np.all(power > line) and np.any(line > 0)):
-        left = without_fitted(np.concatenate([found.jacobian, np.diag(prior)]))
-        return _Refit(left, np.zeros((1, len(left))), np.zeros(1), prior * seen.theta, np.zeros(1), ())
-    part, (a, f), sd = problem.parts[0], free, problem.coordinates.sd
-    frequency, each, square = line_grid(part, power - line)
+        taken = taken_up(np.concatenate([found.jacobian, np.diag(prior)]))[None]
+        return _Refit(np.zeros((1, taken.shape[1])), taken, np.zeros(1), prior * seen.theta, np.zeros(1), ())
+    part, (a, f), sd, noise = problem.parts[0], free, problem.coordinates.sd, power - line
+    frequency, each, square = line_grid(part, noise)
     task = part.task_at(seen.theta)
     here = float(task["harmonic_frequency"])
     held = float(np.sum(line) / np.sum(line_spectra(part, np.array([here]))))
     frequency, square = np.append(frequency, here), np.append(square, held)
-    ratio = np.concatenate([(power - line + square[:-1, None] * each) / power, np.ones((1, len(line)))])
+    total = noise + np.append(square[:-1, None] * each, line[None], axis=0)
     kept = np.delete(np.arange(len(names)), free)
-    count, bins = len(found.residuals), len(line)
-    change = np.zeros((len(ratio), count + len(kept) + 1))
-    logs = np.log(ratio)
-    change[:, :bins] = (logs - logs.mean(axis=1, keepdims=True)) / np.asarray(own.data.sd)
+    count, bins, lines = len(found.residuals), len(line), len(total)
+    change = np.zeros((lines, count + len(kept) + 1))
+    jacobian = np.zeros((*change.shape, len(kept)))
+    spread = np.asarray(own.data.sd)
+    # The level of a line is held: the other parameters move the noise alone, and the amplitude follows.
+    level = np.sum(slopes.line, axis=0)[kept] / np.sum(line)
+    logs = np.log(total / power)
+    change[:, :bins] = (logs - logs.mean(axis=1, keepdims=True)) / spread
+    rise = (slopes.power - slopes.line)[:, kept] / total[..., None]
+    jacobian[:, :bins] = (rise.mean(axis=1, keepdims=True) - rise) / spread[:, None]
+    jacobian[:, bins:count] = found.jacobian[bins:, kept]
     if own.data.variation is not None:
-        variance = 1 + (square - held) / float(moments.variance)
-        change[:, bins] = -0.5 * np.log(np.maximum(variance, 1e-6)) / float(own.data.variation[1])
+        error, variance = float(own.data.variation[1]), float(moments.variance)
+        other = np.maximum(variance + square - held, 1e-6 * variance)
+        change[:, bins] = -0.5 * np.log(other / variance) / error
+        moved = (slopes.variance[kept] - held * level) / other[:, None]
+        jacobian[:, bins] = (0.5 * moved - slopes.mean[kept] / float(moments.mean)) / error
     # Of two lines of one frequency the mean square goes with the squared amplitude.
     louder = 0.5 * (np.log(square / held) - np.log(_gain(task, frequency) / _gain(task, [here]))) / sd[a]
     change[:, -1] = -prior[a] * louder
-    # With a line's level held, the amplitude follows what the other parameters do to that level.
-    level = 0.5 * np.sum(seen.slopes[0].line, axis=0)[kept] / np.sum(line) / sd[a]
-    data = found.jacobian[:, kept] - np.outer(found.jacobian[:, a], level)
-    jacobian = np.concatenate([data, np.diag(prior[kept]), -prior[a] * level[None]])
+    jacobian[:, count:-1] = np.diag(prior[kept])
+    jacobian[:, -1] = -0.5 * prior[a] * level / sd[a]
     theta = seen.theta[f] + np.log(frequency / here) / sd[f]
-    left = without_fitted(jacobian)
-    return _Refit(left, change @ left, problem.prior[f] * (theta**2 - seen.theta[f] ** 2),
+    return _Refit(change, taken_up(jacobian), problem.prior[f] * (theta**2 - seen.theta[f] ** 2),
                   np.append(prior[kept] * seen.theta[kept], prior[a] * seen.theta[a]), frequency, free)  # fmt: skip
 
 

@@ -79,10 +79,13 @@ def report_fit(plan: Plan, stages: list[Stage], *, interrupted: bool = False, pr
     try:
         for part, moments in zip(problem.parts, seen.moments, strict=True):
             check_power(part.task, moments)
+    except ValueError as error:
+        return _failed(problem, common, str(error))
+    try:
         made = [_simulated(problem, part, task, plan.check_seeds) if plan.check_seeds else _expected_only(moments)
                 for part, task, moments in zip(problem.parts, tasks, seen.moments, strict=True)]  # fmt: skip
     except (SimulationError, ValueError) as error:
-        return _failed(problem, common, f"the fitted task cannot be used: {error}")
+        return _failed(problem, common, f"the fitted task cannot be simulated: {error}")
     found = consequences(objective, seen)
     made = [m._replace(each=m.each._replace(line=np.tile(np.minimum(x.line, np.mean(m.each.power, axis=0)),
                                                          (len(m.each.mean), 1))))
