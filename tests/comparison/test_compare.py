@@ -222,7 +222,7 @@ def test_without_harmonic_its_power_is_zero(x64):
 SCORES = np.linspace(-1.0, 1.0, 30)
 
 
-def made(*, disagree=False, sigma=False, success=True):
+def made(*, disagree=False, sigma=False, success=True, p=0.2):
     """Three noises: pink better than band-limited by 8, than Ornstein-Uhlenbeck by 3."""
     target = target_of(true_task("pink"))
     found = {}
@@ -235,6 +235,7 @@ def made(*, disagree=False, sigma=False, success=True):
             "aic": aic - 192.0,
             "scores": None if sigma else lift + 0.1 * np.roll(SCORES, i),
             "chi2_per_bin": 0.7,
+            "adequacy_p": p if noise == "pink" or p is None else min(p, 0.005),
             "success": success,
         }
     rows = _compare._rows(found)
@@ -285,6 +286,14 @@ def test_verdict_in_words():
     assert alone.between("pink", "band-limited").winner == "pink"
     with pytest.raises(ValueError, match="noise = 'white': not compared"):
         alone.between("pink", "white")
+
+
+def test_that_one_model_is_better_does_not_say_that_it_is_good():
+    assert made().adequate == "these describe the data (p >= 0.01): pink; pink, no harmonic"
+    assert made(p=0.001).adequate.startswith("none of the models describes the data")
+    assert made(p=None).adequate.startswith("whether any model describes the data cannot be judged")
+    assert made(p=0.001).adequate.split(":")[0] in " ".join(str(made(p=0.001)).split())
+    assert [row["adequate"] for row in made().table()] == [False] * 4 + [True] * 2
 
 
 @pytest.mark.parametrize("sigma", [False, True])

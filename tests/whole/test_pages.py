@@ -21,9 +21,9 @@ TRUTH = jm.Isometric().replace(harmonic_frequency=6.0, harmonic_amplitude=0.012)
 ELSEWHERE = {"docs/digitise.md": "data/test_digitised.py", "docs/own-muscle.md": "whole/test_hill.py"}
 BELOW = {"docs/gallery.md"}  # its program is read instead
 RUN_HERE = {
-    "README.md", "docs/coming-from-diffrax.md", "docs/coming-from-matlab.md", "docs/ensembles.md", "docs/fit-a-csv.md", "docs/fitting.md",
-    "docs/identifiability.md", "docs/index.md", "docs/recordings.md", "docs/reference/figures.md", "docs/scaling.md",
-    "docs/tutorial.md", "docs/uncertainty.md",
+    "README.md", "docs/coming-from-diffrax.md", "docs/coming-from-matlab.md", "docs/ensembles.md", "docs/fit-a-csv.md",
+    "docs/fitting.md", "docs/identifiability.md", "docs/index.md", "docs/recordings.md", "docs/reference/figures.md",
+    "docs/scaling.md", "docs/tutorial.md", "docs/uncertainty.md",
 }  # fmt: skip
 FEWER_SEEDS = {"seeds=100_000": "seeds=1_000"}
 CALLED_OFTEN = ("fit", "ensemble", "profile", "posterior", "identifiability", "compare_noise", "goodness", "bootstrap")

@@ -35,8 +35,8 @@ def rounded(value: float, error: float) -> tuple[str, str]:
 
 
 def probability(p: float) -> str:
-    """ "p = 0.23"; one below a thousandth as "p < 0.001"."""
-    return "p < 0.001" if p < 0.001 else f"p = {p:.2g}"
+    """In words, as in "p = 0.23"; "p <= 0.001" for what is the least that 999 replicates can show."""
+    return "p <= 0.001" if p <= 0.001 else f"p = {p:.2g}"
 
 
 def choices(word: str, options: Iterable[str]) -> str:

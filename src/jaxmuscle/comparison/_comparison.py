@@ -206,12 +206,13 @@ class Comparison(eqx.Module):
         """Sentences: the best noise against each other one, and whether there is a harmonic."""
         first, *others = self.noises
         decisions = [self.between(first, other) for other in others] + ([] if self.harmonic is None else [self.harmonic])
-        said = [self._describing(), *(str(decision) for decision in decisions)]
+        said = [str(decision) for decision in decisions]
         if self.best.scores is None:
             said.append("the target states no segments: nothing was held out, the AIC decides alone")
         return tuple(said)
 
-    def _describing(self) -> str:
+    @property
+    def adequate(self) -> str:
         """Which models describe the data: that one is better than another does not say that it is good."""
         known = [row for row in self.rows if row.adequate is not None]
         fine = [row.label for row in known if row.adequate]
@@ -263,6 +264,7 @@ class Comparison(eqx.Module):
             "format": FORMAT,
             "target": self.target.name,
             "rows": [{name: with_nulls(value) for name, value in row.items()} for row in self.table()],
+            "adequate": self.adequate,
             "verdict": list(self.verdict),
             "left_out": self.left_out,
             "harmonic_needed": self.harmonic_needed,
@@ -294,20 +296,19 @@ class Comparison(eqx.Module):
 
     def __str__(self) -> str:
         kind = type(next(iter(self.tasks.values()))).__name__
-        head = f"  {'noise':<19}{'line':<5}{'ln L':>9}{'par':>5}{'AIC':>9}{'ΔAIC':>9}{'weight':>7}{'p':>8}  held-out"
+        head = f"  {'noise':<19}{'line':<5}{'ln L':>9}{'par':>5}{'ΔAIC':>9}{'weight':>7}{'p':>9}  held-out"
         lines = [f"{self.target.name} ({self.target.provenance}), {kind}: which noise?", head]
         for row in sorted(self.rows, key=lambda row: row.aic):
             held = "" if row.score is None else f"{_short(row.score_difference)} ± {_short(row.score_stderr)}"
+            p = row.adequacy_p
             line = (
                 f"  {row.noise:<19}{'yes' if row.harmonic else 'no':<5}{_short(row.log_likelihood):>9}{row.parameters:>5.1f}"
             )
-            line += f"{_short(row.aic):>9}{_short(row.delta_aic):>9}{row.weight:>7.2f}"
-            line += (
-                f"{'' if row.adequacy_p is None else '< 0.001' if row.adequacy_p < 0.001 else f'{row.adequacy_p:.3f}':>7}"
-            )
+            line += f"{_short(row.delta_aic):>9}{row.weight:>7.2f}"
+            line += f"{'' if p is None else '<= 0.001' if p <= 0.001 else f'{p:.3f}':>9}"
             lines.append(f"{line}  {held if row.success else 'failed'}")
         said = [f"left out: {noise}: {why}" for noise, why in self.left_out.items()]
-        for sentence in (*self.verdict, *said):
+        for sentence in (self.adequate, *self.verdict, *said):
             lines.append(f"- {sentence}")
         return folded(lines)
 

@@ -57,6 +57,8 @@ def page(found: Reproduction, rows: tuple[Row, ...]) -> str:
             f"jaxmuscle {version('jaxmuscle')}. [30] is Slifkin &amp; Newell 1999, [12] Hamilton, Jones &amp; Wolpert "
             "2004. What is stated was taken from texts; the figures were not available as data.</p>",
             f"<p><b>{escape(counted(rows))}</b> As data: <a href='claims.json'>claims.json</a>.</p>",
+            "<p>No verdict stands here on whether the model describes data: the parameters were tuned to curves that texts "
+            "describe, whose scatter nobody states. Fits of measured spectra have one (<code>jaxmuscle fit</code>).</p>",
             "<h2>Figures</h2>",
             f"<div class='figures'>{''.join(_figure(name, _caption(name, found.experiment)) for name in CAPTIONS)}</div>",
             "<h2>Statements</h2>",
