@@ -221,7 +221,7 @@ def test_the_table_is_consistent():
         assert row.lower <= row.fit_lower <= row.default <= row.fit_upper <= row.upper, name
         assert row.prior_sd > 0
         if row.positive:
-            assert row.lower >= 0 and row.default > 0, name
+            assert row.fit_lower >= 0 and row.default > 0, name
     assert set(DEFAULT_FREE) <= set(PARAMETERS)
     units = {"m": "m", "x_r": "m", "v_r": "m/s", "k_": "N/m^3", "c_": "N s^3/m^3"}
     for prefix, unit in units.items():

@@ -498,7 +498,7 @@ def test_the_mean_of_simulations_is_as_expected(x64):
     for i, task in enumerate(SIMULATED.values()):
         runs = jm.ensemble(jm.settled(task), jax.random.fold_in(KEY, i), **options)
         power = np.asarray(runs.spectrum(window=window).power)
-        expected = np.asarray(jm.expected_spectrum(task, window=window).power)
+        expected = np.asarray(jm.expected_spectrum(jm.settled(task), window=window).power)
         z.append((power.mean(axis=0) - expected) / (power.std(axis=0, ddof=1) / np.sqrt(len(power))))
     references.assert_standard_normal(z, every=3)
 

@@ -46,8 +46,9 @@ def intervals(
     if not objective.linear or problem.residual != "log" or not names:
         return {}
     found: dict[str, Interval] = {}
-    for start in range(0, len(names), MOST_ROWS // 2):
-        found |= _some(problem, objective, seen, covariance, names[start : start + MOST_ROWS // 2])
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # a row that runs away is an open end
+        for start in range(0, len(names), MOST_ROWS // 2):
+            found |= _some(problem, objective, seen, covariance, names[start : start + MOST_ROWS // 2])
     return found
 
 
@@ -82,8 +83,7 @@ def _some(
                                 for new, old in zip(tried[1:], best[1:], strict=True)))  # fmt: skip
         damping = np.where(better, 0.2 * damping, 10 * damping)
     moved, rise = side * (best.at - start), best.rise(here)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        end = moved * wanted / rise
+    end = moved * wanted / rise
     good = np.isfinite(end) & (moved > 0) & (rise > 0.5 * wanted)
     ends = [float(s * e) if fine else None for s, e, fine in zip(side, end, good, strict=True)]
     return {n: Interval(ends[2 * i], ends[2 * i + 1], bool(log[2 * i])) for i, n in enumerate(names)}

@@ -112,7 +112,7 @@ def report_fit(plan: Plan, stages: list[Stage], *, interrupted: bool = False, pr
         other += (f"the harmonic may lie elsewhere or be too faint to be seen: {100 * share:.0f} % of the posterior is more "
                   "than a bin from the frequency shown. No errors are stated for it",)  # fmt: skip
     factor = 1.0 if judgement is None else judgement.widening
-    moved |= too_curved(problem, known)
+    moved |= too_curved(problem, derived, known)
     parameters, derived = (widened(without_errors(moved, table), factor) for table in (parameters, derived))
     stated = [n for n, p in (parameters | derived).items() if p.stderr and (n in derived or n in c.names)]
     ends = intervals(problem, objective, seen, factor**2 * covariance, stated)

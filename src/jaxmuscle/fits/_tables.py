@@ -9,7 +9,7 @@ import numpy as np
 from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.objective._arguments import SAME, base_of
 from jaxmuscle.objective._consequences import DERIVED, unit_of
-from jaxmuscle.objective._covariance import Identifiability
+from jaxmuscle.objective._covariance import Identifiability, common_scales
 from jaxmuscle.objective._problem import FitProblem, Part
 
 from ._intervals import Interval
@@ -74,15 +74,18 @@ def derived_table(
     return table
 
 
-def too_curved(problem: FitProblem, known: Identifiability) -> set[str]:
+def too_curved(problem: FitProblem, derived: Collection[str], known: Identifiability) -> set[str]:
     """Single numbers of muscle and noise, whose errors do not hold while the data leave some direction open.
 
-    Along such a direction they bend: on simulated recordings of muscles drawn from the prior, intervals by curvature or by
-    profile held the truth in 75 to 85 % of cases, not in 95 % (docs/fitting.md). Observed quantities are not concerned.
+    Along such a direction they bend, unless it is a common scale: on simulated recordings of muscles drawn from the
+    prior, intervals by curvature or by profile held the truth in 75 to 85 % of cases, not in 95 % (docs/fitting.md).
+    Observed quantities are not concerned, nor what several targets share.
     """
-    if len(problem.parts) > 1 or np.all(known.determined):
+    names = problem.coordinates.names
+    if np.sum(~known.determined) <= len(common_scales(names, known)):
         return set()
-    return {n for n in problem.coordinates.names if not n.startswith("harmonic_")} | set(BASE)
+    single = {n for n in names if not base_of(n).startswith("harmonic_")} | {n for n in derived if base_of(n) in BASE}
+    return single if len(problem.parts) == 1 else {n for n in single if "@" in n}
 
 
 def merged(problem: FitProblem, tables: list[dict[str, Estimate]], slopes: Any) -> dict[str, Estimate]:

@@ -32,7 +32,7 @@ FAINT = 1e-3
 class SecondOrder(NamedTuple):
     """What the second order adds: `power`, to every bin over that of the linear response; `mean`, over the mean.
 
-    A bin of the linear response counts for a thousandth of their mean at least.
+    A bin of the linear response counts for a thousandth of their mean at least, the mean for the standard deviation.
     """
 
     power: Float[np.ndarray, " bins"]
@@ -146,17 +146,24 @@ def second_order(task: AbstractTask, settings: SpectrumSettings | None = None) -
     matrix[:n] += system.B @ inputs[n : n + 4]
     covariance = solve_continuous_lyapunov(matrix, -white)
     power, mean = _added(0.5 * inputs.T @ hessians @ inputs, matrix, covariance, system, settings)
-    rest, first = float(system.rest), np.asarray(moments.power)
+    first, scale = np.asarray(moments.power), max(abs(float(system.rest)), float(moments.variance) ** 0.5)
     least = FAINT * np.mean(first)
     relative = np.maximum(power, 0.0) / np.maximum(first, least) if least > 0 else np.zeros(len(first))
-    return SecondOrder(relative, mean / rest if rest else 0.0)
+    return SecondOrder(relative, mean / scale if scale > 0 else 0.0)
+
+
+@kept
+def _operator(settings: SpectrumSettings) -> Float[Array, "bins lags"]:
+    """What turns an autocovariance into Welch powers; kept, since to make it takes scipy.signal, half a second to import."""
+    return jnp.asarray(covariance_operator(settings)[:-2])
 
 
 def _added(
     forms: np.ndarray, matrix: np.ndarray, stationary: np.ndarray, system: Any, settings: SpectrumSettings
 ) -> tuple[np.ndarray, float]:
     """Welch power and mean of z₂."""
-    operator = covariance_operator(settings)[:-2]
+    with jax.ensure_compile_time_eval(), jax.enable_x64(True):
+        operator = np.asarray(_operator(settings))
     count, interval = max(SAMPLES, 1 << int(np.ceil(np.log2(2 * operator.shape[1])))), 1 / settings.rate
     step = expm(matrix * interval)
     each = np.empty((count // 2, *matrix.shape))
