@@ -9,12 +9,15 @@ import pytest
 import scipy.stats
 
 import jaxmuscle as jm
-from jaxmuscle.fits._adequacy import adequacy, elsewhere, judged, line_spectra, scatter_of, without_fitted
+from jaxmuscle._common.arrays import as_arrays
+from jaxmuscle.fits._adequacy import elsewhere, judged, scatter_of
 from jaxmuscle.fits._intervals import intervals
+from jaxmuscle.fits._refit import refit_of, without_fitted
 from jaxmuscle.model._parameters import DEFAULT_FREE
 from jaxmuscle.objective._arguments import FitOptions, planned
 from jaxmuscle.objective._consequences import consequences, expand, quantities
 from jaxmuscle.objective._covariance import parameter_covariance
+from jaxmuscle.response._harmonic_line import line_levels
 from jaxmuscle.spectra._bin_law import bin_statistics
 
 TASK = jm.Isometric()
@@ -87,13 +90,13 @@ def test_a_line_in_the_bins_is_that_of_a_sine(x64):
     """Mean over 16 phases of the Welch power of √2 sin, mean square 1, without the low-pass."""
     settings = jm.SpectrumSettings(filter_cutoff=None)
     plain = jm.Isometric(settings=settings)
-    part = planned(plain, jm.Target("x", np.ones(30), segments=[12], settings=settings), FitOptions()).problem.parts[0]
     time = np.arange(1500) / 100
     for frequency in (0.5, 4.25, 7.03):
         phases = 2 * np.pi * np.arange(16)[:, None] / 16
         sines = np.sqrt(2) * np.sin(2 * np.pi * frequency * time + phases)
         seen = np.asarray(jm.spectra.spectrum_of(sines, settings).power).mean(axis=0)
-        np.testing.assert_allclose(line_spectra(part, np.array([frequency]))[0], seen, rtol=1e-6, atol=1e-9 * seen.max())
+        level = np.asarray(line_levels(as_arrays(plain), settings, np.array([frequency]))[0][0])
+        np.testing.assert_allclose(level, seen, rtol=1e-6, atol=1e-9 * seen.max())
 
 
 @pytest.mark.slow
@@ -159,7 +162,7 @@ def test_nothing_is_judged_where_the_scatter_is_unknown():
         plan = planned(TASK, target, FitOptions())
         objective = plan.problem.linear()
         seen = expand(objective, np.zeros((1, 8))).row(0)
-        assert adequacy(plan.problem, objective, seen, consequences(objective, seen), np.eye(29)) is None
+        assert judged(plan.problem, objective, seen) is None
 
 
 # --- what is stated
@@ -178,7 +181,7 @@ def test_a_faint_harmonic_has_no_errors_and_a_strong_one_has(x64):
         seen = expand(objective, theta[None]).row(0)
         found = consequences(objective, seen)
         covariance = parameter_covariance(found.jacobian, scatter_of(problem, objective, seen), problem.prior)
-        shares[amplitude] = elsewhere(problem, objective, seen, found, covariance)
+        shares[amplitude] = elsewhere(problem, found, refit_of(problem, objective, seen, found), covariance)
     assert shares[0.003] > 0.5 and shares[0.05] < 1e-3
 
 

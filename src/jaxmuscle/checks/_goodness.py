@@ -11,7 +11,7 @@ from jaxtyping import Float
 from jaxmuscle import plot
 from jaxmuscle._common.environment import versions
 from jaxmuscle._common.parts import of_only, only
-from jaxmuscle._common.text import folded
+from jaxmuscle._common.text import folded, probability
 from jaxmuscle.data._target import Target
 from jaxmuscle.fits._reopened import reopened
 from jaxmuscle.fits._result import FitResult
@@ -34,10 +34,6 @@ ELSEWHERE = 3
 LINE_SHAPE = np.array([0.25, 1.0, 0.25])
 SMALL_P, LARGE_P = 0.05, 0.975
 CHECKS = ("chi2_per_bin", "runs", "largest")
-
-
-def _p(value: float) -> str:
-    return f"p = {value:.2g}"
 
 
 def _check(result: FitResult, judged: Target | None) -> None:
@@ -95,7 +91,8 @@ class GoodnessPart(eqx.Module):
         p, seen = self.p_values, self.observed
         thing = "prediction" if self.foretold else "fit"
         low, high = np.quantile(self.reference["chi2_per_bin"], [0.05, 0.95])
-        chi2 = f"chi2 per bin {seen['chi2_per_bin']:.2f}, expected {low:.2f} to {high:.2f}, {_p(p['chi2_per_bin'])}"
+        said = {name: probability(value) for name, value in p.items()}
+        chi2 = f"chi2 per bin {seen['chi2_per_bin']:.2f}, expected {low:.2f} to {high:.2f}, {said['chi2_per_bin']}"
         if p["chi2_per_bin"] < SMALL_P:
             first = f"the {thing} is worse than expected: {chi2}"
         elif p["chi2_per_bin"] > LARGE_P:
@@ -104,17 +101,17 @@ class GoodnessPart(eqx.Module):
             first = f"the {thing} is as good as expected: {chi2}"
         usual, runs = float(np.mean(self.reference["runs"])), f"{seen['runs']:.0f} runs of equal sign"
         if p["runs"] < SMALL_P:
-            second = (f"the residuals have fewer runs than expected: {runs} where {usual:.1f} are usual, {_p(p['runs'])}; "
+            second = (f"the residuals have fewer runs than expected: {runs} where {usual:.1f} are usual, {said['runs']}; "
                       "something slow in frequency is missing")  # fmt: skip
         else:
-            second = f"the residuals change sign as often as expected: {runs}, {usual:.1f} usual, {_p(p['runs'])}"
+            second = f"the residuals change sign as often as expected: {runs}, {usual:.1f} usual, {said['runs']}"
         worst = int(np.argmax(np.abs(self.residual)))
         place = f"{self.residual[worst]:+.1f} standard deviations at {self.target.frequency[worst]:.2f} Hz"
         if p["largest"] < SMALL_P:
-            third = f"one bin stands out: {place}, {_p(p['largest'])}; a line or an artefact that the model does not have"
+            third = f"one bin stands out: {place}, {said['largest']}; a line or an artefact that the model does not have"
         else:
-            third = f"no bin stands out: the largest residual is {place}, {_p(p['largest'])}"
-        return first, second, third, f"all three together: {_p(p['all'])}"
+            third = f"no bin stands out: the largest residual is {place}, {said['largest']}"
+        return first, second, third, f"all three together: {said['all']}"
 
     def __str__(self) -> str:
         done = "foretold by fits of" if self.foretold else "each fitted anew,"
@@ -157,7 +154,7 @@ class Goodness(eqx.Module):
     def __str__(self) -> str:
         lines = [str(part) for part in self.parts.values()]
         if len(self.parts) > 1:
-            lines.append(f"all targets together: {_p(self.p_value)}")
+            lines.append(f"all targets together: {probability(self.p_value)}")
         return "\n".join(lines + [f"- {self.lost} refits were not finite and are left out"] * bool(self.lost))
 
     def plot(self, ax: "Axes | None" = None) -> "Figure | SubFigure":

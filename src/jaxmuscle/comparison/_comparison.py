@@ -13,7 +13,7 @@ from jaxmuscle import plot
 from jaxmuscle._common.arrays import with_nulls
 from jaxmuscle._common.environment import versions
 from jaxmuscle._common.files import write_text
-from jaxmuscle._common.text import folded
+from jaxmuscle._common.text import folded, probability
 from jaxmuscle.data._target import Target
 from jaxmuscle.fits._adequacy import ADEQUATE
 from jaxmuscle.model._presets import task_to_table
@@ -305,7 +305,7 @@ class Comparison(eqx.Module):
                 f"  {row.noise:<19}{'yes' if row.harmonic else 'no':<5}{_short(row.log_likelihood):>9}{row.parameters:>5.1f}"
             )
             line += f"{_short(row.delta_aic):>9}{row.weight:>7.2f}"
-            line += f"{'' if p is None else '<= 0.001' if p <= 0.001 else f'{p:.3f}':>9}"
+            line += f"{'' if p is None else probability(p).removeprefix('p ').removeprefix('= '):>9}"
             lines.append(f"{line}  {held if row.success else 'failed'}")
         said = [f"left out: {noise}: {why}" for noise, why in self.left_out.items()]
         for sentence in (self.adequate, *self.verdict, *said):

@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float, Int
 
 from jaxmuscle._common.programs import kept
 from jaxmuscle.data._target import Target
+from jaxmuscle.model._parameters import HARMONIC
 from jaxmuscle.objective._consequences import BATCH, expand
 from jaxmuscle.objective._likelihood import Bins, Likelihood, _precision, without_offsets
 from jaxmuscle.objective._problem import FitProblem
@@ -21,7 +22,6 @@ from jaxmuscle.spectra._bin_law import welch_law
 SPREAD, RANDOM, PLAIN = 24, 8, 16
 BLOCK, BLOCKS, ENOUGH = 12, 10, 1e-3
 SAME, KEPT = 1e-3, 16
-HARMONIC = ("harmonic_amplitude", "harmonic_frequency")
 
 
 class Maxima(NamedTuple):

@@ -6,13 +6,15 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
+from jaxmuscle.model._parameters import HARMONIC
 from jaxmuscle.objective._consequences import consequences
 from jaxmuscle.objective._least_squares import Minima, least_squares
 from jaxmuscle.objective._problem import FitProblem
 from jaxmuscle.objective._residuals import Residuals
 
-from ._adequacy import drawn_log_residuals, generator_of, line_grid, without_fitted
+from ._adequacy import drawn_log_residuals, generator_of
 from ._checks import seen_best
+from ._refit import lines_of, without_fitted
 
 PROFILE = 64
 STEPS = 40
@@ -77,7 +79,7 @@ def _p_value(problem: FitProblem, objective: Residuals, final: Minima) -> float:
     and g. The same is done with spectra drawn from that model: scaled chi² bins, correlated as Welch's are.
     """
     names = problem.coordinates.names
-    columns = [names.index(name) for name in ("harmonic_amplitude", "harmonic_frequency")]
+    columns = [names.index(name) for name in HARMONIC]
     theta = np.array(problem.coordinates.theta(final.s))
     theta[:, columns[0]] = problem.coordinates.theta_of("harmonic_amplitude", ABSENT)
     objective = _pinned(objective, columns)
@@ -89,12 +91,13 @@ def _p_value(problem: FitProblem, objective: Residuals, final: Minima) -> float:
     kept = np.delete(np.arange(len(names)), columns)
     residual = np.concatenate([found.residuals, np.sqrt(problem.prior[kept]) * here.theta[kept]])
     jacobian = np.concatenate([found.jacobian[:, kept], np.diag(np.sqrt(problem.prior[kept]))])
-    _, each, square = line_grid(problem.parts[0], np.asarray(null.power))
-    added = np.zeros((len(each), len(residual)))
-    logs = np.log1p(square[:, None] * each / null.power)
+    (part,) = problem.parts
+    tried = lines_of(part, part.task_at(here.theta), np.asarray(null.power), float(part.target.frequency[-1]))
+    added = np.zeros((len(tried.square), len(residual)))
+    logs = np.log1p(tried.square[:, None] * tried.each / null.power)
     added[:, :n] = -(logs - logs.mean(axis=1, keepdims=True)) / sd
     if own.data.variation is not None:
-        added[:, n] = 0.5 * np.log1p(square / float(null.variance)) / float(own.data.variation[1])
+        added[:, n] = 0.5 * np.log1p(tried.square / float(null.variance)) / float(own.data.variation[1])
     left = added @ without_fitted(jacobian)
     size = np.sum(left**2, axis=1)
 

@@ -7,7 +7,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from jaxmuscle.objective._consequences import Expansion, expand, quantities
+from jaxmuscle.objective._consequences import Expansion, consequences_of_rows, expand
 from jaxmuscle.objective._problem import FitProblem
 from jaxmuscle.objective._residuals import Residuals
 
@@ -146,29 +146,13 @@ class _Point(NamedTuple):
 
     @classmethod
     def of(cls, problem: FitProblem, objective: Residuals, seen: Expansion) -> "_Point":
-        residual, jacobian = [], []
-        for part, moments, slopes in zip(objective.parts, seen.moments, seen.slopes, strict=True):
-            data = part.data
-            z = np.log(np.asarray(data.target)) - np.asarray(data.bias) - np.log(moments.power)
-            rise = -slopes.power / moments.power[..., None]
-            sd = np.asarray(data.sd)
-            residual.append((z - z.mean(axis=1, keepdims=True)) / sd)
-            jacobian.append((rise - rise.mean(axis=1, keepdims=True)) / sd[:, None])
-            if data.variation is not None:
-                target, error = (float(x) for x in data.variation)
-                residual.append((np.log(moments.variation) - target)[:, None] / error)
-                change = 0.5 * slopes.variance / moments.variance[:, None] - slopes.mean / moments.mean[:, None]
-                jacobian.append(change[:, None] / error)
-            if data.mean is not None:
-                target, error = (float(x) for x in data.mean)
-                residual.append((moments.mean - target)[:, None] / error)
-                jacobian.append(slopes.mean[:, None] / error)
-        r, J, theta = np.concatenate(residual, axis=1), np.concatenate(jacobian, axis=1), np.asarray(seen.theta)
-        cost = 0.5 * np.sum(r**2, axis=1) + 0.5 * np.sum(problem.prior * theta**2, axis=1)
-        rows = np.minimum(np.arange(MOST_ROWS), len(theta) - 1)  # one size, so that one program serves all
-        filled = quantities(objective, jax.tree.map(lambda x: np.asarray(x)[rows], seen))
-        values, slopes = ({n: x[: len(theta)] for n, x in problem.by_name(tables).items()} for tables in filled)
-        return cls(problem, theta, r, J, np.where(np.isfinite(cost), cost, np.inf), (values, slopes))
+        count = len(seen.theta)
+        rows = np.minimum(np.arange(MOST_ROWS), count - 1)  # one size, so that one program serves all
+        found = consequences_of_rows(objective, jax.tree.map(lambda x: np.asarray(x)[rows], seen))
+        found = jax.tree.map(lambda x: x[:count], found)
+        cost = 0.5 * np.sum(found.residuals**2, axis=1) + 0.5 * np.sum(problem.prior * seen.theta**2, axis=1)
+        tables = problem.by_name(found.values), problem.by_name(found.slopes)
+        return cls(problem, seen.theta, found.residuals, found.jacobian, np.where(np.isfinite(cost), cost, np.inf), tables)
 
     def quantity(self, name: str) -> tuple[Float[np.ndarray, " rows"], Float[np.ndarray, "rows free"]]:
         """A free parameter or derived quantity and its slopes with respect to θ."""

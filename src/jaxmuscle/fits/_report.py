@@ -38,6 +38,7 @@ from ._checks import (
 from ._harmonic_evidence import harmonic_test
 from ._intervals import intervals
 from ._part import FittedPart, Start
+from ._refit import refit_of
 from ._result import FitResult
 from ._tables import (
     correlation_table,
@@ -91,7 +92,8 @@ def report_fit(plan: Plan, stages: list[Stage], *, interrupted: bool = False, pr
                                                          (len(m.each.mean), 1))))
             for m, x in zip(made, seen.moments, strict=True)]  # fmt: skip
     scatter = scatter_of(problem, objective, seen)
-    judgement = adequacy(problem, objective, seen, found, scatter)
+    refit = refit_of(problem, objective, seen, found)
+    judgement = adequacy(problem, objective, found, refit, scatter)
     covariance = parameter_covariance(found.jacobian, scatter, problem.prior)
     known = Identifiability.of_covariance(covariance)
     success, message = convergence(
@@ -106,7 +108,7 @@ def report_fit(plan: Plan, stages: list[Stage], *, interrupted: bool = False, pr
     c = problem.coordinates
     products = tuple(known_products(c.names, c.positive, c.sd, known))
     other, moved = rivals(problem, stages[0] if problem.method == "linear" else stages[-1], parameters | derived)
-    share = elsewhere(problem, objective, seen, found, covariance)
+    share = elsewhere(problem, found, refit, covariance)
     if share > UNSETTLED:
         moved |= {n for n in parameters | derived if base_of(n).startswith("harmonic_")}
         other += (f"the harmonic may lie elsewhere or be too faint to be seen: {100 * share:.0f} % of the posterior is more "

@@ -34,6 +34,7 @@ def _free_sign(name, symbol, unit, default, meaning, source, sd):
 
 DEFAULT_FREE = ("k_w", "k_z", "c_w", "c_z", "harmonic_amplitude", "harmonic_frequency", "noise_K_w", "noise_K_z")
 USUALLY_FREE = (*DEFAULT_FREE, "noise_correlation_time")  # where a task has them
+HARMONIC = ("harmonic_amplitude", "harmonic_frequency")
 CHANNELS = ("K_w", "K_z", "C_w", "C_z")
 
 

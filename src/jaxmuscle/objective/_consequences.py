@@ -146,11 +146,17 @@ class Consequences(NamedTuple):
 
 def consequences(objective: Residuals, seen: Expansion) -> Consequences:
     """What follows at the point where the model was seen; slopes with respect to θ."""
+    rows = consequences_of_rows(objective, jax.tree.map(lambda x: np.asarray(x)[None], seen))
+    return jax.tree.map(lambda x: x[0], rows)
+
+
+def consequences_of_rows(objective: Residuals, seen: Expansion) -> Consequences:
+    """The same at every point where it was seen, with a leading axis of points."""
     found = [jax.tree.map(np.asarray, _consequences(part, part_of(objective, seen, i)))
              for i, part in enumerate(objective.parts)]  # fmt: skip
     return Consequences(
-        np.concatenate([values[0] for values, _ in found]),
-        np.concatenate([objective.spread(slopes[0], i) for i, (_, slopes) in enumerate(found)]),
+        np.concatenate([values[0] for values, _ in found], axis=1),
+        np.concatenate([objective.spread(slopes[0], i) for i, (_, slopes) in enumerate(found)], axis=1),
         tuple(values[1] for values, _ in found),
         tuple({n: objective.spread(g, i) for n, g in slopes[1].items()} for i, (_, slopes) in enumerate(found)),
     )
@@ -158,13 +164,16 @@ def consequences(objective: Residuals, seen: Expansion) -> Consequences:
 
 @kept
 def _consequences(part: PartResiduals, seen: Expansion) -> tuple[Any, Any]:
-    def everything(theta):
-        moments = seen.near(theta)
-        values = part.data_residuals(moments, part.data), derived(task_at(part.task, part.coordinates, theta), moments)
-        return values, values
+    def one(seen):
+        def everything(theta):
+            moments = seen.near(theta)
+            values = part.data_residuals(moments, part.data), derived(task_at(part.task, part.coordinates, theta), moments)
+            return values, values
 
-    slopes, values = jax.jacfwd(everything, has_aux=True)(seen.theta)
-    return values, slopes
+        slopes, values = jax.jacfwd(everything, has_aux=True)(seen.theta)
+        return values, slopes
+
+    return jax.vmap(one)(seen)
 
 
 class _Response(eqx.Module):

@@ -11,6 +11,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure, SubFigure
 
+from jaxmuscle._common.text import rounded
+
 from ._spectra import target
 from ._style import BLACK, BLUE, GREY, ORANGE, VERMILLION, canvas, legend, output_label, styled
 
@@ -287,8 +289,8 @@ def quantity(estimate: Any) -> tuple[str, str, str]:
     power = 0 if -2 <= power <= 3 else power
     value, stderr = value / 10.0**power, stderr / 10.0**power
     if estimate.identifiable and stderr > 0:
-        places = min(max(1 - math.floor(math.log10(stderr)), 0), 6)
-        return f"{value:.{places}f}", f"± {stderr:.{places}f}", _unit(estimate.unit, power)
+        shown, error = rounded(value, stderr)
+        return shown, f"± {error}", _unit(estimate.unit, power)
     error = "–" if estimate.identifiable else "not determined"
     return f"{value:#.3g}".rstrip("."), error, _unit(estimate.unit, power)
 

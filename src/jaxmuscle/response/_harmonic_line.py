@@ -7,14 +7,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float, Int
 
+from jaxmuscle._common.programs import kept
 from jaxmuscle.model._muscle import Perturbation
 from jaxmuscle.model._signals import Constant
 from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.spectra._bin_law import bin_rows
-from jaxmuscle.spectra._settings import SpectrumSettings
+from jaxmuscle.spectra._settings import WINDOW, SpectrumSettings
 from jaxmuscle.spectra._welch import lowpass, spectrum_of
 
-from ._linearised import Linearisation
+from ._linearised import Linearisation, linearise
 
 
 def _turn(angle: Float[Array, "*any"]) -> Complex[Array, "*any"]:
@@ -70,6 +71,22 @@ class LineTable(NamedTuple):
     def variance(self, reply: Complex[Array, "*frequencies"]) -> Float[Array, "*frequencies"]:
         """Variance of the recording."""
         return 0.5 * (jnp.abs(reply) ** 2 * self.passed - jnp.real(reply**2 * self.twice)) - jnp.imag(reply * self.once) ** 2
+
+
+@kept
+def line_levels(
+    task: AbstractTask, settings: SpectrumSettings, frequency: Float[Array | np.ndarray, " lines"]
+) -> tuple[Float[Array, "lines bins"], Float[Array, " lines"]]:
+    """Of lines of these frequencies [Hz] in the output: Welch power of a mean square of 1 behind the low-pass, the phase
+    averaged; and the mean square behind the low-pass that a harmonic of amplitude √2 has."""
+    system, base = linearise(task), task.harmonic_base()
+
+    def one(f):
+        table = line_table(settings, WINDOW, f, 1)
+        reply = _transfer(system, base, 2 * jnp.pi * f)
+        return 2 * table.level / table.passed, jnp.abs(reply) ** 2 * table.passed
+
+    return jax.vmap(one)(jnp.asarray(frequency))
 
 
 def _turns(turns: Float[Array, ""], start: int, samples: Int[Array | np.ndarray, ""] | int) -> Complex[Array, ""]:

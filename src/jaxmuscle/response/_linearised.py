@@ -83,15 +83,15 @@ def settled(task: AbstractTask, time: float = HOLD) -> AbstractTask:
     """
     traced = not all(is_concrete(leaf) for leaf in jax.tree.leaves(task))
     point = equilibrium(task, time) if traced else np.asarray(linearised(task, time).system.point).tolist()
-    held = {name: Constant(level) for name, level in _inputs(as_arrays(task), time).items()}
+    held = {name: Constant(levels[0]) for name, levels in _inputs(as_arrays(task), np.array([time])).items()}
     found = task.with_parts(**held, initial=tuple(point))
     return found if traced else as_numbers(found)
 
 
 @kept
-def _inputs(task: AbstractTask, time: float) -> dict[str, Scalar]:
-    """Value at `time` of every input that is a function of time."""
-    return {name: signal(jnp.asarray(time)) for name, signal in _signals(task).items()}
+def _inputs(task: AbstractTask, times: Float[Array | np.ndarray, " times"]) -> dict[str, Float[Array, " times"]]:
+    """Values at some times of every input that is a function of time."""
+    return {name: jax.vmap(signal)(jnp.asarray(times)) for name, signal in _signals(task).items()}
 
 
 def _signals(task: AbstractTask) -> dict[str, AbstractSignal]:
@@ -133,23 +133,17 @@ MOVING = 1e-4
 LOOKS = 33
 
 
-@kept
-def _looked_at(task: AbstractTask, window: tuple[float, float]) -> dict[str, Array]:
-    """Every input at times across the window, then its held value."""
-    times = jnp.append(jnp.linspace(*window, LOOKS), HOLD)
-    return {name: jax.vmap(signal)(times) for name, signal in _signals(task).items()}
-
-
 def check_inputs(task: AbstractTask, window: tuple[float, float] = WINDOW) -> None:
     """Refuse inputs that move in the window: a linear response is about held ones."""
     if all(isinstance(signal, Constant) for signal in _signals(task).values()):
         return
+    times = np.append(np.linspace(*window, LOOKS), HOLD)
     with jax.ensure_compile_time_eval(), jax.enable_x64(True):
-        seen = {name: np.asarray(values) for name, values in _looked_at(as_arrays(task), window).items()}
+        seen = {name: np.asarray(values) for name, values in _inputs(as_arrays(task), times).items()}
     for name, values in seen.items():
         off = np.abs(values[:-1] - values[-1])
         if np.max(off) > MOVING * np.max(np.abs(values)):
-            when = np.linspace(*window, LOOKS)[np.argmax(off)]
+            when = times[np.argmax(off)]
             raise OperatingPointError(
                 f"{name} of this {type(task).__name__} moves in the analysed window: at {when:.3g} s it is "
                 f"{values[np.argmax(off)]:.3g}, at the end {values[-1]:.3g}. The linear response needs inputs that are held "
