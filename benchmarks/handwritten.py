@@ -40,7 +40,7 @@ def _column(row: Any, like: Any) -> Any:
 def white_scan(task: AbstractTask, increments: Float[Array, "steps 4 *seeds"], dt: float, every: int) -> Any:
     """Stratonovich Heun for white noise: one `jvp` gives drift and diffusion times increment."""
     start = jnp.zeros((4, *increments.shape[2:]), increments.dtype)
-    base, scale = _column(task.harmonic_base(), start), _column(task.noise_scale(), start)
+    base, scale = _column(task.harmonic_base()[:4], start), _column(task.noise_scale(), start)
 
     def step(carry, x):
         t, dw = x
@@ -75,7 +75,7 @@ def band_scan(
     (f, root, deviation), dtype = matrices, normals.dtype
     f, root = np.asarray(f, dtype), np.asarray(root, dtype)
     start = jnp.zeros((4, *normals.shape[2:]), dtype)
-    base, scale = _column(task.harmonic_base(), start), _column(task.noise_scale(), start) * deviation
+    base, scale = _column(task.harmonic_base()[:4], start), _column(task.noise_scale(), start) * deviation
 
     def slope_of(t, y, u):
         return dt * task.vector_field(t, y, u)
@@ -92,7 +92,7 @@ def band_scan(
 
 def stock_diffrax(task: AbstractTask, path: dfx.AbstractBrownianPath, rate: float, dt: float, steps: int, every: int) -> Any:
     """White noise in plain diffrax: time in seconds, `Heun`, a path of diffrax's own, every `every`-th step saved."""
-    scale, base = task.noise_scale() / np.sqrt(rate), task.harmonic_base()
+    scale, base = task.noise_scale() / np.sqrt(rate), task.harmonic_base()[:4]
 
     def drift(t, y, _):
         return task.vector_field(t, y, base * task.harmonic(t))

@@ -36,14 +36,16 @@ def recordings(task: jm.Isometric, segments: int, count: int, key: int) -> tuple
     return np.asarray(runs.output), window
 
 
-def targets(force: np.ndarray, window: tuple[float, float], segments: int) -> list[jm.Target]:
-    """Their spectra, with the coefficient of variation."""
+def targets(force: np.ndarray, window: tuple[float, float], segments: int, trials: int = 1) -> list[jm.Target]:
+    """Their spectra, with the coefficient of variation; so many recordings in a row are the trials of one target."""
     low = scipy.signal.sosfilt(SETTINGS.sections, force)[
         :, round(window[0] * SETTINGS.rate) : round(window[1] * SETTINGS.rate)
     ]
     power = np.asarray(jm.spectra.spectrum_of(force, SETTINGS, window).power)
-    variation = np.asarray(coefficient_of_variation(low))
-    return [jm.Target(f"recording {i}", p, segments=[segments], settings=SETTINGS, coefficient_of_variation=float(v))
+    power = power.reshape(-1, trials, power.shape[1]).mean(axis=1)
+    variation = np.asarray(coefficient_of_variation(low)).reshape(-1, trials)
+    return [jm.Target(f"recording {i}", p, segments=[segments] * trials, settings=SETTINGS,
+                      coefficient_of_variation=tuple(map(float, v)))
             for i, (p, v) in enumerate(zip(power, variation, strict=True))]  # fmt: skip
 
 

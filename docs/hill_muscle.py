@@ -81,12 +81,13 @@ def tendon_strain(force):
 class HillMuscle(jm.AbstractMuscle):
     """Contractile and parallel elastic element (the active tissue) in series with a tendon (the passive tissue).
 
-        active_force  = P_0 - [a F_max f_L(λ) f_V(ν) + F_max f_P(λ)] cos α + ΔK_w x_w + ΔC_w x_w'
+        active_force  = P_0 - [a (1 + ΔP_w/P_w) F_max f_L(λ) f_V(ν) + F_max f_P(λ)] cos α + ΔK_w x_w + ΔC_w x_w'
         passive_force = -F_max f_T(η) + (c_T + ΔC_z) (x_z' - x_w') + ΔK_z (x_z - x_w)
 
     x_w is how far the belly has shortened along the tendon, x_z how far the insertion has come; x_w = x_z = 0 is the
     fibre at its optimal length and the tendon just slack. P_w is the contractile force that the drive would give there;
-    its value for the muscle's activation is P_0 = a F_max cos α₀ (`held_force`): `at_activation` sets both.
+    its value for the muscle's activation is P_0 = a F_max cos α₀ (`held_force`): `at_activation` sets both. Noise of the
+    drive multiplies the activation.
 
         λ = ℓ / ℓ₀,   ℓ² = (ℓ₀ cos α₀ - x_w)² + (ℓ₀ sin α₀)²,   cos α = (ℓ₀ cos α₀ - x_w) / ℓ      constant thickness
         ν = -x_w' cos α / (v_max ℓ₀),   η = (x_w - x_z) / (ε₀ ℓ_T)
@@ -136,11 +137,11 @@ class HillMuscle(jm.AbstractMuscle):
         length = jnp.sqrt(along**2 + jnp.sin(self.pennation) ** 2)
         return length, along / length
 
-    def belly_force(self, x_w, v_w):
-        """Pull [N] of the contractile and the parallel elastic element along the tendon."""
+    def belly_force(self, x_w, v_w, surge=0.0):
+        """Pull [N] of the contractile and the parallel elastic element along the tendon; the drive is 1 + `surge`."""
         length, cosine = self.fibre(x_w)
         lengthening = -v_w * cosine / (self.velocity_max * self.optimal_length)
-        active = self.activation * force_length(length) * force_velocity(lengthening)
+        active = self.activation * (1 + surge) * force_length(length) * force_velocity(lengthening)
         return self.force_max * (active + passive_length(length)) * cosine
 
     def tendon_force(self, stretch):
@@ -166,8 +167,12 @@ class HillMuscle(jm.AbstractMuscle):
         _, C_w = _slope(lambda v: self.active_force(x, v, none), still)
         return jnp.stack([K_w, K_z, C_w, jnp.asarray(self.tendon_damping, x.dtype)])
 
+    def drive(self, force, u):
+        return force
+
     def active_force(self, x_w, v_w, u):
-        return self.held_force - self.belly_force(x_w, v_w) + u[0] * x_w + u[2] * v_w
+        surge = u[4] if len(u) > 4 else 0.0
+        return self.held_force - self.belly_force(x_w, v_w, surge) + u[0] * x_w + u[2] * v_w
 
     def passive_force(self, x_w, v_w, x_z, v_z, u):
         return (self.tendon_damping + u[3]) * (v_z - v_w) + u[1] * (x_z - x_w) - self.tendon_force(x_w - x_z)

@@ -136,6 +136,19 @@ def test_moments_are_those_of_a_plain_ensemble(x64, task, colour_free):
     np.testing.assert_allclose(moments.proportional, moments.power / moments.power.sum())
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("name, value", [("resonance_frequency", 5.0), ("resonance_width", 0.5), ("noise_cutoff", 20.0)])
+def test_paths_follow_the_colour_of_every_part_of_a_sum(x64, name, value):
+    """Free, a frequency, width or cutoff moves the paths: the moments are those of paths made with it."""
+    task = jm.Isometric(noise=jm.BandLimitedNoise() + jm.ResonantNoise(0.02))
+    moved, target = task.replace(**{name: value}), simple_target()
+    models = [part_of(setup_of(t, target, (free,)), seeds=2).model for t, free in ((task, name), (moved, "c_w"))]
+    free, fixed = (eqx.filter_jit(model.moments)(as_arrays(moved)) for model in models)
+    np.testing.assert_allclose(free.power, fixed.power, rtol=1e-9)
+    before = eqx.filter_jit(models[0].moments)(as_arrays(task))
+    assert np.max(np.abs(before.power / free.power - 1)) > 0.01
+
+
 # --- coordinates
 
 NATURAL = {"c_w": 60.0, "F_ext": -2.0, "harmonic_frequency": 4.25, "noise_K_w": 0.15, "harmonic_phase": 0.3}

@@ -16,6 +16,7 @@ from jaxmuscle._common.errors import PresetError, ResultError
 from jaxmuscle._common.files import replacing, write_json, write_text
 from jaxmuscle.fits import Estimate
 from jaxmuscle.fits._adequacy import Adequacy
+from jaxmuscle.fits._ladder import Rung
 from jaxmuscle.fits._part import Start
 from jaxmuscle.fits._result import FORMAT
 from jaxmuscle.model._presets import task_from_table, task_to_table
@@ -58,6 +59,8 @@ def made_result(**changes: Any) -> jm.fits.FitResult:
         "harmonic_share": rng.uniform(0, 1, 30),
         "residual": rng.standard_normal(30),
         "deviation": rng.uniform(0.1, 0.3, 30),
+        "components": {"relaxation": rng.uniform(0, 1, 30), "tremor": rng.uniform(0, 1, 30)},
+        "ladder": (Rung(0, "base", -250.1, 6.5, 1.9, 0.002), Rung(1, "with activation", -260.0, 7.1, 0.9, 0.3, True)),
         "starts": (Start(1.5, True, 12), Start(None, False, 3)),
         "stretch": (np.arange(10.0, 15.0, 0.01), rng.standard_normal(500)),
         "profile": (np.linspace(0.4, 11.7, 64), rng.uniform(0, 9, 64)),
@@ -80,7 +83,7 @@ def failed_result():
         success=False, message="no start has a finite spectrum", derived={"mean": Estimate(np.nan, "N")}, adequacy=None,
         products=(), further={}, correlation={}, undetermined=(),
         singular_values=np.full(2, np.nan), chi2_per_bin=None, rms_log_error=None,
-        fitted=nothing, harmonic_share=nothing, residual=nothing, deviation=None,
+        fitted=nothing, harmonic_share=nothing, residual=nothing, deviation=None, components={}, ladder=(),
         stretch=(np.zeros(0), np.zeros(0)), profile=None, harmonic_p_value=None, check={}, seed=None,
         starts=(Start(None, False, 0),),
     )  # fmt: skip

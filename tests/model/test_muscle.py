@@ -189,7 +189,15 @@ def _tasks():
         *(jm.Isometric(noise=noise) for noise in (*noises, white)),
         *(jm.PrescribedForce(noise=noise) for noise in (*noises, jm.WhiteNoise())),
         *(jm.PrescribedMotion(noise=noise) for noise in (noises[0], smooth)),
+        _with_everything(),
     ]
+
+
+def _with_everything():
+    """Also what is off by default, at the table's values."""
+    second = (PARAMETERS[f"resonance_2_{what}"].default for what in ("amplitude", "frequency", "width"))
+    noise = jm.BandLimitedNoise() + jm.ResonantNoise() + jm.ResonantNoise(*second)
+    return jm.Isometric(noise=noise, activation=jm.Activation()).replace(noise_P_w=PARAMETERS["noise_P_w"].default)
 
 
 @pytest.mark.parametrize("task", _tasks(), ids=lambda t: f"{type(t).__name__}-{type(t.noise).__name__}")
@@ -245,7 +253,7 @@ def test_the_base_coefficients_are_k_times_reference_squared(x64):
     task = jm.Isometric().replace(k_w=3e5, x_ref_w=0.03, c_z=7.0, v_ref_z=0.5)
     np.testing.assert_allclose(task.muscle.base(), [270.0, 200.0, 60.0, 1.75], rtol=1e-14)
     np.testing.assert_allclose(task.noise_scale(), [270.0 * 0.15, 200.0 * 0.005, 60e-4, 1.75e-4], rtol=1e-14)
-    np.testing.assert_allclose(task.harmonic_base(), [270.0, 200.0, 0.0, 0.0], rtol=1e-14)
+    np.testing.assert_allclose(task.harmonic_base(), [270.0, 200.0, 0.0, 0.0, 0.0], rtol=1e-14)
 
 
 def test_initial_state_has_the_tasks_length():

@@ -212,7 +212,7 @@ def test_relative_noise_is_absolute_noise_of_that_size(x64):
 
 @pytest.mark.parametrize("kind", [jm.WhiteNoise, jm.BandLimitedNoise, jm.OrnsteinUhlenbeckNoise])
 def test_impossible_amplitudes_are_refused(kind):
-    with pytest.raises(ValueError, match=r"unknown coefficient \['K_x'\]: known: K_w, K_z, C_w, C_z"):
+    with pytest.raises(ValueError, match=r"unknown input \['K_x'\]: known: K_w, K_z, C_w, C_z, P_w"):
         kind({"K_x": 0.1})
     with pytest.raises(ValueError, match="noise amplitude has 3 entries"):
         kind((0.1, 0.2, 0.3))

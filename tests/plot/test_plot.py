@@ -262,6 +262,8 @@ def result(**changes):
         "frequency_hz": f,
         "fitted": fitted,
         "harmonic_share": share,
+        "components": {"relaxation": 0.9 * (1 - share), "floor": 0.1 * (1 - share), "harmonic": share},
+        "model": "Isometric, BandLimitedNoise",
         "residual": residual,
         "deviation": np.full(f.size, 0.3),
         "undetermined": ("stiffness and damping can be scaled together",),
@@ -293,6 +295,20 @@ def failed():
 def panels(figure):
     """Linear and logarithmic spectrum, residuals, output: the axes between header and tables."""
     return figure.axes[1:5]
+
+
+def test_the_parts_of_a_model_with_tremor_are_areas_that_add_up_to_the_fit():
+    f = result().frequency_hz
+    tremor = np.where(np.abs(f - 9) < 1, 0.8, 0.0)
+    parts = {"relaxation": 0.7 * (1 - tremor), "floor": 0.3 * (1 - tremor), "harmonic": 0 * f, "tremor": tremor}
+    found = result(components=parts, model="Isometric, BandLimitedNoise + ResonantNoise, activation")
+    linear, logarithmic, _, _ = panels(plot.fit(found))
+    labels = [text.get_text() for text in linear.get_legend().get_texts()]
+    assert [label.partition(",")[0] for label in labels[-3:]] == ["floor", "relaxation", "tremor"]
+    assert sum(int(label.split(", ")[1].split()[0]) for label in labels[-3:]) == pytest.approx(100, abs=2)
+    top = max(path.vertices[:, 1].max() for area in linear.collections[-3:] for path in area.get_paths())
+    assert top == pytest.approx(found.fitted.max())
+    assert len(logarithmic.lines) == len(linear.lines) + 3  # a line for each instead
 
 
 def test_fit_draws_the_fitted_spectrum_twice_with_target_and_harmonic():
@@ -331,7 +347,7 @@ def test_fit_tells_verdict_parameters_and_what_is_not_determined():
     said = texts(plot.fit(result()))
     for text in (
         "vastus-lateralis-26mvc", "Describes the data: chi2 per bin 1.2, p = 0.2",
-        "Isometric (BandLimitedNoise)  ·  linear  ·  χ² per bin 1.18  ·  rms log error 0.31  ·  28 of 100 starts agree",
+        "Isometric, BandLimitedNoise  ·  linear  ·  χ² per bin 1.18  ·  rms log error 0.31  ·  28 of 100 starts agree",
         "k_w", "4.20", "± 0.13", "10⁵ N/m³", "c_w", "57.0", "not determined", "N s³/m³", "3.900", "± 0.047", "Hz",
         "corner_frequency", "1.23", "± 0.16", "•  stiffness and damping can be scaled together",
     ):  # fmt: skip
@@ -366,7 +382,7 @@ def test_a_failed_fit_still_shows_the_target_and_the_reason():
     said = texts(figure)
     assert "Not fitted: no start has a finite spectrum: lower the noise" in said
     assert {"no finite fit", "no finite simulation", "none"} <= set(said)
-    assert "Isometric (BandLimitedNoise)  ·  linear" in said
+    assert "Isometric, BandLimitedNoise  ·  linear" in said
     assert not any(line.get_label() == "fit" for line in panels(figure)[0].lines)
 
 

@@ -40,13 +40,13 @@ def active(p, x):
 
 
 def isometric(p, s):
-    """Responses of F_ext to N_Kw and N_Kz by equation (1a) with x_z held, and F_ext at rest."""
+    """Responses of F_ext to N_Kw, N_Kz and P_w by equation (1a) with x_z held, and F_ext at rest."""
     held = p["x_z"]
     K_z = coefficients(p, 0.0, held)[1]
     x = root(lambda x: active(p, x) + K_z * (x - held) - p["P_w"])
     K_w, _, C_w, C_z = coefficients(p, x, held)
     passive = (C_z * s + K_z) / (p["m_w"] * s**2 + (C_w + C_z) * s + K_w + K_z)
-    return -x * passive, (x - held) * (1 - passive), K_z * (x - held)
+    return -x * passive, (x - held) * (1 - passive), passive, K_z * (x - held)
 
 
 def prescribed_force(p, s):
@@ -58,7 +58,7 @@ def prescribed_force(p, s):
     inner, link = p["m_w"] * s**2 + (C_w + C_z) * s + K_w + K_z, C_z * s + K_z
     outer, back = p["m_z"] * s**2 + C_z * s + tangent, C_z * s + tangent
     determinant = inner * outer - back * link
-    return -link * x_w / determinant, (x_z - x_w) * (link - inner) / determinant, x_z
+    return -link * x_w / determinant, (x_z - x_w) * (link - inner) / determinant, link / determinant, x_z
 
 
 def prescribed_motion(p, s):
@@ -67,7 +67,7 @@ def prescribed_motion(p, s):
     x = p["x_z"] + p["F_ext"] / K_z
     K_w, _, C_w, C_z = coefficients(p, x, p["x_z"])
     along = (p["x_z"] - x) / (C_z * s + K_z)
-    return x + 0 * s, along * (p["m_w"] * s**2 + C_w * s + K_w), active(p, x) + p["F_ext"]
+    return x + 0 * s, along * (p["m_w"] * s**2 + C_w * s + K_w), 0 * s, active(p, x) + p["F_ext"]
 
 
 RESPONSES = {"Isometric": isometric, "PrescribedForce": prescribed_force, "PrescribedMotion": prescribed_motion}
@@ -77,21 +77,40 @@ def stiffness(p):
     return p["k_w"] * p["x_ref_w"] ** 2, p["k_z"] * p["x_ref_z"] ** 2
 
 
+def replies(task, p, f):
+    """Of the output to a relative change of K_w, K_z, C_w, C_z and P_w; at rest damping does nothing."""
+    s = 2j * np.pi * f
+    H_w, H_z, H_P, _ = RESPONSES[type(task).__name__](p, s)
+    (K_w, K_z), twitch = stiffness(p), 1 / (1 + s * p.get("activation_time", 0.0)) ** 2
+    return np.stack([K_w * H_w * twitch, K_z * H_z, 0 * s, 0 * s, p.get("P_w", 0.0) * H_P * twitch])
+
+
+def shape(noise, f):
+    """Two-sided density of a noise of amplitude 1."""
+    match noise:
+        case jm.WhiteNoise():
+            return 1 / noise.rate
+        case jm.BandLimitedNoise():
+            return 1 / noise.rate / (1 + (f / noise.cutoff) ** 4)
+        case jm.ResonantNoise():
+            return noise.width / np.pi * f**2 / ((noise.frequency**2 - f**2) ** 2 + noise.width**2 * f**2)
+        case _:
+            tau = noise.correlation_time
+            return 2 * tau / (1 + (2 * np.pi * f * tau) ** 2)
+
+
+ACTS_ON = {1: [4], 4: [0, 1, 2, 3], 5: [0, 1, 2, 3, 4]}
+
+
 def density(task, p, settings, f):
     """Two-sided density of the output's noise before sampling."""
-    H_w, H_z, _ = RESPONSES[type(task).__name__](p, 2j * np.pi * f)
-    from_w, from_z = (p[f"noise_{n}"] * K * H for n, K, H in zip(("K_w", "K_z"), stiffness(p), (H_w, H_z), strict=True))
-    gain = np.abs(from_w + from_z) ** 2 if task.noise.shared else np.abs(from_w) ** 2 + np.abs(from_z) ** 2
-    match task.noise:
-        case jm.WhiteNoise():
-            shape = 1 / p["noise_rate"]
-        case jm.BandLimitedNoise():
-            shape = 1 / p["noise_rate"] / (1 + (f / p["noise_cutoff"]) ** 4)
-        case _:
-            tau = p["noise_correlation_time"]
-            shape = 2 * tau / (1 + (2 * np.pi * f * tau) ** 2)
+    total, reply = np.zeros(np.shape(f)), replies(task, p, f)
+    for noise in task.noise.components:
+        part = np.asarray(noise.amplitude)[:, None] * reply[ACTS_ON[len(noise.amplitude)]]
+        gain = np.abs(part.sum(axis=0)) ** 2 if noise.shared else np.sum(np.abs(part) ** 2, axis=0)
+        total = total + gain * shape(noise, f)
     averaged = np.sinc(f / settings.rate) ** 2 if settings.sampling == "average" else 1.0
-    return gain * shape * averaged
+    return total * averaged
 
 
 REACH = 100
@@ -142,9 +161,7 @@ def line_by_scipy(task, settings, window):
     """Welch power and variance of the harmonic's steady response as a time series."""
     p = {name: float(value) for name, value in task.parameters.items()}
     f = np.array([p["harmonic_frequency"]])
-    H_w, H_z, _ = RESPONSES[type(task).__name__](p, 2j * np.pi * f)
-    K_w, K_z = stiffness(p)
-    reply = (K_w * H_w + K_z * H_z) * p["harmonic_amplitude"] * np.exp(1j * p["harmonic_phase"])
+    reply = replies(task, p, f)[:2].sum(axis=0) * p["harmonic_amplitude"] * np.exp(1j * p["harmonic_phase"])
     if settings.sampling == "average":
         reply = reply * np.sinc(f / settings.rate) * np.exp(-1j * np.pi * f / settings.rate)
     time = np.arange(round(window[0] * settings.rate), round(window[1] * settings.rate)) / settings.rate
@@ -173,7 +190,7 @@ def by_quadrature(task, settings, window, points=4096):
     turn = np.exp(2j * np.pi * f / settings.rate)
     mean = np.where(f == 0, samples, (turn**samples - 1) / np.where(f == 0, 1, turn - 1)) / samples
     variance = np.sum(S * (1 - np.abs(mean) ** 2)) * settings.rate / points
-    return noise, line, RESPONSES[type(task).__name__](p, np.zeros(1))[2], variance + swing
+    return noise, line, RESPONSES[type(task).__name__](p, np.zeros(1))[-1], variance + swing
 
 
 BOTH = {"K_w": 0.15, "K_z": 0.05}
@@ -212,7 +229,10 @@ def some_slow(names, fast):
 def test_closed_form_is_the_quadrature_of_the_transfer_functions(x64, name):
     kind, noise, changes = CASES[name]
     settings, window = Settings().replace(**changes), SHIFTED if name == "isometric, OU" else WINDOW
-    task = kind(*INPUTS[kind], noise=noise, harmonic=RHYTHM)
+    assert_as_by_quadrature(kind(*INPUTS[kind], noise=noise, harmonic=RHYTHM), settings, window)
+
+
+def assert_as_by_quadrature(task, settings, window):
     moments, _ = expected_moments(as_arrays(task), settings, window)
     noise, line, mean, variance = by_quadrature(task, settings, window)
     np.testing.assert_allclose(moments.power, noise + line, rtol=ALIASES)
@@ -346,10 +366,16 @@ DIFFERENTIATED = {
     "isometric": jm.Isometric(5.0, 0.003, noise=jm.OrnsteinUhlenbeckNoise(0.05)),
     "force": jm.PrescribedForce(5.0, 1.0, noise=jm.WhiteNoise(0.05)),
     "motion": jm.PrescribedMotion(0.004, 5.0),
+    "all": jm.Isometric(
+        5.0,
+        0.003,
+        noise=jm.BandLimitedNoise((0.1, 0.05, 0.01, 0.01, 0.02)) + jm.ResonantNoise(0.01) + jm.ResonantNoise(0.01, 3.5, 1.0),
+        activation=jm.Activation(0.06),
+    ),
 }
 # At rest nothing moves: noise on damping has no first-order effect, nor has the mass of an insertion that is held.
 SILENT = {"noise_C_w", "noise_C_z"}
-SILENT_IN = {"isometric": SILENT | {"m_z"}, "force": SILENT, "motion": SILENT | {"m_z"}}
+SILENT_IN = {"isometric": SILENT | {"m_z"}, "force": SILENT, "motion": SILENT | {"m_z"}, "all": SILENT | {"m_z"}}
 
 
 @pytest.mark.slow
@@ -407,13 +433,13 @@ def test_single_precision(name):
 def test_lags_and_the_variance_of_a_mean_are_plain_sums(x64, samples):
     rng = np.random.default_rng(samples)
     step = 0.99 * scipy.linalg.expm(0.3 * (rng.normal(size=(3, 3)) - 2 * np.eye(3)))
-    first, row, start = 1.7, rng.normal(size=3), rng.normal(size=3)
-    r, state = [first], start
+    first, rows, start = 1.7, rng.normal(size=(2, 3)), rng.normal(size=(2, 3))
+    r, states = [first], start
     for _ in range(samples - 1):
-        r.append(row @ state)
-        state = step @ state
+        r.append(sum(row @ state for row, state in zip(rows, states, strict=True)))
+        states = [step @ state for state in states]
     powers = jnp.stack([np.linalg.matrix_power(step, 2**k) for k in range(11)])
-    found = _Autocovariance(jnp.asarray(first), jnp.asarray(row), powers, jnp.asarray(start))
+    found = _Autocovariance(jnp.asarray(first), jnp.asarray(rows), powers, jnp.asarray(start))
     np.testing.assert_allclose(found.lagged(samples), r, rtol=1e-12, atol=1e-13)
     lag = np.abs(np.subtract.outer(np.arange(samples), np.arange(samples)))
     np.testing.assert_allclose(found.mean_variance(samples), np.array(r)[lag].mean(), rtol=1e-11)

@@ -33,6 +33,8 @@ CASES = {
     "light damping": jm.Isometric().replace(c_w=0.3, c_z=0.3, noise_K_w=0.2),
     "displacement, harmonic of 10 %": jm.PrescribedForce(F_ext=3.0).replace(harmonic_amplitude=0.1),
     "motion, harmonic of 10 %": jm.PrescribedMotion().replace(harmonic_amplitude=0.1),
+    "activation, harmonic of 30 %": jm.Isometric(activation=jm.Activation()).replace(harmonic_amplitude=0.3),
+    "activation, resonance": jm.Isometric(noise=jm.ResonantNoise({"K_w": 0.5}, 4.0, 1.0), activation=jm.Activation(0.03)),
 }
 
 

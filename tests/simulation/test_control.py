@@ -266,7 +266,7 @@ def test_the_linear_task_is_the_tangent(x64, kind):
     linear = linearised(task)
     point, t = linear.initial_state(), jnp.asarray(15.0)
     dy = jnp.asarray(1e-3 * rng.normal(size=point.size))
-    u, du = (jnp.asarray(size * rng.normal(size=4)) for size in (1.0, 100.0))
+    u, du = (jnp.asarray(size * rng.normal(size=5)) for size in (1.0, 100.0))
 
     def left(h):
         y = point + h * dy

@@ -13,9 +13,16 @@ TASKS = {
     "motion": jm.PrescribedMotion(0.004, 5.0, settings=SETTINGS),
     "force": jm.PrescribedForce(5.0, 1.0, noise=jm.WhiteNoise(0.05), settings=SETTINGS),
     "isometric": jm.Isometric(5.0, 0.003, noise=jm.OrnsteinUhlenbeckNoise(0.05), settings=SETTINGS),
+    "all": jm.Isometric(
+        5.0,
+        0.003,
+        noise=jm.OrnsteinUhlenbeckNoise((0.05, 0.05, 0.05, 0.05, 0.02)) + jm.ResonantNoise(0.01),
+        activation=jm.Activation(0.06),
+        settings=SETTINGS,
+    ),
 }
 SUBSTEPS = {"isometric": 2}
-WITHOUT_INFLUENCE = {"motion": (), "force": (), "isometric": ("m_z",)}
+WITHOUT_INFLUENCE = {"motion": (), "force": (), "isometric": ("m_z",), "all": ("m_z",)}
 
 
 @pytest.mark.slow

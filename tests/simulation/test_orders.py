@@ -10,7 +10,7 @@ import references
 import jaxmuscle as jm
 from jaxmuscle.model._noise import Realisation
 from jaxmuscle.simulation._grid import Grid
-from jaxmuscle.simulation._integrator import observe, solve
+from jaxmuscle.simulation._integrator import Forcing, observe, solve
 
 KEY = jax.random.key(5)
 FINE, SECONDS, SEEDS = 2**14, 0.25, 400
@@ -34,10 +34,15 @@ def strong_errors(task, factors):
     @eqx.filter_jit
     def final(path, factor):
         grid = Grid(factor / FINE, steps // factor, steps // factor)
-        return jax.vmap(lambda p: solve(task, coarsened(p, factor), grid)[-1] * scale)(path)
+        return jax.vmap(lambda p: solve(task, Forcing.of(task, coarsened(p, factor), grid), grid)[-1] * scale)(path)
 
     reference = final(fine, 1)
     return [float(jnp.sqrt(jnp.mean(jnp.sum((final(fine, factor) - reference) ** 2, axis=-1)))) for factor in factors]
+
+
+def seen(task, path, grid):
+    given = Forcing.of(task, path, grid)
+    return observe(task, given, grid, solve(task, given, grid))
 
 
 def moving(noise):
@@ -97,11 +102,11 @@ def test_what_task_1_asks_for_moves_task_2_the_same_way(x64, amplitude, lowest, 
     for factor in (16, 8, 4):
         dt, steps = factor / fine, int(seconds * fine) // factor
         grid, here = Grid(dt, steps, 1), coarsened(path, factor)
-        force = np.asarray(eqx.filter_jit(lambda p, g=grid: observe(forward, p, g, solve(forward, p, g)))(here))
+        force = np.asarray(eqx.filter_jit(seen)(forward, here, grid))
         time = dt * np.arange(steps + 1)
         pulled = jm.model.Sampled.through(time, force)
         back = forward.as_task(jm.PrescribedForce, P_w=pulled, F_ext=forward.F_ext)
-        x_z = np.asarray(eqx.filter_jit(lambda p, b=back, g=grid: solve(b, p, g)[:, 2])(here))
+        x_z = np.asarray(eqx.filter_jit(seen)(back, here, grid))
         expected = np.asarray(jax.vmap(forward.x_z)(time))
         errors.append(np.abs(x_z - expected).max() / 0.005)
         dts.append(dt)

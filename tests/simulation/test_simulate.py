@@ -16,7 +16,7 @@ from jaxmuscle.model import Decay, RampHold, Sampled, SmoothStep
 from jaxmuscle.model._noise import Realisation
 from jaxmuscle.simulation._batch import draw
 from jaxmuscle.simulation._grid import Grid
-from jaxmuscle.simulation._integrator import solve
+from jaxmuscle.simulation._integrator import Forcing, solve
 
 KEY = jax.random.key(11)
 HARMONIC = jm.Harmonic(0.1, 4.25, 0.3)
@@ -142,8 +142,8 @@ def test_every_step_gets_its_own_noise(steps, every, substeps, precision):
         noise = np.random.default_rng(0).normal(size=(steps + 1, 4)).astype(precision)
         task = Integral(noise=jm.WhiteNoise(1.0, relative=False), harmonic=jm.Harmonic(0.0))
         grid = Grid(1e-3, steps, every, substeps)
-        smooth = solve(task, Realisation(values=jnp.asarray(noise)), grid)[:, 0]
-        rough = solve(task, Realisation(increments=jnp.asarray(noise[1:])), grid)[:, 0]
+        paths = Realisation(values=jnp.asarray(noise)), Realisation(increments=jnp.asarray(noise[1:]))
+        smooth, rough = (solve(task, Forcing.of(task, path, grid), grid)[:, 0] for path in paths)
         sums = np.cumsum(0.5e-3 * (noise[1:, 0] + noise[:-1, 0]).astype(float)), np.cumsum(noise[1:, 0].astype(float))
         for seen, expected, size in ((smooth, sums[0], 1e-3), (rough, sums[1], 1.0)):
             # One wrong value is an error of order `size`, at a thousand of the steps.

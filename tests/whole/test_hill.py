@@ -16,7 +16,7 @@ from jaxmuscle.model import SmoothStep
 
 DOCS = Path(__file__).parents[2] / "docs"
 KEY = jax.random.key(7)
-STILL = np.zeros(4)
+STILL = np.zeros(5)
 
 
 hill = pages.module(DOCS / "hill_muscle.py")
@@ -36,11 +36,11 @@ def numpy_velocity(v):
     return np.where(v < 0, 0.25 * 1.25 / (0.25 - v) - 0.25, 1 + 0.4 * w / (1 + w))
 
 
-def numpy_belly(p, x_w, v_w):
+def numpy_belly(p, x_w, v_w, surge=0.0):
     height, along = p["optimal_length"] * np.sin(p["pennation"]), p["optimal_length"] * np.cos(p["pennation"]) - x_w
     angle, length = np.arctan2(height, along), np.hypot(height, along) / p["optimal_length"]
     velocity = numpy_velocity(-v_w * np.cos(angle) / (p["velocity_max"] * p["optimal_length"]))
-    active = p["activation"] * np.exp(-((length - 1) ** 2) / 0.45) * velocity
+    active = (1 + surge) * p["activation"] * np.exp(-((length - 1) ** 2) / 0.45) * velocity
     passive = (np.exp(5 * (length - 1) / 0.6) - 1) / (np.exp(5) - 1)
     return p["force_max"] * (active + passive) * np.cos(angle)
 
@@ -55,7 +55,7 @@ def numpy_tendon(p, stretch):
 def numpy_forces(p, x_w, v_w, x_z, v_z, u=STILL):
     """Active and passive force."""
     held = p["activation"] * p["force_max"] * np.cos(p["pennation"])
-    active = held - numpy_belly(p, x_w, v_w) + u[0] * x_w + u[2] * v_w
+    active = held - numpy_belly(p, x_w, v_w, u[4]) + u[0] * x_w + u[2] * v_w
     passive = (p["tendon_damping"] + u[3]) * (v_z - v_w) + u[1] * (x_z - x_w) - numpy_tendon(p, x_w - x_z)
     return active, passive
 
@@ -133,10 +133,12 @@ def test_the_passive_curves_are_smooth(x64):
 def test_forces_are_the_equations(muscle):
     p, rng = numpy_values(muscle), np.random.default_rng(2)
     for _ in range(20):
-        y, u = rng.normal(size=4) * [0.006, 0.05, 0.005, 0.05], rng.normal(size=4) * [40, 40, 5, 1]
+        y, u = rng.normal(size=4) * [0.006, 0.05, 0.005, 0.05], rng.normal(size=5) * [40, 40, 5, 1, 0.2]
         active, passive = numpy_forces(p, *y, u)
         np.testing.assert_allclose(muscle.active_force(y[0], y[1], u), active, rtol=1e-10, atol=1e-12)
         np.testing.assert_allclose(muscle.passive_force(*y, u), passive, rtol=1e-10, atol=1e-12)
+        assert muscle.active_force(y[0], y[1], u[:4]) == muscle.active_force(y[0], y[1], u * [1, 1, 1, 1, 0])
+        assert muscle.drive(4.0, u) == 4.0
         v_w = muscle.contraction_velocity(y[0], y[2], y[3], 3.0 * y[1], u)
         np.testing.assert_allclose(muscle.passive_force(y[0], v_w, y[2], y[3], u), 3.0 * y[1], rtol=1e-10, atol=1e-10)
 
@@ -244,7 +246,7 @@ def rhythm(task, t):
     ahead, behind = (np.array(numpy_forces(p, x + s, 0.0, 0.0, 0.0)) for s in (h, -h))
     K = (ahead - behind) / (2 * h) * [1, -1]
     sine = p["harmonic_amplitude"] * np.sin(2 * np.pi * p["harmonic_frequency"] * t)
-    return np.array([K[0] * sine, K[1] * sine, 0.0, 0.0])
+    return np.array([K[0] * sine, K[1] * sine, 0.0, 0.0, 0.0])
 
 
 TASKS = {
@@ -302,7 +304,8 @@ def test_prescribed_motion_is_the_inverse_problem(x64):
         return v_z + (pull - elastic) / (p["tendon_damping"] + u[3])
 
     for t in (0.3, 0.45, 3.0):
-        x_w, u, du = -0.001 + 1e-3 * rng.normal(), rng.normal(size=4) * [20, 90, 5, 1], rng.normal(size=4) * [99, 99, 9, 9]
+        u, du = rng.normal(size=5) * [20, 90, 5, 1, 0.2], rng.normal(size=5) * [99, 99, 9, 9, 2]
+        x_w = -0.001 + 1e-3 * rng.normal()
         v_w = velocity(t, x_w, u)
         ahead, behind = (velocity(t + s, x_w + s * v_w, u + s * du) for s in (h, -h))
         active, _ = numpy_forces(p, x_w, v_w, 0.0, 0.0, u)
@@ -403,6 +406,27 @@ def test_the_spectrum_goes_by_its_rules(x64):
     density = references.aliased(lambda f: 1 / (100 * (1 + (f / 50) ** 4)), 100.0, f)
     # Left out: K_w / (K_w + K_z) below 0.1 %, the resonance near 670 Hz, the bend of the density across a bin.
     np.testing.assert_allclose(jm.expected_spectrum(alone).power[1:12], 2 * (0.15 * K_w * x_w) ** 2 * density, rtol=0.01)
+
+
+@pytest.mark.parametrize("time", [0.0, 0.05])
+def test_a_noisy_drive_multiplies_the_activation(x64, time):
+    """By differences of the NumPy forces: F_act n drives m x'' + (C_w + c_T) x' + (K_w + K_z) x, felt through the tendon."""
+    activation = jm.Activation(time) if time else None
+    task = hill.held_task(noise=jm.ResonantNoise(0.02, 6.0, 2.0), harmonic=jm.Harmonic(0.0), activation=activation)
+    p, x_z, h = numpy_values(task.muscle), 0.005, 1e-6
+    x = scipy.optimize.brentq(lambda x: numpy_tendon(p, x - x_z) - numpy_belly(p, x, 0.0), x_z, x_z + 0.01, xtol=1e-16)
+    slope = lambda along: (along(h) - along(-h)) / (2 * h)  # noqa: E731
+    K_w, C_w = slope(lambda d: -numpy_belly(p, x + d, 0.0)), slope(lambda d: -numpy_belly(p, x, d))
+    K_z, pull = slope(lambda d: numpy_tendon(p, x + d - x_z)), numpy_belly(p, x, 0.0, 1.0) - numpy_belly(p, x, 0.0)
+
+    def density(f):
+        s = 2j * np.pi * f
+        passive = (p["tendon_damping"] * s + K_z) / (p["m_w"] * s**2 + (C_w + p["tendon_damping"]) * s + K_w + K_z)
+        tremor = 0.02**2 * 2.0 / np.pi * f**2 / ((36.0 - f**2) ** 2 + (2.0 * f) ** 2)
+        return np.abs(pull * passive / (1 + s * time) ** 2) ** 2 * tremor
+
+    # Differences: h² f''' / 6 and 1e-16 / h; aliases from beyond a thousand sampling rates.
+    np.testing.assert_allclose(jm.expected_spectrum(task).power, references.expected_welch(density), rtol=1e-6)
 
 
 @pytest.mark.slow

@@ -22,8 +22,8 @@ ELSEWHERE = {"docs/digitise.md": "data/test_digitised.py", "docs/own-muscle.md":
 BELOW = {"docs/gallery.md"}  # its program is read instead
 RUN_HERE = {
     "README.md", "docs/coming-from-diffrax.md", "docs/coming-from-matlab.md", "docs/ensembles.md", "docs/fit-a-csv.md",
-    "docs/fitting.md", "docs/identifiability.md", "docs/index.md", "docs/recordings.md", "docs/reference/figures.md",
-    "docs/scaling.md", "docs/tutorial.md", "docs/uncertainty.md",
+    "docs/fitting.md", "docs/force.md", "docs/identifiability.md", "docs/index.md", "docs/recordings.md",
+    "docs/reference/figures.md", "docs/scaling.md", "docs/tutorial.md", "docs/uncertainty.md",
 }  # fmt: skip
 FEWER_SEEDS = {"seeds=100_000": "seeds=1_000"}
 CALLED_OFTEN = ("fit", "ensemble", "profile", "posterior", "identifiability", "compare_noise", "goodness", "bootstrap")
@@ -133,6 +133,16 @@ def test_tutorial_and_front_page():
     assert "harmonic_frequency" in names["sharper"].free and jm.load_result("mine.json").success
     assert pages.run("docs/index.md")["result"].success
     assert pages.run("docs/fitting.md")["in_newtons"].derived["mean"].value == pytest.approx(40.5, abs=3 * 0.8)
+
+
+@pytest.mark.slow
+def test_force():
+    """The share that the page states, and a fit that stays on the lowest rung."""
+    names = pages.run("docs/force.md")
+    near = names["tremor"][names["near"]].sum() / names["tremor"].sum()
+    text = (pages.ROOT / "docs" / "force.md").read_text(encoding="utf-8")
+    assert f"It prints {near:.2f}." in text and f"{100 * near:.0f} % of the tremor's power" in text
+    assert [rung.number for rung in names["result"].ladder] == [0]
 
 
 @pytest.mark.slow

@@ -15,7 +15,6 @@ from .options import (
     Free,
     MethodName,
     Noise,
-    NoiseName,
     Output,
     Quantity,
     ResidualName,
@@ -35,7 +34,15 @@ def fit(
     method: Annotated[
         MethodName, typer.Option(help="Spectrum in linear response, then corrected; or simulated.")
     ] = MethodName.linear,
-    noise: Noise = NoiseName.band_limited,
+    noise: Noise = None,
+    rungs: Annotated[
+        int | None,
+        typer.Option(
+            min=0,
+            max=3,
+            help="Richer models that may be tried: activation, tremor, a second one. Of several targets: what all get.",
+        ),
+    ] = None,
     residual: Annotated[ResidualName, typer.Option(help="What is compared.")] = ResidualName.log,
     free: Free = None,
     fix: Fix = None,
@@ -88,7 +95,7 @@ def fit(
         options = {
             "free": names,
             "fix": fixed,
-            "noise": str(noise),
+            "noise": None if noise is None else str(noise),
             "residual": str(residual),
             "starts": starts,
             "key": seed,
@@ -99,10 +106,10 @@ def fit(
             if method != MethodName.linear or seeds is not None or quick:
                 raise ValueError("several targets are fitted together in linear response, without checks: leave out "
                                  "--method, --seeds and --quick, or fit them one at a time")  # fmt: skip
-            raise typer.Exit(fit_together(target, read, task, groups, output, options))
+            raise typer.Exit(fit_together(target, read, task, groups, output, options | {"rung": rungs or 0}))
         if groups is not None:
             raise ValueError("--groups needs several targets")
-        options |= {"method": str(method), "seeds": seeds}
+        options |= {"method": str(method), "seeds": seeds, "rungs": rungs}
         options |= {"check_seeds": 0} if quick else {}
         converged = _fit_one(*aim_of(target[0], task, read), output, options, quick=quick)
     raise typer.Exit(CONVERGED if converged else NOT_CONVERGED)

@@ -41,7 +41,9 @@ Seed = Annotated[int, typer.Option(help="Seed of all random numbers.")]
 Preset = Annotated[str, typer.Argument(help="Bundled preset (see `jaxmuscle presets`), preset file or fit.json.")]
 OtherTask = Annotated[TaskName | None, typer.Option(help="Put the same muscle into another task.")]
 TargetTask = Annotated[TaskName | None, typer.Option(help="Default: follows from what the target measured.")]
-Noise = Annotated[NoiseName, typer.Option(help="Colour of the noise.")]
+Noise = Annotated[
+    NoiseName | None, typer.Option(help="Colour of the noise (band-limited); if it is given, no richer model is tried.")
+]
 Free = Annotated[str | None, typer.Option(metavar="NAMES", help="Comma-separated; replaces the default set.")]
 Fix = Annotated[list[str] | None, typer.Option(metavar="NAME=VALUE", help="Set a parameter and keep it; repeatable.")]
 Segments = Annotated[int | None, typer.Option(min=1, help="Welch segments behind the target.")]

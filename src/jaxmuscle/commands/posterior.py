@@ -14,7 +14,6 @@ from .options import (
     Fix,
     Free,
     Noise,
-    NoiseName,
     Output,
     Quantity,
     Seed,
@@ -32,7 +31,7 @@ if TYPE_CHECKING:
 def posterior(
     target: Annotated[str, typer.Argument(help="Bundled target, path of a target file, or a fit.json that is taken up.")],
     task: TargetTask = None,
-    noise: Noise = NoiseName.band_limited,
+    noise: Noise = None,
     free: Free = None,
     fix: Fix = None,
     segments: Segments = None,
@@ -62,7 +61,7 @@ def posterior(
 
         keep_compiled_programs()
         writable(output)
-        asked = {"task": task, "noise": str(noise), "free": free, "fix": fix}
+        asked = {"task": task, "noise": None if noise is None else str(noise), "free": free, "fix": fix}
         result = _fitted(target, {"segments": segments, "quantity": quantity}, asked, seed)
         if not result.success:
             err.print(f"[bold red]failed:[/] the fit did not converge: {plain(result.message)}", highlight=False)

@@ -53,7 +53,8 @@ def controlled_moments(runs: Trajectory, target: Target) -> tuple[Moments, Momen
         variance = expected.variance + variance - beside.filtered(settings).var(axis=1)
     line = np.zeros_like(power) if expected is None else np.broadcast_to(expected.line, power.shape)
     mean = held.mean(axis=1)
-    return Moments(power, line, mean, variance, np.full_like(mean, np.nan)), expected
+    unknown = np.full_like(mean, np.nan)
+    return Moments(power, line, mean, variance, unknown, unknown), expected
 
 
 def seen_best(objective: Residuals, minima: Minima) -> Expansion:

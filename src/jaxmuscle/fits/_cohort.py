@@ -16,10 +16,12 @@ from jaxmuscle._common.environment import versions
 from jaxmuscle._common.progress import told
 from jaxmuscle.data._target import Target, load_target
 from jaxmuscle.model._noise import AbstractNoise
+from jaxmuscle.model._rungs import on_rung
 from jaxmuscle.model._tasks import AbstractTask, with_noise
 from jaxmuscle.objective._arguments import FitOptions, Plan, planned, task_for
 from jaxmuscle.spectra._bin_law import trial_samples
 
+from ._ladder import options_for
 from ._result import FitResult
 from ._search import search_together
 
@@ -180,6 +182,7 @@ def fit_cohort(
     coefficient_of_variation: bool = True,
     max_steps: int = 40,
     key: PRNGKeyArray | int = 0,
+    rung: int = 0,
     progress: bool | Callable[[str, float], None] = False,
 ) -> CohortResult:
     """Fit many targets, in linear response, all starts of all of them in one batch.
@@ -190,7 +193,9 @@ def fit_cohort(
 
     **Arguments:** `targets`, or names and paths of them; `groups` {target name: group}; `task`, the same kind for all
     (by default what each measured); `noise`, `fix`, `free`, `residual`, `bounds`, `priors`, `key`, `max_steps`,
-    `coefficient_of_variation` as in `fit`; `starts` for each target; `progress`, True or a function of (text, share).
+    `coefficient_of_variation` as in `fit`; `starts` for each target; `rung`, the model of all of them (`on_rung`: 0 the base
+    model, 1 with activation, 2 with tremor, 3 with a second resonance), so that their numbers can be compared; `progress`,
+    True or a function of (text, share).
 
     **Returns:** a `CohortResult`. A target that cannot be read, or not be fitted with these options, is
     listed in `failed` with the reason and does not stop the rest.
@@ -210,7 +215,8 @@ def fit_cohort(
             model = task_for(target) if task is None else task(settings=target.settings)
             model = with_noise(model, noise, fix)
             try:
-                plan = planned(model, target, options)
+                model = on_rung(model, rung) if rung else model
+                plan = planned(model, target, options_for(model, options))
             except ValueError as error:
                 failed[name] = str(error)
                 continue

@@ -7,10 +7,12 @@ from jaxtyping import PRNGKeyArray
 
 from jaxmuscle._common.progress import told
 from jaxmuscle.data._target import Target
-from jaxmuscle.model._noise import AbstractNoise
+from jaxmuscle.model._noise import AbstractNoise, BandLimitedNoise
+from jaxmuscle.model._rungs import RUNGS, is_base
 from jaxmuscle.model._tasks import AbstractTask, with_noise
 from jaxmuscle.objective._arguments import DT, FitOptions, planned
 
+from ._ladder import Models, options_for
 from ._result import FitResult
 from ._search import search
 
@@ -34,6 +36,7 @@ def fit(
     max_steps: int = 40,
     dt: float = DT,
     check_seeds: int | None = None,
+    rungs: int | None = None,
     progress: bool | Callable[[str, float], None] = False,
     answer: Callable[[FitResult], None] | None = None,
 ) -> FitResult:
@@ -57,7 +60,9 @@ def fit(
     `coefficient_of_variation`, whether the target's, if it states one, is one more residual (it fixes the scale of the
     noise); `mean_force` (value, sd) [N] as a further residual; `max_steps` for each descent; `check_seeds` (64, or 200
     then; 0: not simulated); `dt` [s], noise grid of a Monte Carlo fit; `progress`, True or a function of (text, share);
-    `answer`, a function that gets the result as soon as the search ends, before simulated check, profile and p-value.
+    `rungs`, how many richer models may be tried where the base model does not describe the data (`on_rung`; 3, or 0 where
+    `noise` or `free` is given); `answer`, a function that gets the result as soon as the search ends, before simulated
+    check, profile and p-value.
 
     **Returns:** a `FitResult`; a fit that fails is one, too, and says why.
 
@@ -68,6 +73,25 @@ def fit(
         options = FitOptions(
             free=free, fix=fix, method=method, residual=residual, starts=starts, seeds=seeds, check_seeds=check_seeds,
             key=key, bounds=bounds, priors=priors, coefficient_of_variation=coefficient_of_variation,
-            mean_force=mean_force, max_steps=max_steps, dt=dt, progress=tell,
+            mean_force=mean_force, max_steps=max_steps, dt=dt, progress=tell, rungs=rungs,
         )  # fmt: skip
-        return search(planned(with_noise(task, noise, fix), target, options), answer)
+        task = with_noise(task, noise, fix)
+        top = _top(task, target, options, chosen=noise is not None)
+        plan = planned(task, target, options)
+        models = Models(task, top, lambda task: planned(task, target, options_for(task, options)))
+        return search(plan, answer, models if top else None)
+
+
+def _top(task: AbstractTask, target: Target, options: FitOptions, *, chosen: bool) -> int:
+    """The highest rung of the ladder that may be tried: all of them, unless a model was asked for."""
+    possible = (options.method == "linear" and options.residual == "log" and is_base(task)
+                and (target.segments is not None or target.sigma is not None))  # fmt: skip
+    if options.rungs is None:
+        asked = chosen or options.free is not None or type(task.noise) is not BandLimitedNoise
+        return len(RUNGS) - 1 if possible and not asked else 0
+    if options.rungs >= len(RUNGS):
+        raise ValueError(f"rungs = {options.rungs}: the highest is {len(RUNGS) - 1}")
+    if options.rungs and not possible:
+        raise ValueError("rungs: richer models are tried only by method='linear' with residual='log', on a target that "
+                         "states segments or sigma, and from a task without activation and resonance")  # fmt: skip
+    return options.rungs

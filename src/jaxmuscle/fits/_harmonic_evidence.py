@@ -19,6 +19,7 @@ from ._refit import lines_of, without_fitted
 PROFILE = 64
 STEPS = 40
 ABSENT = 1e-6
+SIGNIFICANT = 0.05
 REPLICATES = 999
 
 
@@ -50,7 +51,7 @@ def harmonic_test(problem: FitProblem, final: Minima, *, judged: bool = True) ->
     ):
         return HarmonicTest(frequency, rise, None)
     problem.tell("bootstrap without harmonic", 0.95)
-    return HarmonicTest(frequency, rise, _p_value(problem, objective, final))
+    return HarmonicTest(frequency, rise, p_value(problem, objective, final))
 
 
 def _pinned(objective: Residuals, columns: list[int]) -> Residuals:
@@ -71,7 +72,7 @@ def _profile(problem: FitProblem, objective: Residuals, final: Minima) -> tuple[
     return frequency, 2 * (found.cost - min(np.nanmin(found.cost), best.cost[0]))
 
 
-def _p_value(problem: FitProblem, objective: Residuals, final: Minima) -> float:
+def p_value(problem: FitProblem, objective: Residuals, final: Minima) -> float:
     """Improvement of chi² by a harmonic of any frequency and strength, against that in spectra that have none.
 
     The model without harmonic is fitted; about it the other parameters are linear (`M` removes what they take up), a

@@ -64,7 +64,9 @@ class FittedPart(eqx.Module):
 
     Its fitted `task`; `chi2_per_bin` (None without knowledge of the spread) and `rms_log_error`; on the target's bins the
     `fitted` proportional power (of fresh seeds where they were simulated), `harmonic_share` of each bin's power, `residual`
-    and `deviation` [standard deviations, log power]; `stretch`, time and output of a few simulated seconds; `check`, how far
+    and `deviation` [standard deviations, log power]; `components`, what share of each bin's power the parts of the model
+    have in linear response: the `relaxation` of the active tissue under its noise, the `floor` from noise on the passive
+    one, the `harmonic`, the `tremor`, `resonance_2`; `stretch`, time and output of a few simulated seconds; `check`, how far
     linear response and nonlinear simulation differ; `further`, residuals of the coefficient of variation and of the mean, as
     far as they are data [standard deviations, model above data].
     """
@@ -77,6 +79,7 @@ class FittedPart(eqx.Module):
     harmonic_share: Float[np.ndarray, " bins"]
     residual: Float[np.ndarray, " bins"]
     deviation: Float[np.ndarray, " bins"] | None
+    components: dict[str, Float[np.ndarray, " bins"]]
     stretch: tuple[np.ndarray, np.ndarray]
     check: dict[str, float | int]
     further: dict[str, float]
@@ -89,7 +92,8 @@ class FittedPart(eqx.Module):
     @property
     def model(self) -> str:
         """Task and noise in words."""
-        return f"{type(self.task).__name__}, {type(self.task.noise).__name__}"
+        parts = [type(noise).__name__ for noise in self.task.noise.components]
+        return ", ".join([type(self.task).__name__, " + ".join(parts), *["activation"] * (self.task.activation is not None)])
 
     @property
     def remarks(self) -> tuple[str, ...]:
@@ -128,6 +132,7 @@ def part_to_table(part: FittedPart) -> dict[str, Any]:
             "frequency_hz": with_nulls(part.frequency_hz),
             "target": with_nulls(part.target.proportional_power),
             **{field: with_nulls(getattr(part, field)) for field in SPECTRUM},
+            "components": {name: with_nulls(share) for name, share in part.components.items()},
         },
         "stretch": {"time": with_nulls(part.stretch[0]), "output": with_nulls(part.stretch[1])},
         "check": part.check,
@@ -146,6 +151,7 @@ def read_part(table: dict[str, Any]) -> FittedPart:
         chi2_per_bin=table["chi2_per_bin"],
         rms_log_error=table["rms_log_error"],
         **{field: from_nulls(spectrum[field]) for field in SPECTRUM},
+        components={name: np.asarray(from_nulls(share)) for name, share in spectrum["components"].items()},
         stretch=(from_nulls(stretch["time"]), from_nulls(stretch["output"])),
         check=table["check"],
         further=table["further"],

@@ -9,17 +9,18 @@ from jaxmuscle._common.environment import versions
 from jaxmuscle._common.errors import SimulationError
 from jaxmuscle._common.keys import fold_in
 from jaxmuscle.ensembles._ensemble import ensemble
-from jaxmuscle.model._tasks import AbstractTask
+from jaxmuscle.model._tasks import AbstractTask, with_active_noise
 from jaxmuscle.objective._arguments import Plan, base_of
-from jaxmuscle.objective._consequences import consequences, jackknife, observed
+from jaxmuscle.objective._consequences import BANDS, consequences, jackknife, observed
 from jaxmuscle.objective._covariance import Identifiability, common_scales, known_products, parameter_covariance
 from jaxmuscle.objective._moment_models import Linear
 from jaxmuscle.objective._problem import FitProblem, Part
 from jaxmuscle.objective._residuals import PartResiduals, further_residuals
-from jaxmuscle.response._expected import Moments, check_power
+from jaxmuscle.response._expected import Moments, check_power, expected_moments
 from jaxmuscle.response._linearised import settled
 from jaxmuscle.response._second_order import negative_coefficients, second_order
-from jaxmuscle.spectra._bin_law import bin_statistics, standardised
+from jaxmuscle.spectra._bin_law import bin_statistics, standardised, trial_samples
+from jaxmuscle.spectra._settings import WINDOW
 
 from ._adequacy import adequacy, elsewhere, scatter_of
 from ._checks import (
@@ -37,6 +38,7 @@ from ._checks import (
 )
 from ._harmonic_evidence import harmonic_test
 from ._intervals import intervals
+from ._ladder import Rung
 from ._part import FittedPart, Start
 from ._refit import refit_of
 from ._result import FitResult
@@ -52,7 +54,7 @@ from ._tables import (
 )
 
 STRETCH = 5.0
-UNSETTLED = 0.05
+UNSETTLED = 1e-3
 UNCHECKED = "not checked on simulated seeds; no profile over the harmonic's frequency and no p-value (check_seeds=0)"
 TOGETHER = (
     "in linear response alone: no nonlinear correction, no check on simulated seeds, no profile and p-value of the "
@@ -60,7 +62,14 @@ TOGETHER = (
 )
 
 
-def report_fit(plan: Plan, stages: list[Stage], *, interrupted: bool = False, preliminary: bool = False) -> FitResult:
+def report_fit(
+    plan: Plan,
+    stages: list[Stage],
+    ladder: tuple[Rung, ...] = (),
+    *,
+    interrupted: bool = False,
+    preliminary: bool = False,
+) -> FitResult:
     """The result of a fit that ended at the best point of the last stage; with no `check_seeds` nothing is simulated.
 
     Then the second order says whether the linear response holds, unless the result is `preliminary`.
@@ -72,7 +81,7 @@ def report_fit(plan: Plan, stages: list[Stage], *, interrupted: bool = False, pr
         for c, ok, n in zip(first.cost, first.settled, first.steps, strict=True)
     )
     common = {"method": problem.method, "starts": starts, "seed": plan.seed, "settings": plan.settings,
-              "versions": versions()}  # fmt: skip
+              "versions": versions(), "ladder": ladder}  # fmt: skip
     if not np.isfinite(final.cost[final.best]):
         return _failed(problem, common, _not_finite(problem))
     seen = seen_best(objective, final)
@@ -116,7 +125,8 @@ def report_fit(plan: Plan, stages: list[Stage], *, interrupted: bool = False, pr
     factor = 1.0 if judgement is None else judgement.widening
     moved |= too_curved(problem, derived, known)
     parameters, derived = (widened(without_errors(moved, table), factor) for table in (parameters, derived))
-    stated = [n for n, p in (parameters | derived).items() if p.stderr and (n in derived or n in c.names)]
+    stated = [n for n, p in (parameters | derived).items()
+              if p.stderr and (n in derived or n in c.names) and base_of(n) not in BANDS]  # fmt: skip
     ends = intervals(problem, objective, seen, factor**2 * covariance, stated)
     parameters, derived = (with_intervals(table, ends) for table in (parameters, derived))
     polish = polish_check(problem, stages, derived)
@@ -204,11 +214,29 @@ def _parts(
             harmonic_share=share,
             residual=residual,
             deviation=statistics.sd if statistics.known else None,
+            components=_components(part, task) if plan.problem.control else {},
             stretch=simulated.stretch,
             check=check | polish,
             further=further,
         )
     return parts, notices
+
+
+def _components(part: Part, task: AbstractTask) -> dict[str, np.ndarray]:
+    """Share of each bin's power that every part of the model has in linear response."""
+    settings, samples = part.target.settings, trial_samples(part.target)
+
+    def powers(task: AbstractTask) -> tuple[np.ndarray, list[np.ndarray]]:
+        moments, _ = expected_moments(task, settings, WINDOW, samples)
+        rhythms = [np.asarray(x)[part.chosen] for x in (moments.line, *moments.resonant)]
+        return np.asarray(moments.power)[part.chosen], rhythms
+
+    power, rhythms = powers(task)
+    active, own = powers(with_active_noise(task))
+    relaxation = active - np.sum(own, axis=0)
+    floor = power - relaxation - np.sum(rhythms, axis=0)
+    names = ("relaxation", "floor", "harmonic", "tremor", *(f"resonance_{i}" for i in range(2, len(rhythms))))
+    return {name: own / power for name, own in zip(names, (relaxation, floor, *rhythms), strict=False)}
 
 
 def further_of(part: PartResiduals, moments: Moments) -> dict[str, float]:
@@ -256,7 +284,7 @@ def _failed(problem: FitProblem, common: dict[str, Any], reason: str) -> FitResu
     for part in problem.parts:
         notices += [n if len(problem.parts) == 1 else f"{part.name}: {n}" for n in part.target.notices]
         nothing, none = np.full(len(part.target.bins), np.nan), (np.zeros(0), np.zeros(0))
-        made = FittedPart(part.target, part.task, None, None, nothing, nothing, nothing, None, none, {}, {})
+        made = FittedPart(part.target, part.task, None, None, nothing, nothing, nothing, None, {}, none, {}, {})
         parts[part.name or part.target.name] = made
     unknown = Identifiability.of_covariance(np.eye(free))
     tasks = tuple(part.task for part in problem.parts)

@@ -16,9 +16,10 @@ from jaxmuscle._common.parts import of_only, only
 from jaxmuscle._common.text import choices, folded, probability
 from jaxmuscle.data._target import Target
 from jaxmuscle.model._tasks import AbstractTask
-from jaxmuscle.objective._consequences import DERIVED
+from jaxmuscle.objective._consequences import derived_names
 
 from ._adequacy import Adequacy
+from ._ladder import HEAD, Rung
 from ._part import Estimate, FittedPart, Start, estimates_to_table, part_to_table, read_estimates, read_part
 
 if TYPE_CHECKING:
@@ -27,6 +28,11 @@ if TYPE_CHECKING:
 
 
 FORMAT = 2
+ALIASES = {
+    "resonance_frequency": "tremor_frequency",
+    "resonance_width": "tremor_width",
+    "activation_time": "contraction_time",
+}
 PROFILE = ("frequency_hz", "chi2_rise")
 
 
@@ -39,6 +45,7 @@ class FitResult(eqx.Module):
     belongs to one is called "name@target", what is the same number for all by its own name), their errors widened by
     `adequacy.widening`; `products` and ratios of parameters that the data determine; `correlation` of the free
     parameters; `undetermined`, sentences naming what can be scaled together without the data noticing;
+    `ladder`, the models that were tried (`Rung`s; empty where one was asked for);
     `singular_values` of the Jacobian (residuals in standard deviations, parameters in the prior's); the table of
     `starts`; `profile`, harmonic frequencies [Hz] and the rise of chi² there, all else fitted anew; `harmonic_p_value`,
     how often spectra without harmonic would show one as strong (both None with several targets); `notices`; `seed`;
@@ -57,6 +64,7 @@ class FitResult(eqx.Module):
     products: tuple[str, ...]
     correlation: dict[str, Any]
     undetermined: tuple[str, ...]
+    ladder: tuple[Rung, ...]
     singular_values: Float[np.ndarray, " free"]
     starts: tuple[Start, ...]
     profile: tuple[np.ndarray, np.ndarray] | None
@@ -151,13 +159,18 @@ class FitResult(eqx.Module):
     @property
     def derived_names(self) -> tuple[str, ...]:
         """Names that derived quantities have in this fit."""
-        return DERIVED if len(self.parts) == 1 else tuple(self.derived)
+        return derived_names(self.task) if len(self.parts) == 1 else tuple(self.derived)
 
     @property
     def determined(self) -> dict[str, Estimate]:
         """Fitted parameters and derived quantities that have a standard error; what is both, once."""
-        both = {name: p for name, p in self.parameters.items() if p.free} | self.derived
-        return {name: p for name, p in both.items() if p.stderr is not None}
+        return {name: p for name, p in self.found.items() if p.stderr is not None}
+
+    @property
+    def found(self) -> dict[str, Estimate]:
+        """Fitted parameters and derived quantities; what is both, once, by the name that people use."""
+        fitted = {name: p for name, p in self.parameters.items() if p.free and ALIASES.get(name) not in self.derived}
+        return fitted | self.derived
 
     @property
     def remarks(self) -> tuple[str, ...]:
@@ -181,6 +194,7 @@ class FitResult(eqx.Module):
         single = len(self.parts) == 1
         lines = [self.verdict[0].upper() + self.verdict[1:], f"  {_head(self)}"]
         lines += [f"  {self.message}"] * self.success
+        lines += [f"  {HEAD}", *(f"  {rung}" for rung in self.ladder)] if self.ladder else []
         if not single:
             lines += [f"  {name}: {p.target.name}, {p.model}{_closeness(p, ', ')}" for name, p in self.parts.items()]
         lines += [f"  {sentence}" for sentence in self.advice]
@@ -188,11 +202,11 @@ class FitResult(eqx.Module):
         if single and self.rms_log_error is not None:
             lines.append(f"  {_closeness(self.only)}")
         lines += [f"  {sentence}" for sentence in self.remarks]
-        every = {name: p for name, p in self.parameters.items() if p.free} | self.derived
+        every = self.found
         shown = self.determined
         intervals = any(p.interval is not None for p in shown.values())
         lines += _table("determined by the data", shown, " 95 % interval  " * intervals)
-        fixed = [name for name in self.products if name not in every]
+        fixed = [name for name in self.products if name not in self.parameters]
         lines += [f"  they also fix, roughly: {', '.join(fixed)}"] if fixed else []
         loose = {name: p for name, p in every.items() if name not in shown and p.free}
         lines += _table("not determined (near their defaults by the prior)", loose) if loose else []
@@ -254,6 +268,7 @@ def to_table(result: FitResult) -> dict[str, Any]:
         "per_newton": {name: with_nulls(value) for name, value in result.per_newton.items()},
         "correlation": result.correlation,
         "undetermined": list(result.undetermined),
+        "ladder": [rung._asdict() for rung in result.ladder],
         "singular_values": with_nulls(result.singular_values),
         "starts": [{"cost": s.cost, "success": s.success, "steps": s.steps} for s in result.starts],
         "profile": None if profile is None else dict(zip(PROFILE, map(with_nulls, profile), strict=True)),
@@ -296,6 +311,7 @@ def _from_table(table: dict[str, Any]) -> FitResult:
         products=tuple(table["products"]),
         correlation=table["correlation"],
         undetermined=tuple(table["undetermined"]),
+        ladder=tuple(Rung(**rung) for rung in table["ladder"]),
         singular_values=from_nulls(table["singular_values"]),
         starts=tuple(Start(s["cost"], s["success"], s["steps"]) for s in table["starts"]),
         profile=None if profile is None else tuple(from_nulls(profile[name]) for name in PROFILE),

@@ -22,6 +22,7 @@ from jaxmuscle.response._expected import Moments
 from jaxmuscle.response._linearised import settled
 
 from ._checks import Stage, controlled_moments, seen_best
+from ._ladder import Climbed, Models, Rung, climb, line_or_resonance
 from ._report import UNCHECKED, report_fit
 from ._result import FitResult
 
@@ -40,39 +41,59 @@ class FitInterrupted(KeyboardInterrupt):
         self.result = result
 
 
-def search(plan: Plan, answer: Callable[[FitResult], None] | None = None) -> FitResult:
+def search(plan: Plan, answer: Callable[[FitResult], None] | None = None, models: Models | None = None) -> FitResult:
     """From the starting points to a result; Ctrl-C ends it with what had been reached.
 
-    `answer` gets the result before its checks. Ctrl-C in these keeps it.
+    `answer` gets the result before its checks. Ctrl-C in these keeps it. Of richer `models` one
+    after the other is tried until one describes the data.
     """
     problem = plan.problem
     stages: list[Stage] = []
+    ladder: tuple[Rung, ...] = ()
     interrupted = False
+
+    def keep(found: Climbed) -> None:
+        nonlocal plan, known
+        plan, known = found.plan, found.known
+        stages[:] = found.stages
+
+    known: Known | None = None
     try:
         problem.tell("compiling", 0.0)
-        (_linear if problem.method == "linear" else _montecarlo)(plan, starting_points(problem, plan.starts), stages)
+        if problem.method != "linear":
+            _montecarlo(plan, starting_points(problem, plan.starts), stages)
+        elif models is None:
+            known = _descended(plan, starting_points(problem, plan.starts), stages)
+        else:
+            ladder = climb(plan, models, _descended, keep)
+        if known is not None:
+            _polished(plan, known, stages)
     except KeyboardInterrupt:
         interrupted = True
     if not stages:
         raise KeyboardInterrupt("fit interrupted before its first step")
     if interrupted:
-        raise FitInterrupted(_unchecked(plan, stages, interrupted=True))
+        raise FitInterrupted(_unchecked(plan, stages, ladder, interrupted=True))
+    problem = plan.problem
     if answer is not None:
-        found = _unchecked(plan, stages)
+        found = _unchecked(plan, stages, ladder)
         later = tuple(n for n in found.notices if n != UNCHECKED) if plan.check_seeds else found.notices
         answer(dataclasses.replace(found, notices=later))
     try:
         problem.tell("checking on fresh seeds" if plan.check_seeds else "reporting", 0.8)
-        result = report_fit(plan, stages)
+        result = report_fit(plan, stages, ladder)
+        if models is not None and result.success:
+            said = line_or_resonance(plan, result.task, ladder, models, _descended)
+            result = dataclasses.replace(result, notices=(*result.notices, *said))
     except KeyboardInterrupt:
-        raise FitInterrupted(_unchecked(plan, stages)) from None
+        raise FitInterrupted(_unchecked(plan, stages, ladder)) from None
     problem.tell("done", 1.0)
     return result
 
 
-def _unchecked(plan: Plan, stages: list[Stage], *, interrupted: bool = False) -> FitResult:
+def _unchecked(plan: Plan, stages: list[Stage], ladder: tuple[Rung, ...], *, interrupted: bool = False) -> FitResult:
     """The result before anything is simulated to check it."""
-    return report_fit(plan._replace(check_seeds=0), stages, interrupted=interrupted, preliminary=True)
+    return report_fit(plan._replace(check_seeds=0), stages, ladder, interrupted=interrupted, preliminary=True)
 
 
 def search_together(plans: list[Plan], tell: Callable[[str, float], None]) -> list[FitResult]:
@@ -131,34 +152,43 @@ def _stage(problem: FitProblem, stages: list[Stage], objective: Residuals, name:
     return show
 
 
-def _linear(plan: Plan, points: np.ndarray, stages: list[Stage]) -> None:
-    """All starts in linear response, the best of them with the line's share known, then the nonlinear correction."""
+Known = tuple[FitProblem, list[Float[np.ndarray, " bins"]]]
+
+
+def _descended(plan: Plan, points: np.ndarray, stages: list[Stage]) -> Known | None:
+    """All starts in linear response, then the best of them with the line's share known."""
     problem, max_steps = plan.problem, plan.max_steps
     objective = problem.linear()
     show = _stage(problem, stages, objective, "trying starts", (0.05, 0.5), max_steps)
     first = _with_recombined(plan, objective, least_squares(objective, points, max_steps, report=show))
     stages[:] = [Stage("trying starts", objective, first)]
     if not np.isfinite(first.cost[first.best]):
-        return
+        return None
     best = first.s[contenders(problem, first, RIVAL_MARGIN)[:BATCH]]
     problem, shares = _known(problem, stages[0])
     objective = problem.linear(shares)
     show = _stage(problem, stages, objective, "linear response", (0.5, 0.6), 15)
-    found = least_squares(objective, best, max_steps, report=show)
+    least_squares(objective, best, max_steps, report=show)
+    return problem, shares
+
+
+def _polished(plan: Plan, known: Known, stages: list[Stage]) -> None:
+    """The nonlinear correction, until it no longer changes."""
+    (problem, shares), found, max_steps = known, stages[-1].minima, plan.max_steps
     corrections: list[Moments] | None = None
     for turn in range(POLISHES if problem.seeds else 0):
         if not np.isfinite(found.cost[found.best]):
             return
         tasks = problem.tasks_at(np.asarray(problem.coordinates.theta(found.s[found.best])))
         new = [correction_at(problem, part, task) for part, task in zip(problem.parts, tasks, strict=True)]
-        known = [correction for correction in new if correction is not None]
-        if len(known) < len(new):
+        made = [correction for correction in new if correction is not None]
+        if len(made) < len(new):
             return
         if corrections is not None:
-            changes = [np.max(np.abs(np.log(a.power / b.power))) for a, b in zip(known, corrections, strict=True)]
+            changes = [np.max(np.abs(np.log(a.power / b.power))) for a, b in zip(made, corrections, strict=True)]
             if max(changes) < STILL:
                 return
-        corrections, objective = known, problem.linear(shares, known)
+        corrections, objective = made, problem.linear(shares, made)
         show = _stage(problem, stages, objective, "polishing", (0.6 + 0.05 * turn, 0.65 + 0.05 * turn), 15)
         found = least_squares(objective, found.s, max_steps, report=show)
 
@@ -188,7 +218,12 @@ def correction_at(problem: FitProblem, part: Part, task: AbstractTask) -> Moment
     mean = jax.tree.map(lambda x: np.asarray(x).mean(axis=0), each)
     power = mean.power[part.chosen] / np.asarray(expected.power)[part.chosen]
     found = power, np.ones(len(power)), mean.mean / expected.mean, mean.variance / expected.variance
-    return Moments(*found, np.ones(())) if all(np.all(np.isfinite(x) & (np.asarray(x) > 0)) for x in found) else None
+    resonant = tuple(np.ones(len(power)) for _ in expected.resonant)
+    return (
+        Moments(*found, np.ones(()), np.ones(()), resonant)
+        if all(np.all(np.isfinite(x) & (np.asarray(x) > 0)) for x in found)
+        else None
+    )
 
 
 def _montecarlo(plan: Plan, points: np.ndarray, stages: list[Stage]) -> None:

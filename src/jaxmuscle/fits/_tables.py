@@ -64,7 +64,7 @@ def derived_table(
     Their errors are those of the parameters and, where a value comes from fresh seeds, their sampling error.
     """
     table = {}
-    for name in DERIVED:
+    for name in (n for n in DERIVED if n in values):
         g = np.asarray(slopes[name])
         free = bool(np.any(g != 0))
         determined = free and known.determines(g)
@@ -84,7 +84,8 @@ def too_curved(problem: FitProblem, derived: Collection[str], known: Identifiabi
     names = problem.coordinates.names
     if np.sum(~known.determined) <= len(common_scales(names, known)):
         return set()
-    single = {n for n in names if not base_of(n).startswith("harmonic_")} | {n for n in derived if base_of(n) in BASE}
+    shape = ("_frequency", "_width", "_time")
+    single = {n for n in names if not base_of(n).endswith(shape)} | {n for n in derived if base_of(n) in BASE}
     return single if len(problem.parts) == 1 else {n for n in single if "@" in n}
 
 

@@ -1,5 +1,6 @@
 """Public names of this wing."""
 
+from ._activation import Activation as Activation
 from ._muscle import AbstractLaw as AbstractLaw
 from ._muscle import AbstractMuscle as AbstractMuscle
 from ._muscle import Muscle as Muscle
@@ -7,7 +8,9 @@ from ._muscle import QuadraticDamping as QuadraticDamping
 from ._muscle import QuadraticStiffness as QuadraticStiffness
 from ._noise import AbstractNoise as AbstractNoise
 from ._noise import BandLimitedNoise as BandLimitedNoise
+from ._noise import NoiseSum as NoiseSum
 from ._noise import OrnsteinUhlenbeckNoise as OrnsteinUhlenbeckNoise
+from ._noise import ResonantNoise as ResonantNoise
 from ._noise import WhiteNoise as WhiteNoise
 from ._parameters import PARAMETERS as PARAMETERS
 from ._parameters import Parameter as Parameter
@@ -15,6 +18,7 @@ from ._partition import partition as partition
 from ._pink_noise import PinkNoise as PinkNoise
 from ._presets import load_preset as load_preset
 from ._presets import save_preset as save_preset
+from ._rungs import on_rung as on_rung
 from ._signals import AbstractSignal as AbstractSignal
 from ._signals import Constant as Constant
 from ._signals import Decay as Decay

@@ -60,26 +60,33 @@ class QuadraticDamping(AbstractLaw):
         return self.c * (self.v_ref**2 + q**2)
 
 
-Perturbation = Float[Array, "4"]
+Perturbation = Float[Array, " inputs"]
 
 
 class AbstractMuscle(eqx.Module):
-    """A deterministic muscle that takes the perturbations `u = (ΔK_w, ΔK_z, ΔC_w, ΔC_z)` as an input.
+    """A deterministic muscle that takes the perturbations `u = (ΔK_w, ΔK_z, ΔC_w, ΔC_z, ΔP_w / P_w)` as an input.
 
     Active tissue `w` (inner) and passive tissue `z` (at the insertion) move by
 
         m_w x_w'' = P_w - active_force + passive_force,      m_z x_z'' = -F_ext - passive_force
 
-    Whoever writes the four methods and two masses gets simulation, noise, spectra and fits: everything stochastic is
-    derived from them by differentiation with respect to `u`.
+    where P_w stands for `drive(P_w, u)`. Whoever writes the four methods and two masses gets simulation, noise, spectra
+    and fits: everything stochastic is derived from them by differentiation with respect to `u`.
     """
 
     m_w: eqx.AbstractVar[Scalar]
     m_z: eqx.AbstractVar[Scalar]
 
     @abc.abstractmethod
-    def base(self) -> Perturbation:
+    def base(self) -> Float[Array, "4"]:
         """Unperturbed coefficients at zero displacement and velocity, `(K_w0, K_z0, C_w0, C_z0)` [N/m, N s/m]."""
+
+    def drive(self, force: Scalar, u: Perturbation) -> Scalar:
+        """What becomes of the prescribed P_w [N] under its perturbation, `P_w (1 + u[4])`.
+
+        A muscle in which the drive multiplies something else returns `force` here and uses u[4] in `active_force`.
+        """
+        return force * (1 + u[4]) if len(u) > 4 else force  # u may stop before the drive
 
     @abc.abstractmethod
     def active_force(self, x_w: Scalar, v_w: Scalar, u: Perturbation) -> Scalar:
@@ -133,7 +140,7 @@ class Muscle(AbstractMuscle):
         if self.argument not in ("literal", "elongation"):
             raise ValueError(f"argument = {self.argument!r} must be 'literal' or 'elongation'")
 
-    def base(self) -> Perturbation:
+    def base(self) -> Float[Array, "4"]:
         laws = (self.stiffness_w, self.stiffness_z, self.damping_w, self.damping_z)
         return jnp.stack([jnp.asarray(law(0.0)) for law in laws])
 

@@ -21,6 +21,9 @@ _REF = "sets the range over which the muscle is linear: displacements here are a
 _HUMAN = "coefficient of variation of isometric force near 1 %, as people show"
 _PAPER_K = f"{_HUMAN}; the paper: 0.16 % of the initial stiffness coefficient"
 _PAPER_C = "the paper: 0.01 % of the initial damping coefficient"
+_TWITCH = "twitch contraction times of human muscles, 50 to 110 ms (Buchthal & Schmalbruch 1970, Acta Physiol Scand 79:435)"
+_TREMOR = "physiological tremor of hand and wrist, 8 to 12 Hz (Elble & Koller 1990, Tremor)"
+_SLOW = "a slower oscillation of wrist force seen near 3 to 4 Hz"
 
 
 def _row(name, symbol, unit, default, meaning, source, lower=0.0, upper=math.inf, sd=1.0, positive=True, **bounds):
@@ -33,9 +36,12 @@ def _free_sign(name, symbol, unit, default, meaning, source, sd):
 
 
 DEFAULT_FREE = ("k_w", "k_z", "c_w", "c_z", "harmonic_amplitude", "harmonic_frequency", "noise_K_w", "noise_K_z")
-USUALLY_FREE = (*DEFAULT_FREE, "noise_correlation_time")  # where a task has them
 HARMONIC = ("harmonic_amplitude", "harmonic_frequency")
+RESONANCES = ("resonance", "resonance_2")
+RESONANCE = tuple(f"{which}_{what}" for which in RESONANCES for what in ("amplitude", "frequency", "width"))
+USUALLY_FREE = (*DEFAULT_FREE, "noise_correlation_time", "activation_time", *RESONANCE)  # where a task has them
 CHANNELS = ("K_w", "K_z", "C_w", "C_z")
+INPUTS = (*CHANNELS, "P_w")
 
 
 def default(name: str) -> float:
@@ -88,6 +94,19 @@ PARAMETERS: dict[str, Parameter] = {
         _row("harmonic_amplitude", "A/K_0", "1", 0.003, "harmonic amplitude", _HUMAN),
         _row("harmonic_frequency", "f_S", "Hz", 4.25, "harmonic frequency", "the paper: local maximum at 4.251 Hz",
              fit_lower=0.2, fit_upper=30.0),
+        _row("noise_P_w", "σ_Pw", "1", 0.02, "noise on the drive, a fraction of P_w; off by default", _HUMAN),
+        _row("activation_time", "T", "s", 0.06, "contraction time of a twitch; 0, the default of a task, is none", _TWITCH,
+             sd=1.0, fit_lower=0.005, fit_upper=0.5),
+        _row("resonance_amplitude", "σ_1", "1", 0.005, "tremor of the drive, a fraction of P_w", _HUMAN),
+        _row("resonance_frequency", "f_1", "Hz", 9.0, "frequency of the tremor", _TREMOR, sd=0.25,
+             fit_lower=0.5, fit_upper=30.0),
+        _row("resonance_width", "b_1", "Hz", 2.0, "full width of the tremor at half power", _TREMOR, sd=0.7,
+             fit_lower=0.02, fit_upper=15.0),
+        _row("resonance_2_amplitude", "σ_2", "1", 0.005, "a second resonance of the drive, a fraction of P_w", _HUMAN),
+        _row("resonance_2_frequency", "f_2", "Hz", 3.5, "frequency of the second resonance", _SLOW, sd=0.35,
+             fit_lower=0.5, fit_upper=30.0),
+        _row("resonance_2_width", "b_2", "Hz", 1.0, "full width of the second resonance at half power", _SLOW, sd=0.7,
+             fit_lower=0.02, fit_upper=15.0),
         _free_sign("harmonic_phase", "φ", "rad", 0.0, "harmonic phase", "unknown and without influence", math.pi),
         _row("P_w", "P_w", "N", 5.0, "active force level", "light pressing, displacement near 0.01 m", -math.inf),
         _free_sign("F_ext", "F_ext", "N", 0.0, "external force level", "the paper's Task 2", 5.0),
@@ -117,11 +136,9 @@ def _dynamic_fields(module: Any) -> list[tuple[str, Any]]:
 def paths_of(task: Any) -> dict[str, tuple]:
     """Name and path of every parameter of a task: the muscle's, the noise's, the harmonic's and the input levels."""
     paths = _muscle_paths(task.muscle)
-    for field, value in _dynamic_fields(task.noise):
-        if field == "amplitude":
-            paths |= {f"noise_{channel}": ("noise", "amplitude", i) for i, channel in enumerate(CHANNELS)}
-        elif _is_scalar(value):
-            paths[f"noise_{field}"] = ("noise", field)
+    paths |= _noise_paths(task.noise)
+    if task.activation is not None:
+        paths["activation_time"] = ("activation", "time")
     for field in ("amplitude", "frequency", "phase"):
         paths[f"harmonic_{field}"] = ("harmonic", field)
     for field in ("P_w", "F_ext", "x_z"):
@@ -130,16 +147,54 @@ def paths_of(task: Any) -> dict[str, tuple]:
     return paths
 
 
+def _noise_paths(noise: Any) -> dict[str, tuple]:
+    """Of a sum: `noise_` and `resonance_`, then `noise_2_` and so on for further ones of the same sort."""
+    paths: dict[str, tuple] = {}
+    counts = {"noise": 0, "resonance": 0}
+    for i, part in enumerate(noise.components):
+        sort = "resonance" if hasattr(part, "width") else "noise"
+        counts[sort] += 1
+        first = f"{sort}_" if counts[sort] == 1 else f"{sort}_{counts[sort]}_"
+        here = ("noise",) if part is noise else ("noise", "parts", i)
+        inputs = [INPUTS[k] for k in part.acts_on]
+        if sort == "resonance" and len(inputs) == 1:
+            inputs = ["amplitude"]
+        paths |= {f"{first}{name}": (*here, "amplitude", k) for k, name in enumerate(inputs)}
+        others = [field for field, value in _dynamic_fields(part) if field != "amplitude" and _is_scalar(value)]
+        paths |= {f"{first}{field}": (*here, field) for field in others}
+    return paths
+
+
+def names_of(task: Any, part: Any) -> list[str]:
+    """Names of one component's amplitudes on the four coefficients."""
+    where = next(i for i, each in enumerate(task.noise.components) if each is part)
+    here = ("noise",) if part is task.noise else ("noise", "parts", where)
+    return [n for n, path in paths_of(task).items() if path[:-1] == (*here, "amplitude") and part.acts_on[path[-1]] < 4]
+
+
+def amplitude_names(task: Any) -> tuple[str, ...]:
+    """Names of the amplitudes of noise and harmonic, which a common factor makes louder."""
+    return (*(n for n, path in paths_of(task).items() if "amplitude" in path and path[0] == "noise"), "harmonic_amplitude")
+
+
+OFF = ("activation_time", "noise_P_w")
+
+
 def get_parameter(task: Any, name: str) -> Any:
-    """Value of a parameter by name."""
-    node = task
-    for step in _path(task, name):
-        node = node[step] if isinstance(step, int) else getattr(node, step)
-    return node
+    """Value of a parameter by name; 0 of one that is switched off."""
+    if name in OFF and name not in paths_of(task):
+        return 0.0
+    return _follow(task, _path(task, name))
 
 
 def set_parameters(task: Any, values: dict[str, Any]) -> Any:
-    """A copy of the task with the named values, validated as a constructor would."""
+    """A copy of the task with the named values, validated as a constructor would; what is off is switched on."""
+    time = values.get("activation_time")
+    if time is not None and is_concrete(time) and float(time) == 0:
+        task, values = task.with_parts(activation=None), {n: v for n, v in values.items() if n != "activation_time"}
+    for name in OFF:
+        if name in values and name not in paths_of(task):
+            task = task.with_input(name)
     for name, value in values.items():
         row = PARAMETERS.get(name)
         if row is not None:
@@ -148,12 +203,10 @@ def set_parameters(task: Any, values: dict[str, Any]) -> Any:
             require(finite & (value >= row.lower) & (value <= row.upper), message)
         path = _path(task, name)
         index = path[-1] if isinstance(path[-1], int) else None
-        node = task
         fields = path[:-1] if index is not None else path
-        for step in fields:
-            node = getattr(node, step)
+        node = _follow(task, fields)
         if index is not None:
-            parts = [node[i] for i in range(len(CHANNELS))]
+            parts = [node[i] for i in range(len(node))]
             parts[index] = value
             value = _stack(parts)
         task = eqx.tree_at(lambda t, f=fields: _follow(t, f), task, value, is_leaf=lambda x: x is None)
@@ -174,12 +227,13 @@ def _same_dtype(parts: list[Any]) -> list[Any]:
 
 def _follow(node: Any, fields: tuple) -> Any:
     for step in fields:
-        node = getattr(node, step)
+        node = node[step] if isinstance(step, int) else getattr(node, step)
     return node
 
 
 def _path(task: Any, name: str) -> tuple:
     paths = paths_of(task)
     if name not in paths:
-        raise ValueError(f"unknown parameter {name!r} of {type(task).__name__}: {choices(name, paths)}")
+        known = dict.fromkeys([*paths, *(n for n in OFF if n != name)])
+        raise ValueError(f"unknown parameter {name!r} of {type(task).__name__}: {choices(name, known)}")
     return paths[name]

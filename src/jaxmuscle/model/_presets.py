@@ -4,7 +4,7 @@ import dataclasses
 import json
 import tomllib
 from pathlib import Path
-from typing import Any, Literal, get_origin
+from typing import Any, Literal, get_args, get_origin
 
 import equinox as eqx
 import numpy as np
@@ -17,7 +17,7 @@ from jaxmuscle._common.files import write_text
 from jaxmuscle._common.text import choices
 from jaxmuscle.spectra._settings import SpectrumSettings
 
-from . import _muscle, _noise
+from . import _activation, _muscle, _noise
 from . import _muscle as _law
 from . import _pink_noise as _pink
 from . import _signals as _harmonic
@@ -27,7 +27,7 @@ from ._tasks import TASKS, AbstractTask
 
 _KINDS: dict[str, type] = {
     kind.__name__: kind
-    for module in (_harmonic, _law, _muscle, _noise, _pink, _signal, _task)
+    for module in (_activation, _harmonic, _law, _muscle, _noise, _pink, _signal, _task)
     for kind in vars(module).values()
     if isinstance(kind, type) and issubclass(kind, eqx.Module) and not kind.__name__.startswith("Abstract")
 }
@@ -69,7 +69,7 @@ def _to_table(value: Any) -> Any:
         return {"type": type(value).__name__} | _fields_to_table(value)
     if isinstance(value, np.ndarray):
         return value.tolist()
-    return list(value) if isinstance(value, tuple) else value
+    return [_to_table(each) for each in value] if isinstance(value, tuple) else value
 
 
 def task_from_table(table: dict[str, Any]) -> AbstractTask:
@@ -90,7 +90,7 @@ def _build(kind: type, table: dict[str, Any], where: str) -> Any:
         values[key] = _from_table(key, value, f"{where}.{key}")
         if not _fits(fields[key].type, values[key]):
             raise PresetError(f"{where}.{key} = {value!r} is of the wrong kind")
-    if kind in (_noise.OrnsteinUhlenbeckNoise, _pink.PinkNoise):
+    if kind in (_noise.OrnsteinUhlenbeckNoise, _noise.ResonantNoise, _pink.PinkNoise):
         values["std"] = values.pop("amplitude", None)
     try:
         return kind(**values)
@@ -100,6 +100,8 @@ def _build(kind: type, table: dict[str, Any], where: str) -> Any:
 
 def _fits(kind: Any, value: Any) -> bool:
     """Whether a value can be that of a field: a module where one is meant, else a switch, a word, or numbers."""
+    if type(None) in get_args(kind):
+        kind = get_args(kind)[0]
     if isinstance(kind, type) and issubclass(kind, eqx.Module):
         number = isinstance(value, int | float) and not isinstance(value, bool)
         return isinstance(value, kind) or (kind is _signal.AbstractSignal and number)
@@ -119,6 +121,8 @@ def _from_table(key: str, value: Any, where: str) -> Any:
                 f"{where}.type = {kind!r}: {choices(str(kind), known)}; a class of your own must be imported first"
             )
         return _build(known[kind], {k: v for k, v in value.items() if k != "type"}, where)
+    if isinstance(value, list) and any(isinstance(each, dict) for each in value):
+        return tuple(_from_table(key, each, f"{where}[{i}]") for i, each in enumerate(value))
     if isinstance(value, list):
         return tuple(value) if key == "initial" else np.array(value, dtype=float)
     return value

@@ -16,9 +16,10 @@ from jaxmuscle._common.text import choices
 from jaxmuscle._common.types import Scalar
 from jaxmuscle.spectra._settings import SpectrumSettings
 
+from ._activation import ACTIVE, Activation
 from ._muscle import AbstractMuscle, Muscle, Perturbation
-from ._noise import AbstractNoise, BandLimitedNoise, OrnsteinUhlenbeckNoise, WhiteNoise
-from ._parameters import CHANNELS, default, get_parameter, paths_of, set_parameters
+from ._noise import AbstractNoise, BandLimitedNoise, NoiseSum, OrnsteinUhlenbeckNoise, ResonantNoise, WhiteNoise
+from ._parameters import CHANNELS, INPUTS, default, get_parameter, paths_of, set_parameters
 from ._pink_noise import PinkNoise
 from ._signals import AbstractSignal, Harmonic, as_signal, derivatives
 
@@ -35,8 +36,9 @@ State = Float[Array, " states"]
 class AbstractTask(eqx.Module):
     """What is simulated: `y' = vector_field(t, y, u)`, observed as `output(t, y, u, u')`.
 
-    `u = (ΔK_w, ΔK_z, ΔC_w, ΔC_z)` [N/m, N s/m] is the perturbation of the coefficients: noise and harmonic. Common to
-    all tasks are the `muscle`, the `noise` (None in a field: the default), the `harmonic`, how the output's spectrum is
+    `u = (ΔK_w, ΔK_z, ΔC_w, ΔC_z, ΔP_w / P_w)` [N/m, N s/m, 1] is the perturbation of coefficients and drive: noise and
+    harmonic, those of K_w, C_w and P_w through the `activation` if there is one. Common to all tasks are the `muscle`, the
+    `noise` (None in a field: the default), the `harmonic`, the `activation` (None: none), how the output's spectrum is
     estimated (`settings`) and the initial state (`initial`, zero by default).
 
     `task[name]` reads, `task.replace(name=value)` changes a parameter by its name in the parameter table.
@@ -47,6 +49,7 @@ class AbstractTask(eqx.Module):
         default_factory=BandLimitedNoise, kw_only=True, converter=lambda noise: noise.per_channel()
     )
     harmonic: Harmonic = eqx.field(default_factory=Harmonic, kw_only=True)
+    activation: Activation | None = eqx.field(default=None, kw_only=True)
     settings: SpectrumSettings = eqx.field(static=True, default_factory=SpectrumSettings, kw_only=True)
     initial: tuple[Scalar, ...] | None = eqx.field(default=None, kw_only=True)
 
@@ -54,7 +57,7 @@ class AbstractTask(eqx.Module):
     state_units: ClassVar[tuple[str, ...]]
     output_name: ClassVar[str]
     output_unit: ClassVar[str]
-    smoothness_needed: ClassVar[tuple[int, int, int, int]]
+    smoothness_needed: ClassVar[tuple[int, ...]]
 
     @abc.abstractmethod
     def vector_field(self, t: Scalar, y: State, u: Perturbation) -> State:
@@ -78,7 +81,31 @@ class AbstractTask(eqx.Module):
 
     def as_task(self, task: "type[AbstractTask]", **inputs: Any) -> "AbstractTask":
         """The same muscle, perturbation and settings in another task, with that task's default inputs unless given."""
-        return task(muscle=self.muscle, noise=self.noise, harmonic=self.harmonic, settings=self.settings, **inputs)
+        return task(**self.common, **inputs)
+
+    @property
+    def common(self) -> dict[str, Any]:
+        """What all tasks have: muscle, noise, harmonic, activation and spectrum settings."""
+        return {n: getattr(self, n) for n in ("muscle", "noise", "harmonic", "activation", "settings")}
+
+    def with_input(self, name: str) -> "AbstractTask":
+        """A copy with the activation (`activation_time`) or the drive's channel of the noise (`noise_P_w`) switched on."""
+        if name == "activation_time":
+            return self.with_parts(activation=Activation())
+        parts = list(self.noise.components)
+        which = next((i for i, part in enumerate(parts) if not isinstance(part, ResonantNoise)), None)
+        if which is None or len(parts[which].acts_on) != len(CHANNELS):
+            return self
+        amplitude = parts[which].amplitude
+        wider = jnp.append(amplitude, 0.0) if isinstance(amplitude, jax.Array) else np.append(np.asarray(amplitude), 0.0)
+        parts[which] = eqx.tree_at(lambda n: n.amplitude, parts[which], wider)
+        return self.with_parts(noise=NoiseSum(tuple(parts)) if len(parts) > 1 else parts[0])
+
+    def check_step(self, dt: float) -> None:
+        """Raise a `ValueError` if a grid of step dt [s] is too coarse for noise or activation."""
+        self.noise.check_step(dt)
+        if self.activation is not None:
+            self.activation.check_step(dt)
 
     @property
     def parameter_names(self) -> tuple[str, ...]:
@@ -95,20 +122,27 @@ class AbstractTask(eqx.Module):
         size = len(self.state_names)
         return jnp.zeros(size) if self.initial is None else jnp.stack([jnp.asarray(v) * 1.0 for v in self.initial])
 
-    def noise_scale(self) -> Perturbation:
-        """Amplitude of the noise in the coefficients' own units."""
-        amplitude = jnp.asarray(self.noise.amplitude)
-        return amplitude * self.muscle.base() if self.noise.relative else amplitude
+    def noise_scale(self, noise: AbstractNoise | None = None) -> Float[Array, " inputs"]:
+        """Amplitude of the noise, or of one of its components, in the units of the inputs that it acts on."""
+        noise = self.noise if noise is None else noise
+        amplitude = jnp.asarray(noise.amplitude)
+        if not noise.relative or len(noise.acts_on) == 1:
+            return amplitude
+        base = self.muscle.base()
+        return amplitude * (base if len(noise.acts_on) == len(base) else jnp.append(base, jnp.ones((), base.dtype)))
 
     def harmonic_base(self) -> Perturbation:
-        """What the harmonic is a fraction of: (K_w0, K_z0, 0, 0)."""
-        return self.muscle.base() * np.array([1.0, 1.0, 0.0, 0.0], dtype=jnp.result_type(float))
+        """What the harmonic is a fraction of: (K_w0, K_z0, 0, 0, 0)."""
+        base = self.muscle.base()
+        return jnp.append(base, jnp.zeros((), base.dtype)) * np.array(
+            [1.0, 1.0, 0.0, 0.0, 0.0], dtype=jnp.result_type(float)
+        )
 
 
 def with_noise(
     task: AbstractTask, noise: str | AbstractNoise | None, fix: Mapping[str, float] | None = None
 ) -> AbstractTask:
-    """The task with another noise, at its default amplitudes except those that `fix` names."""
+    """The task with another noise, at its default amplitudes except those that `fix` names; by name it keeps its tremor."""
     if noise is None:
         return task
     if isinstance(noise, AbstractNoise):
@@ -119,7 +153,18 @@ def with_noise(
     made = kind().per_channel()
     values = {f"noise_{c}": float(made.amplitude[i]) for i, c in enumerate(CHANNELS)} | dict(fix or {})
     fixed = [values[f"noise_{c}"] for c in CHANNELS]
-    return task.with_parts(noise=eqx.tree_at(lambda n: n.amplitude, made, np.array(fixed)))
+    made = eqx.tree_at(lambda n: n.amplitude, made, np.array(fixed))
+    tremor = [part for part in task.noise.components if isinstance(part, ResonantNoise)]
+    return task.with_parts(noise=NoiseSum((made, *tremor)) if tremor else made)
+
+
+def with_active_noise(task: AbstractTask) -> AbstractTask:
+    """The task with noise on the active tissue and the drive only."""
+    parts = []
+    for noise in task.noise.components:
+        kept = noise.amplitude * np.isin(noise.acts_on, ACTIVE).astype(jnp.result_type(noise.amplitude))
+        parts.append(eqx.tree_at(lambda n: n.amplitude, noise, kept))
+    return task.with_parts(noise=NoiseSum(tuple(parts)) if isinstance(task.noise, NoiseSum) else parts[0])
 
 
 def _check_task(task: AbstractTask) -> None:
@@ -130,16 +175,18 @@ def _check_task(task: AbstractTask) -> None:
 
 def _check_noise(task: AbstractTask) -> None:
     """Refuse a noise that is rougher than the task can sample or differentiate, where its amplitude is not zero."""
-    amplitude, have = task.noise.amplitude, task.noise.smoothness
-    if not is_concrete(amplitude):
-        return
     what = {1: "appears directly in the output, where white noise has no value", 2: "must be differentiable in time"}
-    for i, (channel, need) in enumerate(zip(CHANNELS, task.smoothness_needed, strict=True)):
-        if have < need and np.asarray(amplitude)[i] != 0:
-            raise ValueError(
-                f"{type(task.noise).__name__} on {channel} cannot be used in {type(task).__name__}: there it {what[need]}. "
-                f"Use BandLimitedNoise, or set noise_{channel} = 0"
-            )
+    needed = (*task.smoothness_needed, 0)
+    for noise in task.noise.components:
+        if not is_concrete(noise.amplitude):
+            continue
+        for i, amplitude in zip(noise.acts_on, np.asarray(noise.amplitude), strict=True):
+            have = noise.smoothness + 2 * (task.activation is not None and i in ACTIVE)
+            if have < needed[i] and amplitude != 0:
+                raise ValueError(
+                    f"{type(noise).__name__} on {INPUTS[i]} cannot be used in {type(task).__name__}: there it "
+                    f"{what[needed[i]]}. Use BandLimitedNoise, or set noise_{INPUTS[i]} = 0"
+                )
 
 
 def _check_smooth(task: AbstractTask, name: str, need: int) -> None:
@@ -171,7 +218,7 @@ class PrescribedMotion(AbstractTask):
     state_units: ClassVar[tuple[str, ...]] = ("m",)
     output_name: ClassVar[str] = "P_w"
     output_unit: ClassVar[str] = "N"
-    smoothness_needed: ClassVar[tuple[int, int, int, int]] = (1, 2, 1, 2)
+    smoothness_needed: ClassVar[tuple[int, ...]] = (1, 2, 1, 2, 1)
 
     def __check_init__(self):
         _check_task(self)
@@ -209,7 +256,7 @@ class PrescribedForce(AbstractTask):
     state_units: ClassVar[tuple[str, ...]] = ("m", "m/s", "m", "m/s")
     output_name: ClassVar[str] = "x_z"
     output_unit: ClassVar[str] = "m"
-    smoothness_needed: ClassVar[tuple[int, int, int, int]] = (0, 0, 0, 0)
+    smoothness_needed: ClassVar[tuple[int, ...]] = (0, 0, 0, 0, 0)
 
     def __check_init__(self):
         _check_task(self)
@@ -218,7 +265,7 @@ class PrescribedForce(AbstractTask):
         x_w, v_w, x_z, v_z = y[0], y[1], y[2], y[3]
         muscle = self.muscle
         passive = muscle.passive_force(x_w, v_w, x_z, v_z, u)
-        a_w = (self.P_w(t) - muscle.active_force(x_w, v_w, u) + passive) / muscle.m_w
+        a_w = (muscle.drive(self.P_w(t), u) - muscle.active_force(x_w, v_w, u) + passive) / muscle.m_w
         return jnp.stack([v_w, a_w, v_z, -(self.F_ext(t) + passive) / muscle.m_z])
 
     def output(self, t: Scalar, y: State, u: Perturbation, du: Perturbation) -> Scalar:
@@ -242,7 +289,7 @@ class Isometric(AbstractTask):
     state_units: ClassVar[tuple[str, ...]] = ("m", "m/s")
     output_name: ClassVar[str] = "F_ext"
     output_unit: ClassVar[str] = "N"
-    smoothness_needed: ClassVar[tuple[int, int, int, int]] = (0, 1, 0, 1)
+    smoothness_needed: ClassVar[tuple[int, ...]] = (0, 1, 0, 1, 0)
 
     def __check_init__(self):
         _check_task(self)
@@ -251,7 +298,8 @@ class Isometric(AbstractTask):
         return self.muscle.passive_force(y[0], y[1], jnp.asarray(self.x_z), jnp.zeros_like(y[1]), u)
 
     def vector_field(self, t: Scalar, y: State, u: Perturbation) -> State:
-        force = self.P_w(t) - self.muscle.active_force(y[0], y[1], u) + self._passive(y, u)
+        drive = self.muscle.drive(self.P_w(t), u)
+        force = drive - self.muscle.active_force(y[0], y[1], u) + self._passive(y, u)
         return jnp.stack([y[1], force / self.muscle.m_w])
 
     def output(self, t: Scalar, y: State, u: Perturbation, du: Perturbation) -> Scalar:

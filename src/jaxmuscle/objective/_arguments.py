@@ -27,6 +27,10 @@ from ._problem import FitProblem, Part, target_variation
 RESIDUALS = ("log", "linear", "cumulative")
 METHODS = ("linear", "montecarlo")
 DT = 2.5e-3
+# With an activation stiffness and damping stay nearer to their defaults: no spectrum determines them, and an underdamped
+# muscle, which swings at 8 Hz, would pass for tremor.
+COEFFICIENTS = ("k_w", "k_z", "c_w", "c_z")
+NARROW = 0.5
 
 
 def task_for(target: Target, *, noise: str | AbstractNoise | None = None) -> AbstractTask:
@@ -42,7 +46,10 @@ def free_names(task: AbstractTask, free: Iterable[str] | None, fix: Mapping[str,
     """The parameters to fit, checked against the task, the fixed ones and the number of bins."""
     known = task.parameter_names
     if free is None:
-        names = [n for n in USUALLY_FREE if n in known and n not in fix and float(task[n]) > 0]
+        # Nothing shows the frequency of what has no amplitude.
+        still = [n.removesuffix("amplitude") for n in known if n.endswith("_amplitude") and not float(task[n]) > 0]
+        names = [n for n in USUALLY_FREE if n in known and n not in fix and float(task[n]) > 0
+                 and not n.startswith(tuple(f"{of}{what}" for of in still for what in ("frequency", "width")))]  # fmt: skip
     else:
         names = list(dict.fromkeys(free))
         _check_names("free", names, known)
@@ -81,13 +88,14 @@ class FitOptions:
     mean_force: tuple[float, float] | None = None
     max_steps: int = 40
     dt: float = DT
+    rungs: int | None = None
     progress: Tell = nothing
 
     def __post_init__(self) -> None:
         for name, known in (("method", METHODS), ("residual", RESIDUALS)):
             if getattr(self, name) not in known:
                 raise ValueError(f"{name} = {getattr(self, name)!r}: {choices(getattr(self, name), known)}")
-        for name, least in (("starts", 1), ("seeds", 0), ("check_seeds", 0), ("max_steps", 1)):
+        for name, least in (("starts", 1), ("seeds", 0), ("check_seeds", 0), ("max_steps", 1), ("rungs", 0)):
             count = getattr(self, name)
             if count is not None and count < least:
                 raise ValueError(f"{name} = {count} must be at least {least}")
@@ -121,11 +129,14 @@ def planned(task: AbstractTask, target: Target, options: FitOptions) -> Plan:
         raise ValueError("the task has neither noise nor a harmonic, so its spectrum is zero: set noise_K_w, say")
     _check_mean(task, names, options.mean_force)
     control = has_response(task, required=options.method == "linear")
-    usual = {"starts": 100, "seeds": 32, "check_seeds": 64} if control else {"starts": 8, "seeds": 48, "check_seeds": 200}
-    counts = {name: count if getattr(options, name) is None else getattr(options, name) for name, count in usual.items()}
+    many = {"starts": 100, "seeds": 32, "check_seeds": 64} if control else {"starts": 8, "seeds": 48, "check_seeds": 200}
+    counts = {name: count if getattr(options, name) is None else getattr(options, name) for name, count in many.items()}
     if options.method == "montecarlo" and counts["seeds"] < 1:
         raise ValueError("seeds = 0: a Monte Carlo fit needs at least one")
-    sds = {n: priors.get(n, PARAMETERS[n].prior_sd if n in PARAMETERS else 1.0) for n in names}
+    usual = {n: PARAMETERS[n].prior_sd if n in PARAMETERS else 1.0 for n in names}
+    if task.activation is not None:
+        usual |= {n: NARROW for n in COEFFICIENTS if n in names}
+    sds = {n: priors.get(n, usual[n]) for n in names}
     coordinates = Coordinates.of({n: float(task[n]) for n in names}, bounds, {n: sd or 1.0 for n, sd in sds.items()})
     variation = target_variation(target) if options.coefficient_of_variation else None
     part = Part("", task, target, coordinates, tuple(range(len(names))), variation, options.mean_force)

@@ -1,5 +1,6 @@
 """What follows from a point θ: moments, their slopes, derived quantities."""
 
+import itertools
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -9,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxmuscle._common.programs import kept
+from jaxmuscle.model._noise import ResonantNoise
 from jaxmuscle.model._parameters import PARAMETERS, USUALLY_FREE
 from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.response._expected import Moments
@@ -17,10 +19,17 @@ from ._coordinates import Coordinates, task_at
 from ._moment_models import Linear
 from ._residuals import PartResiduals, Residuals
 
-DERIVED = ("corner_frequency", "harmonic_share", "harmonic_frequency", "high_frequency_floor", "K_w0", "K_z0", "C_w0",
-           "C_z0", "coefficient_of_variation", "mean")  # fmt: skip
+EDGES = (0.0, 0.5, 1.0, 2.0, 4.0, 8.0, 12.0)
+BANDS = {f"band_{low:g}_{high:g}": (low, high) for low, high in itertools.pairwise(EDGES)}
+DERIVED = ("corner_frequency", "half_power_frequency", "contraction_time", "tremor_frequency", "tremor_width",
+           "tremor_share", "resonance_2_share", "harmonic_share", "harmonic_frequency", "high_frequency_floor",
+           "K_w0", "K_z0", "C_w0", "C_z0", "coefficient_of_variation", "mean", *BANDS)  # fmt: skip
 UNITS = {
     "corner_frequency": "Hz",
+    "half_power_frequency": "Hz",
+    "contraction_time": "s",
+    "tremor_frequency": "Hz",
+    "tremor_width": "Hz",
     "harmonic_frequency": "Hz",
     "K_w0": "N/m",
     "K_z0": "N/m",
@@ -29,16 +38,48 @@ UNITS = {
 }
 
 
-def derived(task: Any, moments: Moments) -> dict[str, Any]:
+def derived_names(task: Any) -> tuple[str, ...]:
+    """The derived quantities that a task has."""
+    frequency, resonances = task.settings.frequency, sum(isinstance(n, ResonantNoise) for n in task.noise.components)
+    bands = {name for name, (low, high) in BANDS.items() if np.any((frequency >= low) & (frequency < high))}
+    missing = set(BANDS) - bands
+    missing |= set() if task.activation is not None else {"contraction_time"}
+    missing |= {"tremor_frequency", "tremor_width", "tremor_share"} if resonances < 1 else set()
+    missing |= {"resonance_2_share"} if resonances < 2 else set()
+    return tuple(name for name in DERIVED if name not in missing)
+
+
+def derived(task: Any, moments: Moments, frequency: Float[Array | np.ndarray, " bins"] | None = None) -> dict[str, Any]:
     """What the data can determine.
 
-    `corner_frequency` |λ_slow|/2π of the operating point; `harmonic_share` of the compared power; `harmonic_frequency`;
-    `high_frequency_floor`, mean proportional power per bin over the highest third of the bins; the base coefficients;
-    `coefficient_of_variation` and `mean` of the output.
+    `corner_frequency` |λ_slow|/2π of the operating point; `half_power_frequency` of the slow part, relaxation and activation
+    together; `contraction_time`, where there is an activation; where there is a resonance `tremor_frequency`,
+    `tremor_width` and `tremor_share` of the compared power, and `resonance_2_share` of a second one, both from half the
+    resonance's frequency on (what activation and muscle let through below is no peak and can hardly be told from the rest);
+    `harmonic_share` of the compared power; `harmonic_frequency`; `high_frequency_floor`, mean proportional power per bin
+    over the highest third of the bins; the base coefficients; `coefficient_of_variation` and `mean` of the output;
+    `band_4_8` and so on, the proportional power of the bins from 4 Hz to below 8 Hz.
     """
     base, seen = task.muscle.base(), observed(moments)
-    return {
+    at: Any = task.settings.frequency if frequency is None else frequency  # of the bins, if not all are compared
+    resonances = [noise for noise in task.noise.components if isinstance(noise, ResonantNoise)]
+    whole, one = moments.power.sum(), jnp.ones(())
+    found: dict[str, Any] = {
         "corner_frequency": moments.rate / (2 * jnp.pi),
+        "half_power_frequency": moments.half,
+    }
+    if task.activation is not None:
+        found["contraction_time"] = task.activation.time * one
+    for name, noise, own in zip(("tremor", "resonance_2"), resonances, moments.resonant, strict=False):
+        if name == "tremor":
+            found |= {"tremor_frequency": noise.frequency * one, "tremor_width": noise.width * one}
+        peak = at >= 0.5 * jax.lax.stop_gradient(noise.frequency)
+        found[f"{name}_share"] = jnp.sum(jnp.where(peak, own, 0.0)) / whole
+    proportional = moments.power / whole
+    for name, (low, high) in BANDS.items():
+        if name in derived_names(task):
+            found[name] = jnp.sum(jnp.where((at >= low) & (at < high), proportional, 0.0))
+    return found | {
         "harmonic_share": seen["harmonic_share"],
         "harmonic_frequency": task.harmonic.frequency * jnp.ones(()),
         "high_frequency_floor": seen["high_frequency_floor"],
@@ -49,6 +90,11 @@ def derived(task: Any, moments: Moments) -> dict[str, Any]:
         "coefficient_of_variation": seen["coefficient_of_variation"],
         "mean": seen["mean"],
     }
+
+
+def frequency_of(part: PartResiduals) -> Float[Array, " bins"]:
+    """Frequencies of the compared bins [Hz]."""
+    return jnp.asarray(part.task.settings.frequency)[part.model.chosen]
 
 
 def observed(moments: Moments) -> dict[str, Any]:
@@ -126,7 +172,7 @@ def quantities(objective: Residuals, seen: Expansion) -> tuple[Tables, Tables]:
 def _quantities(part: PartResiduals, seen: Expansion) -> tuple[dict[str, Array], dict[str, Array]]:
     def one(seen):
         def everything(theta):
-            values = derived(task_at(part.task, part.coordinates, theta), seen.near(theta))
+            values = derived(task_at(part.task, part.coordinates, theta), seen.near(theta), frequency_of(part))
             return values, values
 
         slopes, values = jax.jacfwd(everything, has_aux=True)(seen.theta)
@@ -167,7 +213,8 @@ def _consequences(part: PartResiduals, seen: Expansion) -> tuple[Any, Any]:
     def one(seen):
         def everything(theta):
             moments = seen.near(theta)
-            values = part.data_residuals(moments, part.data), derived(task_at(part.task, part.coordinates, theta), moments)
+            task = task_at(part.task, part.coordinates, theta)
+            values = part.data_residuals(moments, part.data), derived(task, moments, frequency_of(part))
             return values, values
 
         slopes, values = jax.jacfwd(everything, has_aux=True)(seen.theta)

@@ -82,7 +82,7 @@ def parameter_covariance(
 SCALES = (
     (
         "all noise amplitudes and the harmonic's can be scaled together",
-        ("noise_K_w", "noise_K_z", "harmonic_amplitude"),
+        ("noise_K_w", "noise_K_z", "noise_P_w", "harmonic_amplitude", "resonance_amplitude", "resonance_2_amplitude"),
     ),
     ("stiffness and damping can be scaled together", ("k_w", "k_z", "c_w", "c_z")),
 )

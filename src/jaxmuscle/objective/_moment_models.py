@@ -9,11 +9,12 @@ import numpy as np
 import scipy
 from jaxtyping import Array, Float, Int
 
-from jaxmuscle.model._noise import Realisation
+from jaxmuscle.model._noise import Realisation, ResonantNoise
 from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.response._equilibrium import slowest, slowest_rate
 from jaxmuscle.response._expected import Moments, expected_moments, response
 from jaxmuscle.response._linearised import LinearTask, settled
+from jaxmuscle.response._transfer import half_power_frequency
 from jaxmuscle.simulation._batch import respond
 from jaxmuscle.simulation._grid import Grid
 from jaxmuscle.spectra._settings import SpectrumSettings, samples_in
@@ -65,8 +66,9 @@ class Linear(eqx.Module):
         """Expected moments of the task's output."""
         # Compiled apart, so that it is traced once.
         found, system = expected_moments(task, task.settings, self.window, self.samples)
-        chosen = found.power[self.chosen], found.line[self.chosen]
-        found = found._replace(power=chosen[0], line=chosen[1], rate=slowest(system.A))
+        power, line, resonant = jax.tree.map(lambda x: x[self.chosen], (found.power, found.line, found.resonant))
+        half = half_power_frequency(task, system)
+        found = found._replace(power=power, line=line, resonant=resonant, rate=slowest(system.A), half=half)
         return jax.tree.map(jnp.multiply, found, self.correction)
 
 
@@ -95,7 +97,7 @@ class MonteCarlo(eqx.Module):
         With a control variate the variance is that of a recording of so many `samples`, by default as many as simulated.
         """
         if not control:
-            normals = jnp.concatenate([jnp.zeros_like(normals[:1]), normals])
+            normals = jax.tree.map(lambda z: jnp.concatenate([jnp.zeros_like(z[:1]), z]), normals)
         noise = normals if colour_free else jax.jit(jax.vmap(lambda z: task.noise.realise(z, grid.dt)))(normals)
         operator = welch_operator(task.settings, grid.steps // grid.every + 1, window)
         samples = samples_in(window, task.settings) if samples is None else samples
@@ -130,11 +132,14 @@ class MonteCarlo(eqx.Module):
             beside = outputs(LinearTask.of(task, system))
             power = exact.power[self.chosen] + jnp.mean(self._power(seen, settings) - self._power(beside, settings), 0)
             spread = jnp.mean(swing(seen) - swing(beside))
-            return Moments(power, exact.line[self.chosen], mean, exact.variance + spread, slowest(system.A))
+            resonant = tuple(own[self.chosen] for own in exact.resonant)
+            half = half_power_frequency(task, system)
+            return Moments(power, exact.line[self.chosen], mean, exact.variance + spread, slowest(system.A), half, resonant)
         quiet, noisy = seen[:1], seen[1:] - seen[:1]
         line, random = jnp.mean(self._power(quiet, settings), 0), jnp.mean(self._power(noisy, settings), 0)
         variance = swing(quiet[0]) + jnp.mean(swing(noisy))
-        return Moments(line + random, line, mean, variance, slowest_rate(task))
+        none = tuple(jnp.full_like(line, jnp.nan) for part in task.noise.components if isinstance(part, ResonantNoise))
+        return Moments(line + random, line, mean, variance, slowest_rate(task), jnp.full((), jnp.nan), none)
 
     def _power(self, outputs: Float[Array, "seeds samples"], settings: SpectrumSettings) -> Float[Array, "seeds bins"]:
         bins = settings.last_bin - settings.first_bin + 1

@@ -12,6 +12,8 @@ from jaxtyping import Float
 
 from jaxmuscle._common.arrays import all_concrete, as_arrays, as_numbers, is_concrete
 from jaxmuscle.data._target import Target
+from jaxmuscle.model._noise import ResonantNoise
+from jaxmuscle.model._parameters import paths_of
 from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.response._equilibrium import fastest_rate
 from jaxmuscle.response._expected import Moments, log_variation_sd
@@ -97,7 +99,8 @@ class Part:
         """Its residuals in linear response, times a correction of its moments."""
         if correction is None:
             ones, one = np.ones(len(self.chosen)), np.ones(())
-            correction = Moments(ones, ones, one, one, one)
+            resonant = tuple(ones for noise in self.task.noise.components if isinstance(noise, ResonantNoise))
+            correction = Moments(ones, ones, one, one, one, one, resonant)
         samples = np.asarray(trial_samples(self.target))
         return self.residuals(Linear(self.chosen, jax.tree.map(np.asarray, correction), samples, WINDOW), residual, share)
 
@@ -218,10 +221,11 @@ class FitProblem:
 
     def _paths(self, part: Part, seeds: int) -> MonteCarlo:
         task, settings, every = as_arrays(part.task), part.target.settings, self.steps_per_sample
-        part.task.noise.check_step(self.dt)
+        part.task.check_step(self.dt)
         grid = Grid(self.dt, every * round(DURATION * settings.rate), every, 1, reverse=False)
         normals = draw(task.noise, jax.random.fold_in(self.key, 0), jnp.arange(seeds), grid.steps)
-        colour = any(name in ("noise_cutoff", "noise_correlation_time") for name in part.coordinates.names)
+        shaping = {n for n, path in paths_of(task).items() if path[0] == "noise" and "amplitude" not in path}
+        colour = not shaping.isdisjoint(part.coordinates.names)
         return MonteCarlo.of(task, normals, grid, part.chosen, WINDOW, colour_free=colour, control=self.control,
                              samples=trial_samples(part.target))  # fmt: skip
 

@@ -27,7 +27,19 @@ def starting_points(problem: FitProblem, count: int) -> Float[np.ndarray, "start
         if number:
             frequencies = np.random.default_rng(number).permutation(frequencies)
         theta[:, coordinates.names.index(name)] = coordinates.theta_of(name, frequencies)
+    _spread_resonances(problem, theta)
     return coordinates.from_theta(theta)
+
+
+def _spread_resonances(problem: FitProblem, theta: Float[np.ndarray, "starts free"]) -> None:
+    """Every other start has its resonances at candidates of the target; of two the first is the higher one."""
+    names, rows = problem.coordinates.names, np.arange(1, len(theta), 2)
+    of = [name.partition("_frequency")[2] for name in names if name.startswith("resonance_frequency")]
+    for target in of if len(rows) else ():
+        pair = [n for n in (f"resonance_frequency{target}", f"resonance_2_frequency{target}") if n in names]
+        each = [np.random.default_rng(i).permutation(frequencies_for(problem, n, len(rows))) for i, n in enumerate(pair)]
+        for name, frequencies in zip(pair, -np.sort(-np.stack(each), axis=0), strict=True):
+            theta[rows, names.index(name)] = problem.coordinates.theta_of(name, frequencies)
 
 
 def frequencies_for(problem: FitProblem, name: str, count: int) -> Float[np.ndarray, " starts"]:

@@ -14,7 +14,7 @@ from matplotlib.figure import Figure, SubFigure
 from jaxmuscle._common.text import rounded
 
 from ._spectra import target
-from ._style import BLACK, BLUE, GREY, ORANGE, VERMILLION, canvas, legend, output_label, styled
+from ._style import BLACK, BLUE, GREEN, GREY, ORANGE, PURPLE, SKY, VERMILLION, canvas, legend, output_label, styled
 
 WIDTH, LINE, FONT = 7.5, 0.165, 7.5  # inches, inches, points
 TABLE = (0.55, 0.565, 0.83)  # where values end, errors begin, units begin
@@ -80,7 +80,7 @@ def _header(result: Any) -> list[_Line]:
         lines += _about(name if several else "", part)
     facts = [*_closeness(result.only)] if not several else []
     facts += [result.message.removeprefix("converged: ")] * result.success
-    model = [] if several else [f"{type(result.task).__name__} ({type(result.task.noise).__name__})", result.method]
+    model = [] if several else [result.only.model, result.method]
     lines += _wrapped("  ·  ".join([*model, *facts]))
     believed = result.success and result.adequate is not False
     verdict = result.verdict[0].upper() + result.verdict[1:]
@@ -98,7 +98,7 @@ def _about(name: str, part: Any) -> list[_Line]:
     """Where a target comes from; of several (each with its `name`) also its model and how close the fit is."""
     aim = part.target
     if name:
-        model = f"{type(part.task).__name__} ({type(part.task.noise).__name__})"
+        model = part.model
         known = f"{name}: {aim.name} ({aim.provenance} {aim.quantity})"
         lines = _wrapped("  ·  ".join([known, model, *_closeness(part)]))
     else:
@@ -164,7 +164,10 @@ def _spectra(ax: Axes, part: Any, *, log: bool, title: str = "") -> None:
     if np.isfinite(fitted).any():
         dots.set_linewidth(0.0)
         ax.plot(frequency, fitted, color=BLUE, label="fit", zorder=4)
-        _harmonic(ax, part, frequency, fitted)
+        if set(part.components) - {"relaxation", "floor", "harmonic"}:
+            _components(ax, part, frequency, fitted, log=log)
+        else:
+            _harmonic(ax, part, frequency, fitted)
     ax.set_title(title or ("Logarithmic" if log else "Linear"), parse_math=False)
     if log:
         ax.set_xlim(frequency[frequency > 0][0] / 1.15, frequency[-1] * 1.15)
@@ -183,6 +186,26 @@ def _log_limits(ax: Axes, part: Any, fitted: Any) -> None:
     seen = np.concatenate([part.target.proportional_power, fitted, *(band or ())])
     seen = seen[np.isfinite(seen) & (seen > 0)]
     ax.set_ylim(seen.min() / 1.4, seen.max() * 1.4)
+
+
+AREAS = {"floor": ("0.75", "floor"), "relaxation": (SKY, "relaxation"), "harmonic": (ORANGE, "harmonic"),
+         "tremor": (GREEN, "tremor"), "resonance_2": (PURPLE, "second resonance")}  # fmt: skip
+
+
+def _components(ax: Axes, part: Any, frequency: Any, fitted: Any, *, log: bool) -> None:
+    """What the parts of the model hold of the fitted power: one area upon the other; over a logarithmic axis, lines."""
+    below = np.zeros(len(fitted))
+    for name, (color, words) in AREAS.items():
+        power = fitted * np.maximum(part.components.get(name, 0.0), 0.0)
+        total = float(np.sum(power))
+        if not total > 1e-4:
+            continue
+        if log:
+            ax.plot(frequency, np.where(power > 0, power, np.nan), color=color, lw=1.0, zorder=3)
+            continue
+        label = f"{words}, {'<1' if total < 0.01 else f'{100 * total:.0f}'} % of power"
+        ax.fill_between(frequency, below, below + power, color=color, alpha=0.7, lw=0, zorder=2, label=label)
+        below = below + power
 
 
 def _harmonic(ax: Axes, part: Any, frequency: Any, fitted: Any) -> None:

@@ -102,13 +102,13 @@ def _operating(task: AbstractTask) -> tuple[float, float, float]:
         x_z = y[task.state_names.index("x_z")] if "x_z" in task.state_names else jnp.nan
     else:
         x_z = prescribed(t) if isinstance(prescribed, AbstractSignal) else prescribed
-    P_w = task.output(t, y, jnp.zeros(4), jnp.zeros(4)) if isinstance(task, PrescribedMotion) else getattr(task, "P_w")(t)  # noqa: B009
+    P_w = task.output(t, y, jnp.zeros(5), jnp.zeros(5)) if isinstance(task, PrescribedMotion) else getattr(task, "P_w")(t)  # noqa: B009
     return float(P_w), float(y[0]), float(x_z)
 
 
 @kept
 def _curves(muscle: AbstractMuscle, x: Array, v: Array, P_w: Array) -> dict[str, Array]:
-    zero, still = jnp.zeros(()), jnp.zeros(4)
+    zero, still = jnp.zeros(()), jnp.zeros(5)
     springs = {
         "w": lambda q: muscle.active_force(q, zero, still),
         "z": lambda q: muscle.passive_force(zero, zero, q, zero, still),
@@ -136,4 +136,4 @@ def _slopes(force: Callable[[Scalar], Scalar], q: Array) -> tuple[Array, Array, 
 
 def _held_force(muscle: AbstractMuscle, x_z: Array, P_w: Array) -> Array:
     held = Isometric(muscle=muscle, P_w=Constant(P_w), x_z=x_z)
-    return held.output(jnp.zeros(()), equilibrium(held), jnp.zeros(4), jnp.zeros(4))
+    return held.output(jnp.zeros(()), equilibrium(held), jnp.zeros(5), jnp.zeros(5))

@@ -27,7 +27,7 @@ def equilibrium(task: AbstractTask, time: float = HOLD) -> Float[Array, " states
     tolerance = 1e-12 if dtype == jnp.float64 else 1e-6
 
     def field(y):
-        return task.vector_field(jnp.asarray(time, dtype), y, jnp.zeros(4))
+        return task.vector_field(jnp.asarray(time, dtype), y, jnp.zeros(5))
 
     def newton(function, y):
         method = optx.Newton(rtol=tolerance, atol=tolerance)
@@ -54,7 +54,7 @@ def equilibrium(task: AbstractTask, time: float = HOLD) -> Float[Array, " states
 def jacobian(task: AbstractTask, y: Float[Array, " states"], time: float = HOLD) -> Float[Array, "states states"]:
     """Jacobian [1/s] of the vector field with respect to the state at y."""
     task = as_arrays(task)
-    return jax.jacfwd(lambda y: task.vector_field(jnp.asarray(time, y.dtype), y, jnp.zeros(4)))(y)
+    return jax.jacfwd(lambda y: task.vector_field(jnp.asarray(time, y.dtype), y, jnp.zeros(5)))(y)
 
 
 def slowest_rate(task: AbstractTask, time: float = HOLD) -> Float[Array, ""]:

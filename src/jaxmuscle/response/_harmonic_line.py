@@ -8,7 +8,6 @@ import numpy as np
 from jaxtyping import Array, Complex, Float, Int
 
 from jaxmuscle._common.programs import kept
-from jaxmuscle.model._muscle import Perturbation
 from jaxmuscle.model._signals import Constant
 from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.spectra._bin_law import bin_rows
@@ -16,23 +15,7 @@ from jaxmuscle.spectra._settings import WINDOW, SpectrumSettings
 from jaxmuscle.spectra._welch import lowpass, spectrum_of
 
 from ._linearised import Linearisation, linearise
-
-
-def _turn(angle: Float[Array, "*any"]) -> Complex[Array, "*any"]:
-    """exp(i angle)."""
-    return jax.lax.complex(jnp.cos(angle), jnp.sin(angle))
-
-
-def _times_i(x: Float[Array, "*any"]) -> Complex[Array, "*any"]:
-    return jax.lax.complex(jnp.zeros_like(x), x)
-
-
-def _transfer(system: Linearisation, base: Perturbation, omega: Float[Array, ""]) -> Complex[Array, ""]:
-    """Response of the output to the harmonic on all its channels, `C (s - A)⁻¹ B + D + s E` times base, s = iω."""
-    s = _times_i(omega)
-    A, B, C = (x.astype(s.dtype) for x in (system.A, system.B @ base, system.C))
-    inside = jnp.linalg.solve(s * jnp.eye(len(A), dtype=s.dtype) - A, B)
-    return C @ inside + jax.lax.complex(system.D @ base, omega * (system.E @ base))
+from ._transfer import harmonic_system, times_i, transfer, turn_of
 
 
 def _low_pass(settings: SpectrumSettings, turn: Complex[Array, ""]) -> Complex[Array, ""]:
@@ -47,7 +30,7 @@ def _low_pass(settings: SpectrumSettings, turn: Complex[Array, ""]) -> Complex[A
 
 def _sample_mean(angle: Float[Array, ""], sampling: str) -> Complex[Array, ""]:
     """What averaging over the sampling interval before each sample does to a line that turns by `angle` in it."""
-    return (1 - _turn(-angle)) / _times_i(angle) if sampling == "average" else jnp.ones_like(_turn(angle))
+    return (1 - turn_of(-angle)) / times_i(angle) if sampling == "average" else jnp.ones_like(turn_of(angle))
 
 
 class LineTable(NamedTuple):
@@ -79,11 +62,11 @@ def line_levels(
 ) -> tuple[Float[Array, "lines bins"], Float[Array, " lines"]]:
     """Of lines of these frequencies [Hz] in the output: Welch power of a mean square of 1 behind the low-pass, the phase
     averaged; and the mean square behind the low-pass that a harmonic of amplitude √2 has."""
-    system, base = linearise(task), task.harmonic_base()
+    system = harmonic_system(task, linearise(task))
 
     def one(f):
         table = line_table(settings, WINDOW, f, 1)
-        reply = _transfer(system, base, 2 * jnp.pi * f)
+        reply = transfer(system, 2 * jnp.pi * f)
         return 2 * table.level / table.passed, jnp.abs(reply) ** 2 * table.passed
 
     return jax.vmap(one)(jnp.asarray(frequency))
@@ -93,7 +76,7 @@ def _turns(turns: Float[Array, ""], start: int, samples: Int[Array | np.ndarray,
     """Mean of `exp(2πi turns m)` over so many successive m from `start` on."""
     n = jnp.asarray(samples, turns.dtype)
     size = jnp.sinc(n * turns) / jnp.sinc(turns)
-    spin = _turn(2 * jnp.pi * turns * (start + 0.5 * (n - 1)))
+    spin = turn_of(2 * jnp.pi * turns * (start + 0.5 * (n - 1)))
     return spin * size.astype(spin.dtype)
 
 
@@ -108,15 +91,15 @@ def line_table(
     Segments are those of the window; its variance is that of so many samples from the window's begin on.
     """
     angle = 2 * jnp.pi * frequency / settings.rate
-    turn, gain = _turn(angle), _sample_mean(angle, settings.sampling)
+    turn, gain = turn_of(angle), _sample_mean(angle, settings.sampling)
     start, stop = (round(edge * settings.rate) for edge in window)
     begins = start + settings.step * np.arange(settings.segments(stop - start))
     rows = jnp.asarray(bin_rows(settings), turn.dtype)
-    spin = _turn(angle * np.arange(settings.length, dtype=angle.dtype))
+    spin = turn_of(angle * np.arange(settings.length, dtype=angle.dtype))
     ahead, behind = rows @ spin, rows @ jnp.conj(spin)
     through = gain * _low_pass(settings, turn)
     level = 0.25 * jnp.abs(through) ** 2 * (jnp.abs(ahead) ** 2 + jnp.abs(behind) ** 2)
-    turning = 0.5 * through**2 * jnp.mean(_turn(2 * angle * begins.astype(angle.dtype))) * ahead * jnp.conj(behind)
+    turning = 0.5 * through**2 * jnp.mean(turn_of(2 * angle * begins.astype(angle.dtype))) * ahead * jnp.conj(behind)
     once, twice = (through**k * _turns(k * frequency / settings.rate, start, samples) for k in (1, 2))
     return LineTable(level, turning, jnp.abs(through) ** 2, once, twice)
 
@@ -137,7 +120,7 @@ def harmonic_line(
         return _enveloped_line(task, system, settings, window)
     frequency = jnp.asarray(harmonic.frequency, system.A.dtype)
     table = line_table(settings, window, frequency, samples)
-    reply = harmonic_size(task, system.A.dtype) * _transfer(system, task.harmonic_base(), 2 * jnp.pi * frequency)
+    reply = harmonic_size(task, system.A.dtype) * transfer(harmonic_system(task, system), 2 * jnp.pi * frequency)
     return table.power(reply), table.variance(reply)
 
 
@@ -146,7 +129,7 @@ def harmonic_size(task: AbstractTask, dtype: Any) -> Complex[Array, ""]:
     harmonic = task.harmonic
     assert isinstance(harmonic.envelope, Constant)
     size = jnp.asarray(harmonic.amplitude, dtype) * jnp.asarray(harmonic.envelope.level, dtype)
-    turn = _turn(jnp.asarray(harmonic.phase, dtype))
+    turn = turn_of(jnp.asarray(harmonic.phase, dtype))
     return size.astype(turn.dtype) * turn
 
 
@@ -158,14 +141,14 @@ def _enveloped_line(
     `Y' = (A - iω) Y + B b a(t)` for y = Im(Y e^{i(ωt + φ)}) is stepped exactly for an envelope a linear between samples,
     from the steady state of its value at t = 0.
     """
-    harmonic, base, dtype = task.harmonic, task.harmonic_base(), system.A.dtype
+    harmonic, dtype, A, b, c, d, e = task.harmonic, system.A.dtype, *harmonic_system(task, system)
     omega, interval = 2 * jnp.pi * jnp.asarray(harmonic.frequency, dtype), 1 / settings.rate
     start, stop = (round(edge * settings.rate) for edge in window)
     time = jnp.arange(stop, dtype=dtype) * interval
     level, slope = jax.vmap(lambda t: jax.jvp(harmonic.envelope, (t,), (jnp.ones_like(t),)))(time)
-    whirl = _times_i(omega)
-    n, drive = len(system.A), (system.B @ base).astype(whirl.dtype)
-    turning = system.A.astype(whirl.dtype) - whirl * jnp.eye(n, dtype=whirl.dtype)
+    whirl = times_i(omega)
+    n, drive = len(A), b.astype(whirl.dtype)
+    turning = A.astype(whirl.dtype) - whirl * jnp.eye(n, dtype=whirl.dtype)
     blocks = jnp.zeros((n + 2, n + 2), whirl.dtype)
     blocks = blocks.at[:n, :n].set(turning * interval).at[:n, n].set(drive * interval).at[n, n + 1].set(1.0)
     whole = jax.scipy.linalg.expm(blocks)
@@ -179,8 +162,7 @@ def _enveloped_line(
     first = -jnp.linalg.solve(turning, drive * pairs[0, 0])
     _, later = jax.lax.scan(advance, first, pairs)
     Y = jnp.concatenate([first[None], later])
-    around = _turn(omega * time + jnp.asarray(harmonic.phase, dtype)) * _sample_mean(omega * interval, settings.sampling)
-    through, ahead = system.D @ base, system.E @ base
-    direct = jax.lax.complex(through * level + ahead * slope, ahead * omega * level)
-    z = jnp.asarray(harmonic.amplitude, dtype) * jnp.imag((Y @ system.C.astype(Y.dtype) + direct) * around)
+    around = turn_of(omega * time + jnp.asarray(harmonic.phase, dtype)) * _sample_mean(omega * interval, settings.sampling)
+    direct = jax.lax.complex(d * level + e * slope, e * omega * level)
+    z = jnp.asarray(harmonic.amplitude, dtype) * jnp.imag((Y @ c.astype(Y.dtype) + direct) * around)
     return jnp.asarray(spectrum_of(z, settings, window).power), jnp.var(lowpass(z, settings)[start:stop])

@@ -26,27 +26,27 @@ class Linearisation(NamedTuple):
     point: Float[Array, " states"]
     rest: Float[Array, ""]
     A: Float[Array, "states states"]
-    B: Float[Array, "states 4"]
+    B: Float[Array, "states 5"]
     C: Float[Array, " states"]
-    D: Float[Array, "4"]
-    E: Float[Array, "4"]
+    D: Float[Array, "5"]
+    E: Float[Array, "5"]
 
 
 def linearise(task: AbstractTask, time: float = HOLD) -> Linearisation:
     """Jacobians of the task's own vector field and output at its equilibrium under the inputs at `time` [s]."""
     point = equilibrium(task, time)
-    n, t, still = point.shape[0], jnp.asarray(time, point.dtype), jnp.zeros(4, point.dtype)
+    n, t, still = point.shape[0], jnp.asarray(time, point.dtype), jnp.zeros(5, point.dtype)
 
     def field(both):
         return task.vector_field(t, both[:n], both[n:])
 
     def output(all_three):
-        z = task.output(t, all_three[:n], all_three[n : n + 4], all_three[n + 4 :])
+        z = task.output(t, all_three[:n], all_three[n : n + 5], all_three[n + 5 :])
         return z, z
 
     AB = jax.jacfwd(field)(jnp.concatenate([point, still]))
     CDE, rest = jax.jacfwd(output, has_aux=True)(jnp.concatenate([point, still, still]))
-    return Linearisation(point, rest, AB[:, :n], AB[:, n:], CDE[:n], CDE[n : n + 4], CDE[n + 4 :])
+    return Linearisation(point, rest, AB[:, :n], AB[:, n:], CDE[:n], CDE[n : n + 5], CDE[n + 5 :])
 
 
 class LinearTask(AbstractTask):
@@ -57,13 +57,12 @@ class LinearTask(AbstractTask):
     state_units: ClassVar[tuple[str, ...]] = ()
     output_name: ClassVar[str] = "z"
     output_unit: ClassVar[str] = ""
-    smoothness_needed: ClassVar[tuple[int, int, int, int]] = (0, 0, 0, 0)
+    smoothness_needed: ClassVar[tuple[int, ...]] = (0, 0, 0, 0, 0)
 
     @classmethod
     def of(cls, task: AbstractTask, system: Linearisation | None = None) -> "LinearTask":
         """The linearisation of a task, if it is known already as `system`."""
-        parts = {"muscle": task.muscle, "noise": task.noise, "harmonic": task.harmonic, "settings": task.settings}
-        return cls(linearise(task) if system is None else system, **parts)
+        return cls(linearise(task) if system is None else system, **task.common)
 
     def initial_state(self) -> State:
         return self.system.point

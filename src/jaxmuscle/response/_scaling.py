@@ -12,7 +12,7 @@ import numpy as np
 from jaxmuscle._common.arrays import all_concrete, as_numbers, is_concrete, require
 from jaxmuscle._common.types import Scalar
 from jaxmuscle.model._muscle import Muscle, QuadraticDamping, QuadraticStiffness
-from jaxmuscle.model._parameters import CHANNELS
+from jaxmuscle.model._parameters import amplitude_names, names_of
 from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.spectra._settings import WINDOW
 
@@ -109,9 +109,8 @@ def at_force(task: AbstractTask, mean: Scalar) -> AbstractTask:
     inputs = {name: _times(getattr(task, name), factor) for name in FORCES if hasattr(task, name)}
     moved = _with_coefficients(task.with_parts(**inputs), stiffness=factor, damping=factor)
     moved = moved.replace(m_w=moved["m_w"] * factor, m_z=moved["m_z"] * factor)
-    if moved.noise.relative:
-        return moved
-    return moved.replace(**{name: task[name] * factor for name in (f"noise_{channel}" for channel in CHANNELS)})
+    absolute = [n for part in moved.noise.components if not part.relative for n in names_of(moved, part)]
+    return moved.replace(**{name: task[name] * factor for name in absolute})
 
 
 def scaled(
@@ -203,8 +202,7 @@ def _with_variation(task: AbstractTask, before: AbstractTask, factor: Scalar) ->
         louder = factor * then / now if moving else 1.0
     else:
         louder = jnp.where(moving, factor * then / jnp.where(moving, now, 1.0), 1.0)
-    names = [*(f"noise_{channel}" for channel in CHANNELS), "harmonic_amplitude"]
-    return task.replace(**{name: task[name] * louder for name in names})
+    return task.replace(**{name: task[name] * louder for name in amplitude_names(task)})
 
 
 def _moments(task: AbstractTask) -> Moments:

@@ -13,8 +13,9 @@ from scipy.special import ndtr
 from jaxmuscle._common.arrays import as_arrays
 from jaxmuscle._common.errors import FirstOrderWarning
 from jaxmuscle._common.programs import kept
+from jaxmuscle.model._activation import ACTIVE
 from jaxmuscle.model._noise import BandLimitedNoise, ShapingFilter, WhiteNoise
-from jaxmuscle.model._parameters import CHANNELS
+from jaxmuscle.model._parameters import CHANNELS, INPUTS
 from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.spectra._settings import WINDOW, SpectrumSettings
 
@@ -56,53 +57,81 @@ def _hessians(task: AbstractTask, system: Linearisation) -> Float[Array, "output
     n, t = len(system.point), jnp.asarray(HOLD, system.point.dtype)
 
     def both(given):
-        y, u, du = given[:n], given[n : n + 4], given[n + 4 :]
+        y, u, du = given[:n], given[n : n + len(INPUTS)], given[n + len(INPUTS) :]
         return jnp.append(task.vector_field(t, y, u), task.output(t, y, u, du))
 
-    return jax.hessian(both)(jnp.concatenate([system.point, jnp.zeros(8, system.point.dtype)]))
+    return jax.hessian(both)(jnp.concatenate([system.point, jnp.zeros(2 * len(INPUTS), system.point.dtype)]))
+
+
+class _Source(NamedTuple):
+    """One scalar noise: its filter, what it adds to each of the inputs; the harmonic is a narrow resonance of its power."""
+
+    filter: ShapingFilter
+    weight: Any
 
 
 class _Parts(NamedTuple):
-    """Filter of the noise, its amplitudes, what the harmonic is a fraction of, its steady size and ω, base coefficients."""
+    """The independent noises, the harmonic, matrix and input of the activation's states, base coefficients, the swing."""
 
-    filter: ShapingFilter
-    scale: Any
-    harmonic: Any
-    swing: Any
-    omega: Any
+    noises: tuple[_Source, ...]
+    harmonic: _Source
+    activation: Any
     base: Any
+    swing: Any
 
 
 @kept
 def _parts(task: AbstractTask) -> _Parts:
-    noise = task.noise
-    if isinstance(noise, WhiteNoise):  # has no value: as its samples at `rate` have
-        noise = BandLimitedNoise(noise.amplitude, rate=noise.rate, cutoff=noise.rate / 2)
+    noises = []
+    for noise in task.noise.components:
+        scale, unit = task.noise_scale(noise), jnp.eye(len(INPUTS))[np.array(noise.acts_on)]
+        if isinstance(noise, WhiteNoise):  # has no value: as its samples at `rate` have
+            noise = BandLimitedNoise(noise.amplitude, rate=noise.rate, cutoff=noise.rate / 2, shared=noise.shared)
+        rows = scale[:, None] * unit
+        rows = jnp.sum(rows, axis=0, keepdims=True) if noise.shared else rows
+        noises += [_Source(noise.shaping_filter(), row) for row in rows]
     harmonic = task.harmonic
     swing = harmonic.amplitude * harmonic.envelope(jnp.asarray(HOLD))
-    return _Parts(noise.shaping_filter(), task.noise_scale(), task.harmonic_base(), swing, 2 * jnp.pi * harmonic.frequency,
-                  task.muscle.base())  # fmt: skip
+    omega, damping = 2 * jnp.pi * harmonic.frequency, 2 * np.pi * LINE_WIDTH
+    F = jnp.stack([jnp.stack([0 * omega, omega]), jnp.stack([-omega, -damping + 0 * omega])])
+    G = jnp.sqrt(damping) * jnp.abs(swing) * jnp.array([[0.0], [1.0]])
+    line = _Source(ShapingFilter(F, G, jnp.array([1.0, 0.0]), jnp.zeros(1)), task.harmonic_base())
+    states = None if task.activation is None else task.activation.states()
+    return _Parts(tuple(noises), line, states, task.muscle.base(), swing)
 
 
-def _inputs_of(parts: _Parts, states: int, shared: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Noise filters and the harmonic as states beside `states` others: matrix, density of what drives it, (y, u, u') of x.
+def _inputs_of(parts: _Parts, sources: tuple[_Source, ...], states: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Noises as states beside `states` others: their matrix, density of what drives them, and (y, u, u') of all states.
 
-    The harmonic is a narrow resonance of the same power.
+    What the active tissue gets has passed the activation, if there is one: two more states for each noise that acts there.
     """
-    made, size = parts.filter, len(parts.filter.F)
-    total = states + (1 if shared else 4) * size + 2
-    matrix, white, inputs = np.zeros((total, total)), np.zeros((total, total)), np.zeros((states + 8, total))
+    k, active = len(INPUTS), np.isin(np.arange(len(INPUTS)), ACTIVE)
+    blocks = []
+    for source in sources:
+        through = parts.activation is not None and bool(np.any(source.weight[active] != 0))
+        blocks.append((source, through, len(source.filter.F) + 2 * through))
+    total = states + sum(size for *_, size in blocks)
+    matrix, white, inputs = np.zeros((total, total)), np.zeros((total, total)), np.zeros((states + 2 * k, total))
     inputs[:states, :states] = np.eye(states)
-    for i in range(4):
-        start = states + (0 if shared else i) * size
-        own = slice(start, start + size)
-        inputs[states + i, own] = parts.scale[i] * made.H
-        inputs[states + 4 + i, own] = parts.scale[i] * made.H @ made.F
-        matrix[own, own], white[own, own] = made.F, made.G @ made.G.T
-    damping = 2 * np.pi * LINE_WIDTH
-    inputs[states : states + 4, -2], inputs[states + 4 :, -1] = parts.harmonic, parts.omega * parts.harmonic
-    matrix[-2:, -2:] = [[0.0, parts.omega], [-parts.omega, -damping]]
-    white[-1, -1] = damping * parts.swing**2
+    start = states
+    for (made, weight), through, size in blocks:
+        F, G, H, L = made.F, made.G, made.H, made.L
+        n = len(F)
+        own, later = slice(start, start + n), slice(start + n, start + size)
+        matrix[own, own] = F
+        gain = np.concatenate([G, np.zeros((size - n, G.shape[1]))])
+        now = ~active if through else np.ones(k, bool)
+        inputs[states : states + k, own] = np.outer(now * weight, H)
+        inputs[states + k :, own] = np.outer(now * weight, H @ F)
+        if through and parts.activation is not None:
+            step, into = parts.activation
+            matrix[later, later], matrix[later, own] = step, np.outer(into, H)
+            gain[n:] = np.outer(into, L)
+            inputs[states : states + k, later] = np.outer(active * weight, [1.0, 0.0])
+            inputs[states + k :, later] = np.outer(active * weight, step[0])
+        whole = slice(start, start + size)
+        white[whole, whole] = gain @ gain.T
+        start += size
     return matrix, white, inputs
 
 
@@ -110,12 +139,12 @@ def negative_coefficients(task: AbstractTask) -> tuple[str, ...]:
     """Sentences about coefficients that noise and harmonic make negative for more than 1 % of the time."""
     with jax.ensure_compile_time_eval(), jax.enable_x64(True):
         parts = jax.tree.map(np.asarray, _parts(as_arrays(task)))
-    matrix, white, inputs = _inputs_of(parts, 0, task.noise.shared)
-    rows = inputs[:4, :-2]
-    covariance = solve_continuous_lyapunov(matrix[:-2, :-2], -white[:-2, :-2])
+    matrix, white, inputs = _inputs_of(parts, parts.noises, 0)
+    rows = inputs[: len(CHANNELS)]
+    covariance = solve_continuous_lyapunov(matrix, -white)
     sd = np.sqrt(np.maximum(np.einsum("ci,ij,cj->c", rows, covariance, rows), 0.0))
     turn = np.sin(2 * np.pi * (np.arange(64) + 0.5) / 64)
-    level = parts.base[:, None] + parts.swing * parts.harmonic[:, None] * turn
+    level = parts.base[:, None] + parts.swing * parts.harmonic.weight[: len(CHANNELS), None] * turn
     share = np.mean(ndtr(level / -np.maximum(sd, 1e-12 * np.abs(parts.base) + 1e-300)[:, None]), axis=1)
     return tuple(f"{channel} is negative for {100 * part:.2g} % of the time, which no tissue is: lower its noise or the "
                  "harmonic" for channel, part, base in zip(CHANNELS, share, parts.base, strict=True)
@@ -141,9 +170,9 @@ def second_order(task: AbstractTask, settings: SpectrumSettings | None = None) -
         moments, _ = expected_moments(task, settings, WINDOW)
         hessians, parts, system = jax.tree.map(np.asarray, (_hessians(arrays, system), _parts(arrays), system))
     n = len(system.A)
-    matrix, white, inputs = _inputs_of(parts, n, task.noise.shared)
+    matrix, white, inputs = _inputs_of(parts, (*parts.noises, parts.harmonic), n)
     matrix[:n, :n] = system.A
-    matrix[:n] += system.B @ inputs[n : n + 4]
+    matrix[:n] += system.B @ inputs[n : n + len(INPUTS)]
     covariance = solve_continuous_lyapunov(matrix, -white)
     power, mean = _added(0.5 * inputs.T @ hessians @ inputs, matrix, covariance, system, settings)
     first, scale = np.asarray(moments.power), max(abs(float(system.rest)), float(moments.variance) ** 0.5)

@@ -58,14 +58,15 @@ def _drawn(noise: AbstractNoise, key: PRNGKeyArray, seeds: Int[Array, " seeds"],
 
 def respond(task: AbstractTask, path: Realisation, grid: Grid, sampling: str) -> tuple[Array, Array]:
     """States (samples, states) and sampled output (samples) of one noise path."""
-    from ._integrator import observe, solve  # and diffrax, which a program that is loaded does without
+    from ._integrator import Forcing, observe, solve  # and diffrax, which a program that is loaded does without
 
+    given = Forcing.of(task, path, grid)
     if sampling == "instant":
-        states = solve(task, path, grid)
-        return states, observe(task, path, grid, states)
+        states = solve(task, given, grid)
+        return states, observe(task, given, grid, states)
     fine = Grid(grid.dt, grid.steps, 1, grid.substeps, grid.reverse)
-    states = solve(task, path, fine)
-    output = observe(task, path, fine, states)
+    states = solve(task, given, fine)
+    output = observe(task, given, fine, states)
     mean = jnp.mean(0.5 * (output[1:] + output[:-1]).reshape(-1, grid.every), axis=1)
     return states[:: grid.every], jnp.concatenate([output[:1], mean])
 

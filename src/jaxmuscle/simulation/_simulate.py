@@ -114,7 +114,7 @@ def schedule(
                   f"{', '.join(f'{1 / rate / n:.6g}' for n in (1, 2, 4, 5, 10, 20))} s")  # fmt: skip
     samples = whole(duration * rate, f"duration = {duration} s is not a whole number of sampling intervals {1 / rate} s")
     if all_concrete(task):
-        task.noise.check_step(dt)
+        task.check_step(dt)
     if substeps is None:
         substeps = stable_substeps(task, dt, duration) if all_concrete(task) else 1
     return Schedule(Grid(dt, samples * every, every, substeps, reverse=not all_concrete(task)), sampling, rate)

@@ -7,10 +7,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Complex, Float
+from jaxtyping import Array, Float
 
 from jaxmuscle._common.types import Scalar
-from jaxmuscle.model._parameters import CHANNELS
+from jaxmuscle.model._parameters import amplitude_names
 from jaxmuscle.model._signals import Constant
 from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.objective._coordinates import task_at
@@ -22,6 +22,7 @@ from jaxmuscle.objective._starts import distinct, frequency_names
 from jaxmuscle.response._expected import Moments, noise_response, noise_variance
 from jaxmuscle.response._harmonic_line import LineTable, harmonic_size, line_table
 from jaxmuscle.response._linearised import Linearisation, linearise
+from jaxmuscle.response._transfer import harmonic_system, polynomial, polynomials
 from jaxmuscle.spectra._bin_law import trial_samples
 from jaxmuscle.spectra._settings import WINDOW
 
@@ -51,34 +52,11 @@ class Features(NamedTuple):
     def moments(self, frequency: Float[Array, " grid"], table: LineTable) -> Moments:
         """Moments with the harmonic at each frequency; a leading axis of frequencies."""
         s = jax.lax.complex(jnp.zeros_like(frequency), 2 * jnp.pi * frequency)
-        reply = jax.lax.complex(*self.size) * _polynomial(self.numerator, s) / _polynomial(self.denominator, s)
+        reply = jax.lax.complex(*self.size) * polynomial(self.numerator, s) / polynomial(self.denominator, s)
         line = table.power(reply)
+        unknown = jnp.full(frequency.shape, jnp.nan)
         return Moments(self.power + line, line, jnp.broadcast_to(self.mean, frequency.shape),
-                       self.variance + table.variance(reply), jnp.full(frequency.shape, jnp.nan))  # fmt: skip
-
-
-def _polynomial(coefficients: Float[Array, " powers"], s: Complex[Array, " grid"]) -> Complex[Array, " grid"]:
-    value = jnp.zeros_like(s)
-    for c in coefficients:
-        value = value * s + c.astype(s.dtype)
-    return value
-
-
-def _reply(task: AbstractTask, system: Linearisation) -> tuple[Array, Array]:
-    """The output's reply to the harmonic, `c (s - A)⁻¹ b + d + s e`, as numerator and denominator: Faddeev and LeVerrier."""
-    base, A, c = task.harmonic_base(), system.A, system.C
-    b, d, e = system.B @ base, system.D @ base, system.E @ base
-    n, eye = len(A), jnp.eye(len(A), dtype=A.dtype)
-    adjoint, below, above = eye, [jnp.ones((), A.dtype)], []
-    for k in range(1, n + 1):
-        above.append(c @ adjoint @ b)
-        forward = A @ adjoint
-        below.append(-jnp.trace(forward) / k)
-        adjoint = forward + below[-1] * eye
-    denominator = jnp.stack(below)
-    inside = jnp.concatenate([jnp.zeros(2, A.dtype), jnp.stack(above)])
-    through = jnp.concatenate([jnp.zeros(1, A.dtype), d * denominator])
-    return inside + through + jnp.concatenate([e * denominator, jnp.zeros(1, A.dtype)]), denominator
+                       self.variance + table.variance(reply), unknown, unknown)  # fmt: skip
 
 
 class Band(eqx.Module):
@@ -179,10 +157,10 @@ class PosteriorDensity(eqx.Module):
         """Log coefficient of variation of a long recording, the harmonic's frequencies weighted; the linearised task."""
         task, band = self.task(s, part), self.band_of(part)
         system = linearise(task)
-        variance, (top, below) = noise_variance(task, system), _reply(task, system)
+        variance, (top, below) = noise_variance(task, system), polynomials(harmonic_system(task, system))
         frequency = jnp.atleast_1d(task.harmonic.frequency if band is None else jnp.asarray(band.frequency))
         s = jax.lax.complex(jnp.zeros_like(frequency), 2 * jnp.pi * frequency)
-        reply = harmonic_size(task, system.A.dtype) * _polynomial(top, s) / _polynomial(below, s)
+        reply = harmonic_size(task, system.A.dtype) * polynomial(top, s) / polynomial(below, s)
         line = 0.5 * jnp.sum(weight * (jnp.real(reply) ** 2 + jnp.imag(reply) ** 2))
         return 0.5 * jnp.log(variance + line) - jnp.log(jnp.abs(system.rest)), system
 
@@ -194,7 +172,8 @@ class PosteriorDensity(eqx.Module):
         power, variance = noise_response(task, system, task.settings, model.samples)
         size = harmonic_size(task, system.A.dtype)
         size = jnp.stack([jnp.real(size), jnp.imag(size)])
-        return Features(power[model.chosen] * model.correction.power, system.rest, variance, size, *_reply(task, system))
+        power = jnp.sum(power, axis=0)[model.chosen] * model.correction.power
+        return Features(power, system.rest, variance, size, *polynomials(harmonic_system(task, system)))
 
     def heights(
         self, band: Band, s: Float[Array, " free"], offsets: Float[Array, " parts"], systems: Systems
@@ -273,9 +252,8 @@ def _levels(problem: FitProblem, made: PosteriorDensity, offsets: np.ndarray) ->
     """A level for every coefficient of variation that is known, where amplitudes of its own are free and without bounds."""
     c = problem.coordinates
     base = [name.partition("@")[0] for name in c.names]
-    amplitude = [
-        (n.startswith("noise_") and n.removeprefix("noise_") in CHANNELS) or n == "harmonic_amplitude" for n in base
-    ]
+    amplitudes = {name for part in problem.parts for name in amplitude_names(part.task)}
+    amplitude = [name in amplitudes for name in base]
     open_now = np.array(amplitude) & c.positive & ~np.isfinite(c.low)
     s, levels = jnp.asarray(made.point), []
     for i, part in enumerate(problem.parts):

@@ -1,0 +1,197 @@
+"""The ladder: richer models, one after the other, until one describes the data."""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxmuscle._common.arrays import as_arrays
+from jaxmuscle._common.programs import kept
+from jaxmuscle._common.text import probability
+from jaxmuscle.model._noise import NoiseSum, ResonantNoise
+from jaxmuscle.model._parameters import HARMONIC, default
+from jaxmuscle.model._rungs import RUNGS, on_rung
+from jaxmuscle.model._tasks import AbstractTask
+from jaxmuscle.objective._arguments import FitOptions, Plan
+from jaxmuscle.objective._consequences import Expansion, consequences
+from jaxmuscle.objective._likelihood import log_marginal, measured_bins
+from jaxmuscle.objective._problem import FitProblem
+from jaxmuscle.objective._residuals import Residuals
+from jaxmuscle.objective._starts import starting_points
+
+from ._adequacy import ADEQUATE, judged, scatter_of
+from ._checks import Stage, seen_best
+from ._harmonic_evidence import SIGNIFICANT, p_value
+
+STARTS = 32
+ALIKE = 2.0
+HEAD = f"{'models tried, up to one that describes the data':<47}{'chi2/bin':>9}{'p':>9}{'AIC':>9}"
+
+
+class Rung(NamedTuple):
+    """A model that was tried: its `number` on the ladder and `model` in words; what it reached.
+
+    `aic`, `-2 ln L + 2 p` with p, `parameters`, the effective number; chi² per bin and `p` of the verdict; whether it was
+    `chosen`.
+    """
+
+    number: int
+    model: str
+    aic: float
+    parameters: float
+    chi2_per_bin: float
+    p: float
+    chosen: bool = False
+
+    def __str__(self) -> str:
+        p = probability(self.p).removeprefix("p ").removeprefix("= ")
+        return (f"{'->' if self.chosen else '  '} {self.number} {self.model:<42}{self.chi2_per_bin:>9.2f}{p:>9}"
+                f"{self.aic:>9.1f}")  # fmt: skip
+
+
+class Climbed(NamedTuple):
+    """A rung that was fitted: its plan, the stages of its search, what its best point knows of the scatter."""
+
+    plan: Plan
+    stages: list[Stage]
+    known: Any
+    rung: Rung
+
+
+def options_for(task: AbstractTask, options: FitOptions) -> FitOptions:
+    """How one of the models is fitted: a harmonic that it does not have is not fixed."""
+    if float(task.harmonic.amplitude) > 0:
+        return options
+    return dataclasses.replace(options, fix={n: value for n, value in (options.fix or {}).items() if n not in HARMONIC})
+
+
+Descend = Callable[[Plan, np.ndarray, list[Stage]], Any]
+
+
+class Models(NamedTuple):
+    """The models that may be tried: the base model, up to which rung, and how a task is fitted."""
+
+    base: AbstractTask
+    top: int
+    plan_of: Callable[[AbstractTask], Plan]
+
+
+def climb(first: Plan, models: Models, descend: Descend, keep: Callable[[Climbed], None]) -> tuple[Rung, ...]:
+    """Fit the first model and the next ones until one is adequate; `keep` gets each that is the best so far.
+
+    The best has the lowest AIC. A rung that gains nothing is left out, and the next one is tried. Where an adequate model
+    has a significant harmonic, the tremor instead is tried, too, and taken if its AIC is lower by more than 2.
+    """
+    tried: list[Climbed] = []
+    best: Climbed | None = None
+    for number in range(models.top + 1):
+        plan = models.plan_of(on_rung(models.base, number)) if number else first
+        plan.problem.tell(f"model {number}: {RUNGS[number]}", 0.02)
+        stages: list[Stage] = []
+        known = descend(plan, starting_points(plan.problem, plan.starts) if best is None else _warm(plan, best), stages)
+        if known is None:
+            continue
+        found = Climbed(plan, stages, known, _judged(plan, stages[-1], number))
+        tried.append(found)
+        described = best is not None and best.rung.p >= ADEQUATE
+        if best is None or found.rung.aic < best.rung.aic - ALIKE * described:
+            best = found
+            keep(found)
+        if described or (best.rung.p >= ADEQUATE and not (number < 2 <= models.top and _has_line(best))):
+            break
+    return tuple(each.rung._replace(chosen=each is best) for each in tried)
+
+
+def _has_line(found: Climbed) -> bool:
+    """Whether the harmonic of a fit is significant."""
+    problem = found.plan.problem
+    if not set(HARMONIC) <= set(problem.coordinates.names):
+        return False
+    return p_value(problem, problem.linear(), found.stages[-1].minima) < SIGNIFICANT
+
+
+def _warm(plan: Plan, best: Climbed) -> Float[np.ndarray, "starts free"]:
+    """Starts of a richer model: for the most part what it shares with the best one begins where that ended."""
+    problem, before = plan.problem, best.plan.problem
+    points = np.array(problem.coordinates.theta(starting_points(problem, min(plan.starts, STARTS))))
+    (task,) = before.tasks_at(seen_best(best.stages[-1].objective, best.stages[-1].minima).theta)
+    for column, name in enumerate(problem.coordinates.names):
+        if name in before.coordinates.names and problem.coordinates.positive[column]:
+            points[: 2 * len(points) // 3, column] = problem.coordinates.theta_of(name, float(task[name]))
+    return problem.coordinates.from_theta(points)
+
+
+def _judged(plan: Plan, stage: Stage, number: int) -> Rung:
+    seen = seen_best(stage.objective, stage.minima)
+    verdict = judged(plan.problem, stage.objective, seen)
+    assert verdict is not None
+    (part,) = plan.problem.parts
+    aic, parameters = criterion(plan.problem, stage.objective, seen)
+    return Rung(number, RUNGS[number], aic, parameters, verdict.chi2 / (len(part.target.bins) - 1), verdict.p)
+
+
+def criterion(problem: FitProblem, objective: Residuals, seen: Expansion) -> tuple[float, float]:
+    """AIC of the likelihood at a point, and the effective number of parameters, `p = tr(F (F + Λ)⁻¹)`.
+
+    F is the Fisher information of the data, their bins correlated, and Λ the precision of the prior.
+    """
+    found, scatter = consequences(objective, seen), scatter_of(problem, objective, seen)
+    precision = np.linalg.pinv(scatter, rcond=1e-9, hermitian=True)
+    information = found.jacobian.T @ precision @ found.jacobian
+    parameters = float(np.trace(information @ np.linalg.pinv(information + np.diag(problem.prior), hermitian=True)))
+    (part,), moments = problem.parts, seen.moments[0]
+    bins = len(part.target.bins)
+    if part.target.segments is None:
+        height = -0.5 * float(found.residuals @ precision @ found.residuals)
+    else:
+        law = as_arrays(measured_bins(part.target))
+        height = float(_height(law, np.asarray(moments.power), np.asarray(moments.line)))
+        height -= 0.5 * float(np.sum(found.residuals[bins:] ** 2))
+    return 2 * parameters - 2 * height, parameters
+
+
+@kept
+def _height(law: Any, power: Any, line: Any) -> Any:
+    return log_marginal(law, power, line)
+
+
+def line_or_resonance(
+    plan: Plan, fitted: AbstractTask, ladder: tuple[Rung, ...], models: Models, descend: Descend
+) -> tuple[str, ...]:
+    """Whether the rhythm that was found is a line or a narrow resonance, in a sentence, where that is the question.
+
+    It is where a harmonic is significant (`climb` has tried the tremor then), and where a resonance is narrower than a bin.
+    """
+    chosen = next(rung for rung in ladder if rung.chosen)
+    (part,) = plan.problem.parts
+    task, resolution = part.task, part.target.settings.resolution
+    if chosen.number < 2:
+        tremor = [rung.aic for rung in ladder if rung.number == 2]
+        return (told_apart(chosen.aic, tremor[0]),) if tremor else ()
+    parts = task.noise.components
+    for i, found in enumerate(fitted.noise.components):
+        if isinstance(found, ResonantNoise) and float(found.width) < resolution:
+            others = parts[:i] + parts[i + 1 :]
+            rest = task.with_parts(noise=NoiseSum(others))
+            line = {"harmonic_amplitude": default("harmonic_amplitude"), "harmonic_frequency": float(found.frequency)}
+            aic, other = _aic_of(models.plan_of(rest.replace(**line)), descend)
+            return () if other is None else (told_apart(aic, chosen.aic),)
+    return ()
+
+
+def _aic_of(plan: Plan, descend: Descend) -> tuple[float, AbstractTask | None]:
+    stages: list[Stage] = []
+    if descend(plan, starting_points(plan.problem, min(plan.starts, STARTS)), stages) is None:
+        return np.inf, None
+    seen = seen_best(stages[-1].objective, stages[-1].minima)
+    return criterion(plan.problem, stages[-1].objective, seen)[0], plan.problem.tasks_at(seen.theta)[0]
+
+
+def told_apart(line: float, resonance: float) -> str:
+    """A line against a resonance by their AIC, in a sentence."""
+    said = f"a line of zero width (AIC {line:.1f}) and a resonance (AIC {resonance:.1f})"
+    if abs(line - resonance) <= ALIKE:
+        return f"{said} cannot be told apart: whether the rhythm is regular or a tremor remains open; record longer"
+    return f"{said}: the data prefer the {'line' if line < resonance else 'resonance'}"

@@ -1,0 +1,39 @@
+"""The models that a fit tries one after the other."""
+
+from ._activation import Activation
+from ._noise import ResonantNoise
+from ._parameters import default
+from ._tasks import AbstractTask
+
+RUNGS = (
+    "base: noise and a harmonic",
+    "with activation",
+    "with tremor instead of the harmonic",
+    "with a second resonance",
+)
+
+
+def on_rung(task: AbstractTask, rung: int, *, harmonic: bool = False) -> AbstractTask:
+    """The task with what measured force asks for beyond the base model, by `rung`:
+
+    0, as it is; 1, with an `Activation` between the nervous drive and the active tissue; 2, with a `ResonantNoise` on the
+    drive as well, the tremor, instead of the harmonic; 3, with a second resonance. Each begins at the default of the
+    parameter table. `harmonic` keeps the harmonic beside the resonances.
+
+    **Raises:** `ValueError` for other rungs, and for a task that has an activation or a resonance already.
+    """
+    if rung not in range(len(RUNGS)):
+        raise ValueError(f"rung = {rung} must be one of 0 to {len(RUNGS) - 1}")
+    if not is_base(task):
+        raise ValueError("this task has an activation or a resonance already: start from one without")
+    if rung >= 1:
+        task = task.with_parts(activation=Activation())
+    for which in ("resonance", "resonance_2")[: max(rung - 1, 0)]:
+        values = (default(f"{which}_{what}") for what in ("amplitude", "frequency", "width"))
+        task = task.with_parts(noise=task.noise + ResonantNoise(*values))
+    return task.replace(harmonic_amplitude=0.0) if rung >= 2 and not harmonic else task
+
+
+def is_base(task: AbstractTask) -> bool:
+    """Whether a task has neither activation nor resonance."""
+    return task.activation is None and not any(isinstance(noise, ResonantNoise) for noise in task.noise.components)

@@ -1,0 +1,197 @@
+"""The ladder: the base model while it describes the data, then activation, tremor and a second resonance."""
+
+import functools
+from typing import Any
+
+import jax
+import numpy as np
+import pytest
+import scipy.stats
+from scipy.optimize import brentq
+
+import jaxmuscle as jm
+from jaxmuscle.fits._ladder import criterion, told_apart
+from jaxmuscle.model._rungs import RUNGS
+from jaxmuscle.objective._arguments import COEFFICIENTS, FitOptions, planned
+from jaxmuscle.objective._consequences import expand
+from jaxmuscle.response._expected import expected_moments
+from jaxmuscle.spectra._bin_law import bin_statistics
+from jaxmuscle.spectra._settings import WINDOW
+
+TASK = jm.Isometric()
+QUICK: dict[str, Any] = {"starts": 16, "seeds": 0, "check_seeds": 0}
+TREMOR = {"resonance_amplitude": 0.08, "resonance_frequency": 9.0, "resonance_width": 2.0}
+
+
+def with_tremor() -> jm.Isometric:
+    """A muscle with a twitch of 60 ms and a tremor at 9 Hz."""
+    return jm.on_rung(TASK, 2).replace(activation_time=0.06, **TREMOR)
+
+
+def drawn(power: np.ndarray, segments: int, seed: int) -> jm.Target:
+    """A spectrum that scatters about a power by the law of its bins."""
+    law = bin_statistics(jm.Target("x", power, segments=[segments]))
+    normal = np.random.default_rng(seed).multivariate_normal(np.zeros(30), law.correlation)
+    made = power * scipy.stats.gamma.ppf(scipy.stats.norm.cdf(normal), law.half) / law.half
+    return jm.Target(f"drawn {segments} {seed}", made, segments=[segments])
+
+
+def expected(task: jm.Isometric) -> np.ndarray:
+    with jax.enable_x64(True):
+        return np.asarray(jm.expected_spectrum(task).proportional)
+
+
+@functools.cache
+def climbed() -> jm.fits.FitResult:
+    return jm.fit(TASK, drawn(expected(with_tremor()), 90, 1), **QUICK)
+
+
+# --- the models
+
+
+def test_every_rung_adds_its_part():
+    assert jm.on_rung(TASK, 0) is TASK
+    first, second, third = (jm.on_rung(TASK, rung) for rung in (1, 2, 3))
+    added = [set(b.parameter_names) - set(a.parameter_names) for a, b in ((TASK, first), (first, second), (second, third))]
+    assert added[0] == {"activation_time"}
+    assert added[1] == {f"resonance_{what}" for what in ("amplitude", "frequency", "width")}
+    assert added[2] == {f"resonance_2_{what}" for what in ("amplitude", "frequency", "width")}
+    assert first["harmonic_amplitude"] > 0 and second["harmonic_amplitude"] == third["harmonic_amplitude"] == 0
+    assert jm.on_rung(TASK, 2, harmonic=True)["harmonic_amplitude"] == TASK["harmonic_amplitude"]
+
+
+@pytest.mark.parametrize("rung", [-1, len(RUNGS)])
+def test_other_rungs_are_refused(rung):
+    with pytest.raises(ValueError, match="must be one of 0 to 3"):
+        jm.on_rung(TASK, rung)
+
+
+def test_a_task_that_stands_on_a_rung_is_not_lifted_again():
+    with pytest.raises(ValueError, match="already"):
+        jm.on_rung(jm.on_rung(TASK, 1), 2)
+    with pytest.raises(ValueError, match="without activation and resonance"):
+        jm.fit(jm.on_rung(TASK, 1), drawn(expected(TASK), 12, 1), rungs=2)
+    with pytest.raises(ValueError, match="the highest is 3"):
+        jm.fit(TASK, drawn(expected(TASK), 12, 1), rungs=4)
+    with pytest.raises(ValueError, match="states segments or sigma"):
+        jm.fit(TASK, jm.Target("no spread", expected(TASK)), rungs=1)
+
+
+def test_frequency_and_width_of_what_has_no_amplitude_are_not_free(x64):
+    plan = planned(jm.on_rung(TASK, 2), drawn(expected(TASK), 12, 1), FitOptions())
+    assert not {"harmonic_amplitude", "harmonic_frequency"} & set(plan.problem.coordinates.names)
+    sd = dict(zip(plan.problem.coordinates.names, plan.problem.coordinates.sd, strict=True))
+    assert all(sd[name] == 0.5 for name in COEFFICIENTS)
+
+
+# --- the climb
+
+
+@pytest.mark.slow
+def test_the_base_model_is_kept_where_it_describes_the_data():
+    result = jm.fit(TASK, drawn(expected(TASK), 30, 3), **QUICK)
+    (only,) = result.ladder
+    assert only.number == 0 and only.chosen and result.adequate
+    assert result.task.activation is None
+    same = jm.fit(TASK, drawn(expected(TASK), 30, 3), rungs=0, **QUICK)
+    assert same.ladder == () and same.parameters == result.parameters
+
+
+@pytest.mark.slow
+def test_a_tremor_is_climbed_to_and_found():
+    result = climbed()
+    chosen = next(rung for rung in result.ladder if rung.chosen)
+    assert chosen.number == 2 and result.adequate
+    assert [rung.number for rung in result.ladder] == [0, 1, 2] and result.ladder[0].p < 0.01
+    assert chosen.aic == min(rung.aic for rung in result.ladder)
+    found = result.derived["tremor_frequency"]
+    assert found.stderr is not None and abs(found.value - 9.0) < 3 * found.stderr < 1.5
+    text = str(result)
+    assert "models tried" in text and "-> 2 with tremor instead of the harmonic" in text
+
+
+@pytest.mark.slow
+def test_a_chosen_model_or_noise_is_not_climbed_from():
+    target = drawn(expected(with_tremor()), 90, 1)
+    for asked in ({"noise": "band-limited"}, {"free": ("c_w", "noise_K_w", "noise_K_z")}, {"rungs": 0}):
+        assert jm.fit(TASK, target, **asked, **QUICK).ladder == ()
+
+
+@pytest.mark.slow
+def test_the_criterion_is_akaikes(x64):
+    """-2 ln L with scipy's gamma laws joined by their normal scores, and the trace of the hat matrix by differences."""
+    target = drawn(expected(TASK), 12, 5)
+    problem = planned(TASK, target, FitOptions(free=("c_w", "noise_K_z"))).problem
+    objective = problem.linear()
+    theta = np.array([0.1, -0.2])
+    aic, parameters = criterion(problem, objective, expand(objective, theta[None]).row(0))
+    assert 0 < parameters < 2
+    from jaxmuscle.objective._likelihood import log_likelihood
+
+    height = float(log_likelihood(problem.tasks_at(theta)[0], target))
+    assert aic == pytest.approx(2 * parameters - 2 * height, abs=1e-6)
+
+
+def test_alike_is_said_and_different_is_said():
+    assert "cannot be told apart" in told_apart(-100.0, -101.9)
+    assert "prefer the line" in told_apart(-110.0, -101.0)
+    assert "prefer the resonance" in told_apart(-100.0, -120.0)
+
+
+# --- what it gives
+
+
+@pytest.mark.slow
+def test_components_add_up_and_are_what_their_noise_alone_gives(x64):
+    result = climbed()
+    parts = result.only.components
+    assert set(parts) == {"relaxation", "floor", "harmonic", "tremor"}
+    np.testing.assert_allclose(sum(parts.values()), 1.0, rtol=1e-9)
+    task = result.task
+    alone = task.replace(**{n: 0.0 for n in task.parameter_names if n.startswith("noise_") and n[6:8] in ("K_", "C_")})
+    whole, own = (np.asarray(expected_moments(t, result.target.settings, WINDOW)[0].power) for t in (task, alone))
+    np.testing.assert_allclose(parts["tremor"], own / whole, rtol=1e-9)
+
+
+@pytest.mark.slow
+def test_half_power_frequency_against_a_root_of_the_transfer_function(x64):
+    result = climbed()
+    task = result.task
+    k, c = task.muscle.base()[:2], task.muscle.base()[2:]
+    # About x_w at rest: K_w x_w³ and so on, the tangent of the quadratic laws.
+    from jaxmuscle.response._linearised import linearised
+
+    A = np.asarray(linearised(task).system.A)
+    T = float(task["activation_time"])
+
+    def level(f: float) -> float:
+        s = 2j * np.pi * f
+        slow = 1 / np.linalg.det(s * np.eye(2) - A)
+        ahead = float(k[1]) + s * float(c[1])  # F_ext = K_z x_w + C_z x_w', at small x_w about
+        return abs(slow * ahead / (1 + s * T) ** 2) ** 2
+
+    found = brentq(lambda f: level(f) / level(1e-9) - 0.5, 1e-3, 20.0)
+    assert result.derived["half_power_frequency"].value == pytest.approx(found, rel=0.05)
+
+
+@pytest.mark.slow
+def test_bands_are_sums_of_bins():
+    result = climbed()
+    f, p = result.frequency_hz, result.fitted
+    for low, high in ((0, 0.5), (1, 2), (8, 12)):
+        assert result.derived[f"band_{low:g}_{high:g}"].value == pytest.approx(p[(f >= low) & (f < high)].sum(), rel=1e-3)
+
+
+@pytest.mark.slow
+def test_all_that_follows_a_fit_takes_a_model_with_tremor(tmp_path):
+    result = climbed()
+    result.save(tmp_path / "fit.json")
+    assert str(jm.load_result(tmp_path / "fit.json")) == str(result)
+    assert jm.load_preset(tmp_path / "fit.json")["resonance_frequency"] == pytest.approx(result.task["resonance_frequency"])
+    profiled = jm.profile(result, "resonance_frequency")
+    assert str(profiled)
+    assert jm.goodness(result, replicates=19).p_value > 0
+    assert "resonance_frequency" in str(jm.identifiability(result))
+    cohort = jm.fit_cohort([result.target], starts=16, rung=2)
+    (found,) = cohort.results.values()
+    assert found.derived["tremor_frequency"].value == pytest.approx(result.derived["tremor_frequency"].value, abs=0.2)
