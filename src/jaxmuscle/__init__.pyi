@@ -22,6 +22,8 @@ from .data._recording import Recording as Recording
 from .data._recording_files import load_recording as load_recording
 from .data._target import Target as Target
 from .data._target import load_target as load_target
+from .data._trials import Trials as Trials
+from .data._trials import load_recordings as load_recordings
 from .ensembles._ensemble import ensemble as ensemble
 from .ensembles._sweep import Sweep as Sweep
 from .fits._cohort import fit_cohort as fit_cohort

@@ -42,19 +42,20 @@ def replicates_of(problem: FitProblem, tasks: tuple[AbstractTask, ...], count: i
 
 
 def _simulated(part: Part, task: AbstractTask, count: int, key: Array, failed: dict[int, str]) -> dict[int, Datum]:
-    """Targets from the nonlinear simulator, with their mean output."""
+    """Targets from the nonlinear simulator, with their mean output; they scatter as much more as the target's trials do."""
     still = settled(task)
     trials = list(part.target.segments or ())
     runs = [_runs(still, part.target, K, jax.random.fold_in(key, trial), np.arange(count), failed)
             for trial, K in enumerate(trials)]  # fmt: skip
-    made = {}
-    for number in range(count):
-        if all(number in each for each in runs):
-            rows = [each[number] for each in runs]
-            # Trials count in proportion to their segments, as in the law of the bins.
-            power = np.average([row[0] for row in rows], axis=0, weights=trials)[part.chosen]
-            target = _target(part.target, number, power, [row[1] for row in rows])
-            made[number] = target, float(np.mean([row[2] for row in rows]))
+    made, spread = {}, part.target.overdispersion
+    whole = {number: [each[number] for each in runs] for number in range(count) if all(number in each for each in runs)}
+    # Trials count in proportion to their segments, as in the law of the bins.
+    powers = {n: np.average([row[0] for row in rows], axis=0, weights=trials)[part.chosen] for n, rows in whole.items()}
+    middle = np.exp(np.mean([np.log(power) for power in powers.values()], axis=0)) if powers else 1.0
+    for number, rows in whole.items():
+        power = middle * (powers[number] / middle) ** spread
+        target = _target(part.target, number, power, [row[1] for row in rows])
+        made[number] = target, float(np.mean([row[2] for row in rows]))
     return made
 
 
@@ -92,6 +93,7 @@ def _target(like: Target, number: int, power: np.ndarray, variation: list[float]
         segments=like.segments,
         sigma=sigma,
         coefficient_of_variation=None if stated is None else variation,
+        dispersion=like.dispersion,
         settings=like.settings,
     )
 

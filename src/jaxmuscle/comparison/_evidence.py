@@ -17,7 +17,7 @@ from jaxmuscle.objective._problem import FitProblem
 from jaxmuscle.objective._scoring import Maximum, maximise
 from jaxmuscle.objective._starts import points_about, starting_points
 from jaxmuscle.response._expected import Moments
-from jaxmuscle.spectra._bin_law import welch_law
+from jaxmuscle.spectra._bin_law import target_law
 
 SPREAD, RANDOM, PLAIN = 24, 8, 16
 BLOCK, BLOCKS, ENOUGH = 12, 10, 1e-3
@@ -201,7 +201,7 @@ def masked_bins(target: Target, masks: Float[np.ndarray, "rows bins"]) -> Bins:
     """The target's bins once for every mask, 0 for what is left out."""
     if target.segments is None:
         raise ValueError(f"{target.name}: states no segments, so the law of its bins is unknown; give segments")
-    law = welch_law(target.settings, target.bins, target.segments)
+    law = target_law(target)
     power, half = np.log(target.proportional_power), law.degrees / 2
     return stacked([Bins(power, half, *_precision(law.correlation, mask), mask) for mask in masks])
 

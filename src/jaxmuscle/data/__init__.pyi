@@ -5,3 +5,5 @@ from ._recording_files import load_recording as load_recording
 from ._recording_quality import RecordingSummary as RecordingSummary
 from ._target import Target as Target
 from ._target import load_target as load_target
+from ._trials import Trials as Trials
+from ._trials import load_recordings as load_recordings

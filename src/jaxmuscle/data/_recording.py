@@ -17,12 +17,12 @@ from jaxmuscle.spectra._measures import approximate_entropy, peaks, sample_entro
 from jaxmuscle.spectra._settings import SpectrumSettings, require
 from jaxmuscle.spectra._welch import Spectrum, lowpass, spectrum_of
 
+from ._pooled import pooled_target
 from ._recording_quality import RecordingSummary, clipping, plateau
 from ._target import Target
 from ._target_fields import Quantity
 
 RECORDED = SpectrumSettings(filter_direction="both")
-DRIFT = 0.5  # share of the variance
 LOWEST_RATE = 24.0  # Hz; half of it lies above bin 30
 SEGMENTS = 2  # a steady part holds at least this many
 UNITS: dict[str, Quantity | None] = {
@@ -262,8 +262,9 @@ class Recording(eqx.Module):
     ) -> Target:
         """The window's proportional power as a `Target` for `jaxmuscle.fit`.
 
-        It states the Welch segments, the settings, and for a force or torque the coefficient of variation of what the
-        low-pass lets through, which fixes the scale of the noise; and says so if most of that is a straight drift.
+        It states the Welch segments, the settings, and for a force or torque the mean and the coefficient of variation of
+        what the low-pass lets through, which fixes the scale of the noise; and says so if most of that is a straight
+        drift. Several recordings of one condition give one target: `Trials.target`.
 
         **Arguments:** `name`, or that of the recording; `quantity`, or that of the unit; `provenance`; `mvc` [`unit`], the
         maximal voluntary contraction, for the level (a recording in % MVC needs none); `settings` as for `spectrum`.
@@ -271,27 +272,11 @@ class Recording(eqx.Module):
         **Raises:** `ValueError` if the unit (V, a.u.) does not say what was measured, and as `spectrum` does.
         """
         settings = RECORDED if settings is None else settings
-        quantity = self.quantity if quantity is None else quantity
-        require(quantity is not None, "quantity", quantity, f"unit {self.unit} does not tell; give force, torque, ...")
-        power, x = np.asarray(self.spectrum(settings).power), self.filtered(settings)
-        mean, variation = float(np.mean(x)), float(np.std(x)) / max(abs(float(np.mean(x))), 1e-300)
-        full = 100.0 if mvc is None and self.unit == "% MVC" else mvc
-        require(full is None or 0 < abs(mean) <= full < math.inf, "mvc", mvc, f"give a force above the mean, {mean:.4g}")
-        varying = quantity != "displacement" and variation <= 1
-        return Target(
-            self.name if name is None else name,
-            power / np.sum(power),
-            quantity=str(quantity),
-            provenance=provenance,
-            source=f"{self.source}, {self._window_words()}",
-            segments=self.segments(settings),
-            coefficient_of_variation=variation if varying else None,
-            mvc_fraction=None if full is None else abs(mean) / full,
-            settings=settings,
-            notices=(*self.notices, *(_drift(x) if varying else ())),
-        )
+        return pooled_target((self,), self.name if name is None else name, quantity, provenance, mvc, settings)
 
-    def _window_words(self) -> str:
+    @property
+    def window_in_words(self) -> str:
+        """The window, or that there is none."""
         return "all of it" if self.window is None else f"window {self.window[0]:g} s to {self.window[1]:g} s"
 
     def plot(self, settings: SpectrumSettings | None = None, ax: Any = None) -> Any:
@@ -303,21 +288,10 @@ class Recording(eqx.Module):
         lines = [
             f"{self.name}: {what} [{self.unit}], {self.whole.size} samples at {self.rate:g} Hz",
             f"  source    {self.source}",
-            f"  time      {self.start:g} s to {self.stop:g} s; {self._window_words()}",
+            f"  time      {self.start:g} s to {self.stop:g} s; {self.window_in_words}",
             f"  range     {np.min(self.samples):.4g} to {np.max(self.samples):.4g} {self.unit}",
         ]
         return folded(lines + [f"  notice    {notice}" for notice in self.notices])
-
-
-def _drift(x: Float[np.ndarray, " times"]) -> tuple[str, ...]:
-    """What to say where a straight line makes more than half of the variance; the model has none."""
-    before, after = np.std(x), np.std(scipy.signal.detrend(x))
-    if after**2 > DRIFT * before**2:
-        return ()
-    mean = abs(float(np.mean(x)))
-    return (f"a straight drift makes {100 * (1 - (after / before) ** 2):.0f} % of the variance: coefficient of variation "
-            f"{before / mean:.3g} with it, {after / mean:.3g} without; the model knows no drift, so remove it first "
-            "(scipy.signal.detrend, and add the mean), or choose a steadier window",)  # fmt: skip
 
 
 def _rate(rate: Any) -> float:

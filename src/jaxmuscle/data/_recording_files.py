@@ -3,6 +3,7 @@
 import contextlib
 import math
 import os
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -90,6 +91,15 @@ def load_recording(
     except ValueError as error:
         raise ValueError(f"{table.file}: column {chosen.name}: {error}") from None
     return recording
+
+
+def load_columns(
+    path: str | os.PathLike[str], columns: Iterable[str | int] | None = None, **options: Any
+) -> list[Recording]:
+    """One recording of each column of a file, of all but the time by default; `options` as in `load_recording`."""
+    table = _read(path)
+    names = _others(table, time_name(table) or unnamed_time(table)) if columns is None else list(columns)
+    return [load_recording(path, column=name, **options) for name in names]
 
 
 class _Choice(NamedTuple):

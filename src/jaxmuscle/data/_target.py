@@ -3,7 +3,7 @@
 import os
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import numpy as np
@@ -14,15 +14,19 @@ from jaxmuscle import plot
 from jaxmuscle._common.errors import TargetError
 from jaxmuscle._common.files import write_text
 from jaxmuscle._common.text import folded
-from jaxmuscle.spectra._bin_law import bin_statistics
+from jaxmuscle.spectra._bin_law import bin_statistics, dispersion_of, trial_samples
 from jaxmuscle.spectra._settings import SpectrumSettings
 
 from . import _target_fields as check
-from ._target_fields import GRID_TOLERANCE, PIXEL_OF_LOG, PIXEL_TOLERANCE, Provenance, Quantity
-from ._target_files import KEYS, Raw, read_target
+from ._target_fields import Provenance, Quantity
+from ._target_files import KEYS, on_grid, read_target
 
 # A sum this near to 1 is rounding of the printed numbers, not another scale.
 SUM_TOLERANCE = 1e-3
+NEWTONS = {"N": 1.0, "mN": 1e-3, "kN": 1e3}
+# Of the mean, where nothing says how far it may be from the person's; and the least, that of a good calibration.
+MEAN_ERROR, LEAST_MEAN_ERROR = 0.02, 0.002
+UNUSUAL = 1.25  # dispersion from which trials are said to differ
 
 
 class Target(eqx.Module):
@@ -41,6 +45,11 @@ class Target(eqx.Module):
     - `coefficient_of_variation`: standard deviation over mean of each trial, a fraction; of the force as the spectrum sees
       it, low-passed as `settings` say.
     - `mvc_fraction`: mean level as a fraction of the maximum voluntary contraction.
+    - `mean`, `unit`: mean force or torque of each trial, and in what. One in newtons fixes the scale of force in a fit.
+    - `trial_power`: spectrum of each trial [unit²/Hz], shape `(trials, bins)`; `proportional_power` is their mean, weighted
+      with `segments`.
+    - `dispersion`: how many times more than their segments explain the trials differ in shape, and the standard error of
+      that. Above 1 it widens every error. Follows from `trial_power` where that is given (`dispersion_of`).
     - `settings`: how the spectrum was estimated, and thus how the model's is.
     - `notices`: what was done to the numbers, in sentences.
 
@@ -58,6 +67,10 @@ class Target(eqx.Module):
     segments: tuple[int, ...] | None = eqx.field(static=True)
     coefficient_of_variation: tuple[float, ...] | None = eqx.field(static=True)
     mvc_fraction: float | None = eqx.field(static=True)
+    mean: tuple[float, ...] | None = eqx.field(static=True)
+    unit: str | None = eqx.field(static=True)
+    trial_power: Float[np.ndarray, "trials bins"] | None
+    dispersion: tuple[float, ...] | None = eqx.field(static=True)
     reason: str | None = eqx.field(static=True)
     settings: SpectrumSettings = eqx.field(static=True)
     notices: tuple[str, ...] = eqx.field(static=True)
@@ -75,6 +88,10 @@ class Target(eqx.Module):
         segments: int | Sequence[int] | None = None,
         coefficient_of_variation: float | Sequence[float] | None = None,
         mvc_fraction: float | None = None,
+        mean: float | Sequence[float] | None = None,
+        unit: str | None = None,
+        trial_power: Any = None,
+        dispersion: float | Sequence[float] | None = None,
         reason: str | None = None,
         settings: SpectrumSettings | None = None,
         notices: Iterable[str] = (),
@@ -86,6 +103,7 @@ class Target(eqx.Module):
         self.segments = check.metadata("segments", segments)
         self.coefficient_of_variation = check.metadata("coefficient_of_variation", coefficient_of_variation)
         self.mvc_fraction = check.metadata("mvc_fraction", mvc_fraction)
+        self.mean, self.unit = check.metadata("mean", mean), check.metadata("unit", unit)
         self.reason = check.metadata("reason", reason)
         self.settings = settings
         selected = np.arange(settings.first_bin, settings.last_bin + 1)
@@ -94,6 +112,10 @@ class Target(eqx.Module):
         power = check.positive("proportional_power", proportional_power, self.bins.size)
         deviation = None if sigma is None else check.positive("sigma", sigma, self.bins.size)
         self.proportional_power, self.sigma = _normalised(power, deviation)
+        self.trial_power, self.dispersion = None, check.metadata("dispersion", dispersion)
+        if trial_power is not None:
+            self.trial_power = check.trial_powers(trial_power, self.bins.size, self.segments, power)
+            self.dispersion = dispersion_of(self.trial_power, self.segments or (), settings, self.bins)
         own = _own_notices(self, float(np.sum(power)))
         self.notices = tuple(dict.fromkeys((*check.metadata("notices", list(notices)), *own)))
 
@@ -103,6 +125,32 @@ class Target(eqx.Module):
         if self.segments is None:
             return None
         return float(sum(self.settings.degrees_of_freedom(K) for K in self.segments))
+
+    @property
+    def overdispersion(self) -> float:
+        """What multiplies the standard deviations of the log powers: the dispersion, if it is above 1."""
+        return 1.0 if self.dispersion is None else max(1.0, self.dispersion[0])
+
+    @property
+    def mean_force(self) -> tuple[float, float] | None:
+        """Mean force and its standard error [N]; `None` without a mean in newtons.
+
+        The error: that of the trials' scatter and that of a recording of this length, whichever is larger. The latter from
+        the density S₁ in the lowest bin, `√(S₁ / 2T)`, T the time recorded; 2 % of the mean where the target does not
+        state segments and coefficient of variation, and at least 0.2 %.
+        """
+        if self.mean is None or self.unit not in NEWTONS or self.quantity != "force":
+            return None
+        means = NEWTONS[self.unit] * np.asarray(self.mean)
+        relative = MEAN_ERROR
+        if self.segments is not None and self.coefficient_of_variation is not None:
+            density = (
+                np.mean(np.square(self.coefficient_of_variation)) * self.proportional_power[0] / self.settings.resolution
+            )
+            time = len(self.segments) * trial_samples(self) / self.settings.rate
+            relative = np.sqrt(density / (2 * time))
+        scatter = means.std(ddof=1) / np.sqrt(len(means)) if len(means) > 1 else 0.0
+        return float(means.mean()), float(max(scatter, max(relative, LEAST_MEAN_ERROR) * means.mean()))
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write TOML that `load_target` reads back equal; an existing file is replaced in one step.
@@ -135,6 +183,8 @@ class Target(eqx.Module):
         sigma = None if self.sigma is None else self.sigma.tolist()
         arrays = {"frequency_hz": self.frequency.tolist(), "settings": self.settings.to_dict()}
         arrays |= {"proportional_power": self.proportional_power.tolist(), "sigma": sigma}
+        arrays["trial_power"] = None if self.trial_power is None else self.trial_power.tolist()
+        arrays["dispersion"] = self.dispersion if self.trial_power is None else None
         table = {key: arrays[key] if key in arrays else getattr(self, key) for key in KEYS}
         return {key: value for key, value in table.items() if value not in (None, ())}
 
@@ -166,6 +216,10 @@ class Target(eqx.Module):
             lines.append(f"  coefficient of variation  {variation}")
         if self.mvc_fraction is not None:
             lines.append(f"  level     {100 * self.mvc_fraction:.4g} % MVC")
+        if self.mean is not None:
+            lines.append(f"  mean      {np.mean(self.mean):.4g} {self.unit or '(unit unknown)'}")
+        if self.dispersion:
+            lines.append(f"  trials    {_dispersion_in_words(self.dispersion)}")
         return folded(lines + [f"  notice    {notice}" for notice in self.notices])
 
 
@@ -204,57 +258,20 @@ def load_target(
             notices.append(f"{key} {_words(asked)} as asked; the file says {_words(fields[key])}")
         fields[key] = asked
     try:
-        points, more = _on_grid(raw, fields["settings"])
+        points, more = on_grid(raw)
         notices = (*fields.pop("notices", ()), *notices, *more)
-        return Target(**fields, **points._asdict(), notices=notices)
+        return Target(**(fields | points._asdict()), notices=notices)
     except TargetError as error:
         raise TargetError(f"{file}: {error}") from None
 
 
+def _dispersion_in_words(dispersion: Sequence[float]) -> str:
+    value = " ± ".join(f"{number:.2f}" for number in dispersion[:2])
+    return f"differ {value} times as much as their segments explain"
+
+
 def _words(value: str | tuple[int, ...]) -> str:
     return value if isinstance(value, str) else " + ".join(map(str, value))
-
-
-class _Points(NamedTuple):
-    bins: np.ndarray
-    proportional_power: np.ndarray
-    sigma: np.ndarray | None = None
-
-
-def _on_grid(raw: Raw, settings: SpectrumSettings) -> tuple[_Points, list[str]]:
-    """The rows on the bins they cover: as they are if all lie on bins, else interpolated in log power."""
-    columns = raw.columns
-    position = np.minimum(columns.frequency / settings.resolution, 1e9)
-    tolerance = np.full(position.size, PIXEL_TOLERANCE if raw.digitised else GRID_TOLERANCE)
-    if raw.log_frequency:
-        tolerance = np.maximum(tolerance, PIXEL_OF_LOG * position)
-    bins = np.rint(position).astype(int)
-    first, last = settings.first_bin, settings.last_bin
-    aligned = np.all(np.abs(position - bins) <= tolerance) and np.unique(bins).size == bins.size
-    notices = []
-    if aligned:
-        inside = (bins >= first) & (bins <= last)
-        sigma = None if columns.sigma is None else columns.sigma[inside]
-        points = _Points(bins[inside], columns.power[inside], sigma)
-        if (off := np.max(np.abs(position - bins)[inside], initial=0)) > GRID_TOLERANCE:
-            notices.append(f"points up to {off:.2g} bins off the grid: taken as on the bins, within a pixel of a figure")
-        if not np.all(inside):
-            notices.append(f"rows outside bins {first} to {last} left out: {np.sum(~inside)}")
-    else:
-        every = np.arange(first, last + 1)
-        low, high = position[0] - tolerance[0], position[-1] + tolerance[-1]
-        covered = every[(every >= low) & (every <= high)]
-        logs = [np.log(values) for values in (columns.power, columns.sigma) if values is not None]
-        at, known = (np.log(covered), np.log(position)) if raw.log_frequency else (covered, position)
-        points = _Points(covered, *(np.exp(np.interp(at, known, log)) for log in logs))
-        gap, scale = f"{np.max(np.diff(columns.frequency), initial=0):.3g}", " and frequency" * raw.log_frequency
-        notices.append(f"frequencies off the grid: interpolated onto the bins in log power{scale} (widest gap {gap} Hz)")
-    if points.bins.size < 2:
-        raise TargetError(
-            f"covers {points.bins.size} of the bins {first} to {last} ({settings.frequency[0]:.4g} to "
-            f"{settings.frequency[-1]:.4g} Hz), at least 2 are needed; frequencies are in Hz"
-        )
-    return points, notices
 
 
 def _normalised(power: np.ndarray, sigma: np.ndarray | None) -> tuple[np.ndarray, np.ndarray | None]:
@@ -273,6 +290,9 @@ def _own_notices(target: Target, total: float) -> list[str]:
         notices.append(f"bins not covered and left out: {spans} (bin spacing {settings.resolution:g} Hz)")
     if abs(total - 1) > SUM_TOLERANCE:
         notices.append(f"proportional power summed to {total:.4g} over the bins covered: rescaled to 1")
+    if target.overdispersion > UNUSUAL and target.dispersion is not None:
+        notices.append(f"the trials {_dispersion_in_words(target.dispersion)}: all errors are widened by that. Did the "
+                       "person tire, drift or change the grip?")  # fmt: skip
     if target.provenance == "reconstructed":
         if target.reason is None:
             raise TargetError("a reconstructed target needs a reason: a sentence that says what was assumed")

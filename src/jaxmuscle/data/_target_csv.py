@@ -72,6 +72,10 @@ def _delimiter(place: str, body: str, file: str) -> str:
 
 def _header(place: str, row: list[str], file: str) -> list[str]:
     names = [cell.lower() for cell in row]
+    if not any(name.startswith(("freq", "prop", "power", "sigma")) for name in names):
+        raise TargetError(f"{file}, {place}: the columns are {', '.join(row)}; a spectrum has {NAMES[0]},{NAMES[1]}"
+                          "[,sigma]. Is this a recording? Then give it to `jaxmuscle analyse`, or read it with "
+                          "jaxmuscle.load_recording")  # fmt: skip
     for name in names:
         if name not in NAMES:
             raise TargetError(f"{file}, {place}: unknown column {name!r}; {choices(name, NAMES)}")

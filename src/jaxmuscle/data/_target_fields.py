@@ -103,6 +103,12 @@ def _fraction(name: str, value: Any) -> float:
     return float(value)
 
 
+def _positive(name: str, value: Any) -> float:
+    if not (is_number(value) and _usable(float(value))):
+        raise TargetError(f"{name} {value!r}: give a finite number above 0")
+    return float(value)
+
+
 def _each(check: Callable[[str, Any], Any], *, empty: bool = False) -> Callable[[str, Any], tuple[Any, ...]]:
     def check_each(name: str, value: Any) -> tuple[Any, ...]:
         values = value.tolist() if isinstance(value, np.ndarray) else value
@@ -122,10 +128,13 @@ CHECKS: dict[str, Callable[[str, Any], Any]] = {
     "segments": _each(_count),
     "coefficient_of_variation": _each(_fraction),
     "mvc_fraction": _fraction,
+    "mean": _each(_positive),
+    "unit": _text,
+    "dispersion": _each(_positive),
     "reason": _text,
     "notices": _each(_text, empty=True),
 }
-OPTIONAL = ("segments", "coefficient_of_variation", "mvc_fraction", "reason")
+OPTIONAL = ("segments", "coefficient_of_variation", "mvc_fraction", "mean", "unit", "dispersion", "reason")
 
 
 def bin_numbers(values: Any, settings: SpectrumSettings) -> Int[np.ndarray, " bins"]:
@@ -148,6 +157,25 @@ def positive(name: str, values: Any, size: int) -> Float[np.ndarray, " bins"]:
     if not np.all(_usable(array)):
         raise TargetError(f"{name}: every value must be finite and larger than 0; leave out bins that are not known")
     return array
+
+
+def trial_powers(values: Any, bins: int, segments: tuple[int, ...] | None, power: np.ndarray) -> np.ndarray:
+    """Spectra of trials, one row each, whose mean, weighted with their segments, has the shape of `power`."""
+    try:
+        rows = np.array(values, dtype=float)
+    except (TypeError, ValueError):
+        raise TargetError("trial_power: give a row for each trial, a number for each bin") from None
+    if segments is None or rows.shape != (len(segments), bins) or len(rows) < 2:
+        known = "no segments are stated" if segments is None else f"segments names {len(segments)} trials"
+        raise TargetError(f"trial_power has shape {rows.shape}, and {known}; give 2 rows or more, one for each entry of "
+                          f"segments, of {bins} bins each")  # fmt: skip
+    if not np.all(_usable(rows)):
+        raise TargetError("trial_power: every value must be finite and larger than 0")
+    mean = np.average(rows, axis=0, weights=segments)
+    if not np.allclose(mean / mean.sum(), power / power.sum(), rtol=1e-6):
+        raise TargetError("trial_power: its mean over the trials, weighted with their segments, is not proportional_power; "
+                          "leave one of both out or make it right")  # fmt: skip
+    return frozen(rows)
 
 
 def frozen(values: np.ndarray) -> np.ndarray:

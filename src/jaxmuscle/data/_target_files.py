@@ -17,11 +17,20 @@ from jaxmuscle.spectra._settings import SpectrumSettings
 
 from ._digitised import AXES, Points, columns_of, read_datasets, read_project, read_tar
 from ._target_csv import merge_duplicates, read_csv
-from ._target_fields import CHECKS, GRID_TOLERANCE, Columns, check_columns, is_number, metadata
+from ._target_fields import (
+    CHECKS,
+    GRID_TOLERANCE,
+    PIXEL_OF_LOG,
+    PIXEL_TOLERANCE,
+    Columns,
+    check_columns,
+    is_number,
+    metadata,
+)
 
 REQUIRED = ("name", "quantity", "provenance", "source", "frequency_hz", "proportional_power")
-METADATA = ("segments", "coefficient_of_variation", "mvc_fraction", "reason", "notices")
-KEYS = (*REQUIRED, "sigma", *METADATA, "settings")
+METADATA = ("segments", "coefficient_of_variation", "mvc_fraction", "mean", "unit", "dispersion", "reason", "notices")
+KEYS = (*REQUIRED, "sigma", *METADATA, "trial_power", "settings")
 
 
 class Raw(NamedTuple):
@@ -160,3 +169,60 @@ def _numbers(file: str, key: str, values: Any) -> Float[np.ndarray, " rows"]:
         if not is_number(value):
             raise TargetError(f"{file}, entry {i}: {key} {value!r} is not a number")
     return np.array([float(value) for value in values])
+
+
+class OnBins(NamedTuple):
+    """Powers of the bins that a file covers."""
+
+    bins: np.ndarray
+    proportional_power: np.ndarray
+    sigma: np.ndarray | None = None
+    trial_power: Any = None
+
+
+def on_grid(raw: Raw) -> tuple[OnBins, list[str]]:
+    """The rows on the bins they cover: as they are if all lie on bins, else interpolated in log power; and notices.
+
+    Raises `TargetError` if fewer than 2 bins are covered, and for spectra of trials that are off the bins.
+    """
+    columns, settings, trials = raw.columns, raw.fields["settings"], raw.fields.get("trial_power")
+    position = np.minimum(columns.frequency / settings.resolution, 1e9)
+    tolerance = np.full(position.size, PIXEL_TOLERANCE if raw.digitised else GRID_TOLERANCE)
+    if raw.log_frequency:
+        tolerance = np.maximum(tolerance, PIXEL_OF_LOG * position)
+    bins = np.rint(position).astype(int)
+    first, last = settings.first_bin, settings.last_bin
+    aligned = np.all(np.abs(position - bins) <= tolerance) and np.unique(bins).size == bins.size
+    notices = []
+    if aligned:
+        inside = (bins >= first) & (bins <= last)
+        sigma = None if columns.sigma is None else columns.sigma[inside]
+        points = OnBins(bins[inside], columns.power[inside], sigma, None if trials is None else _columns(trials, inside))
+        if (off := np.max(np.abs(position - bins)[inside], initial=0)) > GRID_TOLERANCE:
+            notices.append(f"points up to {off:.2g} bins off the grid: taken as on the bins, within a pixel of a figure")
+        if not np.all(inside):
+            notices.append(f"rows outside bins {first} to {last} left out: {np.sum(~inside)}")
+    elif trials is not None:
+        raise TargetError("trial_power: needs frequencies that lie on the bins of the settings")
+    else:
+        every = np.arange(first, last + 1)
+        low, high = position[0] - tolerance[0], position[-1] + tolerance[-1]
+        covered = every[(every >= low) & (every <= high)]
+        logs = [np.log(values) for values in (columns.power, columns.sigma) if values is not None]
+        at, known = (np.log(covered), np.log(position)) if raw.log_frequency else (covered, position)
+        points = OnBins(covered, *(np.exp(np.interp(at, known, log)) for log in logs))
+        gap, scale = f"{np.max(np.diff(columns.frequency), initial=0):.3g}", " and frequency" * raw.log_frequency
+        notices.append(f"frequencies off the grid: interpolated onto the bins in log power{scale} (widest gap {gap} Hz)")
+    if points.bins.size < 2:
+        raise TargetError(
+            f"covers {points.bins.size} of the bins {first} to {last} ({settings.frequency[0]:.4g} to "
+            f"{settings.frequency[-1]:.4g} Hz), at least 2 are needed; frequencies are in Hz"
+        )
+    return points, notices
+
+
+def _columns(rows: Any, inside: np.ndarray) -> list[list[float]]:
+    """The trials' spectra on the bins that are kept."""
+    if not isinstance(rows, list) or any(not isinstance(row, list) or len(row) != inside.size for row in rows):
+        raise TargetError(f"trial_power: every trial needs {inside.size} numbers, as many as proportional_power has")
+    return [[value for value, kept in zip(row, inside, strict=True) if kept] for row in rows]

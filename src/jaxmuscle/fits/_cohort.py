@@ -2,7 +2,6 @@
 
 import itertools
 from collections.abc import Callable, Iterable, Mapping
-from os import PathLike
 from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
@@ -14,11 +13,12 @@ from jaxtyping import PRNGKeyArray
 from jaxmuscle import plot
 from jaxmuscle._common.environment import versions
 from jaxmuscle._common.progress import told
-from jaxmuscle.data._target import Target, load_target
+from jaxmuscle.data._as_target import as_target
+from jaxmuscle.data._target import Target
 from jaxmuscle.model._noise import AbstractNoise
 from jaxmuscle.model._rungs import on_rung
 from jaxmuscle.model._tasks import AbstractTask, with_noise
-from jaxmuscle.objective._arguments import FitOptions, Plan, planned, task_for
+from jaxmuscle.objective._arguments import FitOptions, Plan, at_mean, planned, task_for
 from jaxmuscle.spectra._bin_law import trial_samples
 
 from ._ladder import options_for
@@ -168,7 +168,7 @@ def _difference(quantity: str, a: tuple[str, list[Any]], b: tuple[str, list[Any]
 
 
 def fit_cohort(
-    targets: Iterable[Target | str | PathLike[str]],
+    targets: Iterable[Any],
     *,
     groups: Mapping[str, str] | None = None,
     task: type[AbstractTask] | None = None,
@@ -191,11 +191,11 @@ def fit_cohort(
     on simulated seeds, no profile over the harmonic's frequency; fit a target alone for those. Targets that can share a
     batch are those of the same task, bins and settings.
 
-    **Arguments:** `targets`, or names and paths of them; `groups` {target name: group}; `task`, the same kind for all
-    (by default what each measured); `noise`, `fix`, `free`, `residual`, `bounds`, `priors`, `key`, `max_steps`,
-    `coefficient_of_variation` as in `fit`; `starts` for each target; `rung`, the model of all of them (`on_rung`: 0 the base
-    model, 1 with activation, 2 with tremor, 3 with a second resonance), so that their numbers can be compared; `progress`,
-    True or a function of (text, share).
+    **Arguments:** `targets`, one of each person, in any form that `fit` takes (a list is the trials of one); `groups`
+    {target name: group}; `task`, the same kind for all (by default what each measured); `noise`, `fix`, `free`, `residual`,
+    `bounds`, `priors`, `key`, `max_steps`, `coefficient_of_variation` as in `fit`; `starts` for each target; `rung`, the
+    model of all of them (`on_rung`: 0 the base model, 1 with activation, 2 with tremor, 3 with a second resonance), so that
+    their numbers can be compared; `progress`, True or a function of (text, share).
 
     **Returns:** a `CohortResult`. A target that cannot be read, or not be fitted with these options, is
     listed in `failed` with the reason and does not stop the rest.
@@ -215,8 +215,8 @@ def fit_cohort(
             model = task_for(target) if task is None else task(settings=target.settings)
             model = with_noise(model, noise, fix)
             try:
-                model = on_rung(model, rung) if rung else model
-                plan = planned(model, target, options_for(model, options))
+                model, given = at_mean(on_rung(model, rung) if rung else model, target, options)
+                plan = planned(model, target, options_for(model, given))
             except ValueError as error:
                 failed[name] = str(error)
                 continue
@@ -227,12 +227,12 @@ def fit_cohort(
     return CohortResult(ordered, {name: (groups or {})[name] for name in ordered if name in (groups or {})}, failed)
 
 
-def _loaded(targets: Iterable[Target | str | PathLike[str]]) -> tuple[dict[str, Target], dict[str, str]]:
+def _loaded(targets: Iterable[Any]) -> tuple[dict[str, Target], dict[str, str]]:
     loaded: dict[str, Target] = {}
     failed: dict[str, str] = {}
     for given in targets:
         try:
-            target = given if isinstance(given, Target) else load_target(given)
+            target = as_target(given)
         except (ValueError, OSError) as error:
             failed[str(given)] = str(error)
             continue

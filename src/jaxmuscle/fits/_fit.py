@@ -1,16 +1,18 @@
 """Fit of a task's parameters to a target spectrum, in linear response or by Monte Carlo."""
 
 from collections.abc import Callable, Iterable, Mapping
+from typing import Any
 
 import jax
 from jaxtyping import PRNGKeyArray
 
 from jaxmuscle._common.progress import told
+from jaxmuscle.data._as_target import as_target
 from jaxmuscle.data._target import Target
 from jaxmuscle.model._noise import AbstractNoise, BandLimitedNoise
 from jaxmuscle.model._rungs import RUNGS, is_base
 from jaxmuscle.model._tasks import AbstractTask, with_noise
-from jaxmuscle.objective._arguments import DT, FitOptions, planned
+from jaxmuscle.objective._arguments import DT, FitOptions, at_mean, planned
 
 from ._ladder import Models, options_for
 from ._result import FitResult
@@ -19,7 +21,7 @@ from ._search import search
 
 def fit(
     task: AbstractTask,
-    target: Target,
+    target: Any,
     *,
     free: Iterable[str] | None = None,
     fix: Mapping[str, float] | None = None,
@@ -32,7 +34,7 @@ def fit(
     bounds: Mapping[str, tuple[float, float]] | None = None,
     priors: Mapping[str, float | None] | None = None,
     coefficient_of_variation: bool = True,
-    mean_force: tuple[float, float] | None = None,
+    mean_force: tuple[float, float] | bool | None = None,
     max_steps: int = 40,
     dt: float = DT,
     check_seeds: int | None = None,
@@ -52,23 +54,29 @@ def fit(
     where the task has one. The reported spectrum comes from `check_seeds` fresh paths of the nonlinear model.
 
     **Arguments:** `task` (its values are the prior's centre; `task_for(target)` makes one) and `target`, whose spectrum
-    settings replace the task's; `free`, names to fit (default: `DEFAULT_FREE`, those of them that the task has);
+    settings replace the task's: a `Target`, a `Recording`, the recordings of one condition (a list, `Trials`), or names and
+    paths of these; `free`, names to fit (default: `DEFAULT_FREE`, those of them that the task has);
     `fix`, values to set, which are then not free; `noise`, a name or an object; `residual`, "log", "linear" or
     "cumulative"; `starts` (100, or 8 for a task without linear response); `seeds` (32, or 48 then; 0: no nonlinear
     correction); `key`, a `jax.random` key or a seed number; `bounds` {name: (low, high)}; `priors` {name: sd in log, or None
     for a flat one};
     `coefficient_of_variation`, whether the target's, if it states one, is one more residual (it fixes the scale of the
-    noise); `mean_force` (value, sd) [N] as a further residual; `max_steps` for each descent; `check_seeds` (64, or 200
-    then; 0: not simulated); `dt` [s], noise grid of a Monte Carlo fit; `progress`, True or a function of (text, share);
-    `rungs`, how many richer models may be tried where the base model does not describe the data (`on_rung`; 3, or 0 where
-    `noise` or `free` is given); `answer`, a function that gets the result as soon as the search ends, before simulated
-    check, profile and p-value.
+    noise); `mean_force` (value, sd) [N] as a further residual, by default the target's if it states its mean in newtons:
+    the task is then carried to it (`at_force`) and P_w is free (False: not used); `max_steps` for each descent;
+    `check_seeds` (64, or 200 then; 0: not simulated); `dt` [s], noise grid of a Monte Carlo fit; `progress`, True or a
+    function of (text, share); `rungs`, how many richer models may be tried where the base model does not describe the data
+    (`on_rung`; 3, or 0 where `noise` or `free` is given); `answer`, a function that gets the result as soon as the search
+    ends, before simulated check, profile and p-value.
 
     **Returns:** a `FitResult`; a fit that fails is one, too, and says why.
 
     **Raises:** `ValueError` for bad arguments (unknown names with the nearest known, too few bins, values outside
     bounds); `FitInterrupted` on Ctrl-C, with what was reached.
     """
+    if not isinstance(task, AbstractTask):
+        raise ValueError(f"task: this is a {type(task).__name__}; give a task first, as jaxmuscle.Isometric(), then the "
+                         "target: fit(task, target)")  # fmt: skip
+    target = as_target(target)
     with told(progress, f"fitting {target.name}") as tell, jax.enable_x64(True):
         options = FitOptions(
             free=free, fix=fix, method=method, residual=residual, starts=starts, seeds=seeds, check_seeds=check_seeds,
@@ -77,6 +85,7 @@ def fit(
         )  # fmt: skip
         task = with_noise(task, noise, fix)
         top = _top(task, target, options, chosen=noise is not None)
+        task, options = at_mean(task, target, options)
         plan = planned(task, target, options)
         models = Models(task, top, lambda task: planned(task, target, options_for(task, options)))
         return search(plan, answer, models if top else None)

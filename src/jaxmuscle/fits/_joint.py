@@ -2,7 +2,6 @@
 
 import dataclasses
 from collections.abc import Callable, Iterable, Mapping
-from os import PathLike
 from typing import Any
 
 import jax
@@ -10,7 +9,8 @@ from jaxtyping import PRNGKeyArray
 
 from jaxmuscle._common.progress import told
 from jaxmuscle._common.text import choices
-from jaxmuscle.data._target import Target, load_target
+from jaxmuscle.data._as_target import as_target
+from jaxmuscle.data._target import Target
 from jaxmuscle.model._noise import AbstractNoise
 from jaxmuscle.model._tasks import AbstractTask, with_noise
 from jaxmuscle.objective._arguments import (
@@ -26,6 +26,7 @@ from jaxmuscle.objective._arguments import (
     task_for,
 )
 from jaxmuscle.objective._problem import FitProblem
+from jaxmuscle.response._scaling import at_force, is_scalable, times_force
 
 from ._result import FitResult
 from ._search import search
@@ -34,7 +35,7 @@ Tasks = dict[str, AbstractTask]
 
 
 def fit_joint(
-    targets: Mapping[str, Target | str | PathLike[str]],
+    targets: Mapping[str, Any],
     *,
     tasks: Mapping[str, AbstractTask] | None = None,
     separate: Iterable[str] = (),
@@ -60,14 +61,16 @@ def fit_joint(
     nonlinear model's correction to every target's spectrum. A parameter of one name is the same number in all tasks that
     have it; one that only one task has belongs to that. The inputs (`P_w`, `F_ext`, `x_z`) are each task's own.
 
-    **Arguments:** `targets` {name: target, bundled name or path} (of one target: the fit of that); `tasks` {name: task}
+    **Arguments:** `targets` {name: target, in any form that `fit` takes} (of one: the fit of that); `tasks` {name: task}
     (`task_for` of each target by default), whose values are the prior's centre and whose spectrum settings the target's
     replace; `separate`, names of parameters that have a value for each target, then called "c_w@high"; `proportional`, names
     that keep the ratio which their values have in the tasks (as `at_level` sets them); `free`, names to fit, "P_w@high" for
     one target's (default as in `fit`); `fix` {name or "name@target": value}; `noise` of all tasks; `starts`; `seeds` of the
     nonlinear correction (0: none); `check_seeds`, fresh seeds of the nonlinear model for each reported spectrum (0: linear
     response times the correction); `bounds`, `priors`, `key`, `residual`, `coefficient_of_variation`, `max_steps`,
-    `progress` as in `fit`; `mean_force` {target: (value, sd)}.
+    `progress` as in `fit`; `mean_force` {target: (value, sd)}, by default what the
+    targets state in newtons, if no `tasks` are given: all tasks are then carried by one number to the first, with a free
+    P_w each.
 
     **Returns:** a `FitResult` with a part for each target; a fit that fails is one, too, and says why.
 
@@ -83,9 +86,13 @@ def fit_joint(
             if name not in loaded:
                 raise ValueError(f"{argument}: no target is called {name!r}: {choices(name, loaded)}")
     models = _models(loaded, tasks or {}, noise, dict(fix or {}))
+    carried: tuple[str, ...] = ()
+    if mean_force is None and not tasks and "P_w" not in map(base_of, fix or ()):
+        models, mean_force = _at_means(models, loaded)
+        carried = tuple(mean_force)
     with told(progress, f"fitting {', '.join(loaded)}") as tell, jax.enable_x64(True):
         options = dataclasses.replace(options, progress=tell)
-        return search(planned_jointly(models, loaded, options, separate, proportional, mean_force))
+        return search(planned_jointly(models, loaded, options, separate, proportional, mean_force, carried))
 
 
 def planned_jointly(
@@ -95,12 +102,18 @@ def planned_jointly(
     separate: Iterable[str] = (),
     proportional: Iterable[str] = (),
     mean_force: Mapping[str, tuple[float, float]] | None = None,
+    carried: Iterable[str] = (),
 ) -> Plan:
-    """The fit of several targets, its arguments checked (see `fit_joint`). Needs double precision."""
+    """The fit of several targets, its arguments checked (see `fit_joint`). Needs double precision.
+
+    `carried`: the targets whose P_w is free, too, since it follows from their mean force.
+    """
     separate, proportional = tuple(separate), tuple(proportional)
     bounds, priors, means = dict(options.bounds or {}), dict(options.priors or {}), dict(mean_force or {})
     check_shared(tasks, separate, proportional)
-    local = _local_free(tasks, targets, None if options.free is None else tuple(options.free), options.fix or ())
+    local = _local_free(
+        tasks, targets, None if options.free is None else tuple(options.free), options.fix or (), options.also_free
+    )
     names = joint_names(local, tasks, separate)
     known = list(dict.fromkeys(joint for of in names.values() for joint in of.values()))
     _check_known("bounds", bounds, known)
@@ -130,7 +143,7 @@ def _loaded(targets: Mapping[str, Any]) -> dict[str, Target]:
     for name in targets:
         if not name or "@" in name:
             raise ValueError(f"targets: a name must not be empty nor contain '@', as {name!r} does")
-    return {name: t if isinstance(t, Target) else load_target(t) for name, t in targets.items()}
+    return {name: as_target(t) for name, t in targets.items()}
 
 
 def _models(targets: dict[str, Target], tasks: Mapping[str, AbstractTask], noise: Any, fix: dict[str, float]) -> Tasks:
@@ -159,7 +172,7 @@ def _holders(argument: str, name: str, tasks: Tasks) -> list[str]:
 
 
 def _local_free(
-    tasks: Tasks, targets: dict[str, Target], free: Iterable[str] | None, fix: Iterable[str]
+    tasks: Tasks, targets: dict[str, Target], free: Iterable[str] | None, fix: Iterable[str], carried: Iterable[str]
 ) -> dict[str, tuple[str, ...]]:
     """The free parameters of every target's task."""
     found = {}
@@ -171,7 +184,22 @@ def _local_free(
             raise ValueError(f"free: none of these belongs to the task of target {t!r}: free one, or leave the target out")
         held = {base_of(n): 0.0 for n, holders in fixed.items() if t in holders}
         found[t] = free_names(task, None if free is None else here, held, len(targets[t].bins))
+        found[t] += ("P_w",) if t in carried and "P_w" not in found[t] else ()
     return found
+
+
+def _at_means(tasks: Tasks, targets: dict[str, Target]) -> tuple[Tasks, dict[str, tuple[float, float]]]:
+    """All tasks carried by one number to the first mean force that a target states, each P_w to its own; these means."""
+    stated = {
+        name: t.mean_force for name, t in targets.items() if t.mean_force is not None and tasks[name].output_unit == "N"
+    }
+    if not stated or not all(is_scalable(task.muscle) for task in tasks.values()):
+        return tasks, {}
+    first, (mean, _) = next(iter(stated.items()))
+    factor = float(at_force(tasks[first], mean)["P_w"]) / float(tasks[first]["P_w"])
+    moved = {name: times_force(task, factor) for name, task in tasks.items()}
+    own = {name: moved[name].replace(P_w=float(moved[name]["P_w"]) * value / mean) for name, (value, _) in stated.items()}
+    return moved | own, stated
 
 
 def _check_known(argument: str, given: Mapping[str, Any], known: list[str]) -> None:

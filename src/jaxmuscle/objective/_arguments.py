@@ -20,6 +20,7 @@ from jaxmuscle.model._parameters import PARAMETERS, USUALLY_FREE
 from jaxmuscle.model._tasks import AbstractTask, Isometric, PrescribedForce, with_noise
 from jaxmuscle.response._expected import check_line
 from jaxmuscle.response._linearised import has_response
+from jaxmuscle.response._scaling import FORCES, at_force, is_scalable
 
 from ._coordinates import Coordinates
 from ._problem import FitProblem, Part, target_variation
@@ -72,7 +73,10 @@ def _check_names(argument: str, names: Iterable[str], known: Iterable[str]) -> N
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class FitOptions:
-    """How a fit is done: what `fit` and `fit_joint` are asked for, by the names of their arguments."""
+    """How a fit is done: what `fit` and `fit_joint` are asked for, by the names of their arguments.
+
+    `also_free`: what is free besides `free`, whatever that is.
+    """
 
     free: Iterable[str] | None = None
     fix: Mapping[str, float] | None = None
@@ -85,7 +89,8 @@ class FitOptions:
     bounds: Mapping[str, tuple[float, float]] | None = None
     priors: Mapping[str, float | None] | None = None
     coefficient_of_variation: bool = True
-    mean_force: tuple[float, float] | None = None
+    mean_force: tuple[float, float] | bool | None = None
+    also_free: tuple[str, ...] = ()
     max_steps: int = 40
     dt: float = DT
     rungs: int | None = None
@@ -106,6 +111,21 @@ class FitOptions:
         return self.key if isinstance(self.key, int) else None
 
 
+def at_mean(task: AbstractTask, target: Target, options: FitOptions) -> tuple[AbstractTask, FitOptions]:
+    """The task carried to the target's mean force, where it states one in newtons, which then is data; P_w follows from it.
+
+    Not where the fit is given a `mean_force` (or False), where P_w is fixed, nor for a muscle that is not the paper's.
+    """
+    if options.mean_force is not None:
+        return task, dataclasses.replace(options, mean_force=options.mean_force or None)
+    level = next((name for name in FORCES if name in task.parameter_names), None)
+    stated = target.mean_force if task.output_unit == "N" and is_scalable(task.muscle) else None
+    if stated is None or level is None or level in (options.fix or {}):
+        return task, options
+    free = (*options.also_free, level)
+    return at_force(task, stated[0]), dataclasses.replace(options, mean_force=stated, also_free=free)
+
+
 class Plan(NamedTuple):
     """A fit to be done."""
 
@@ -122,12 +142,14 @@ def planned(task: AbstractTask, target: Target, options: FitOptions) -> Plan:
     bounds, priors, fix = dict(options.bounds or {}), dict(options.priors or {}), dict(options.fix or {})
     task = as_numbers(task.with_parts(settings=target.settings).replace(**fix))
     names = free_names(task, options.free, fix, len(target.bins))
+    names += tuple(name for name in options.also_free if name not in names)
+    mean = options.mean_force if isinstance(options.mean_force, tuple) else None
     _check_names("priors", priors, names)
     _check_names("bounds", bounds, names)
     check_line(task, target.settings)
     if not (np.any(np.asarray(task.noise.amplitude) > 0) or float(task.harmonic.amplitude) > 0):
         raise ValueError("the task has neither noise nor a harmonic, so its spectrum is zero: set noise_K_w, say")
-    _check_mean(task, names, options.mean_force)
+    _check_mean(task, names, mean)
     control = has_response(task, required=options.method == "linear")
     many = {"starts": 100, "seeds": 32, "check_seeds": 64} if control else {"starts": 8, "seeds": 48, "check_seeds": 200}
     counts = {name: count if getattr(options, name) is None else getattr(options, name) for name, count in many.items()}
@@ -139,14 +161,14 @@ def planned(task: AbstractTask, target: Target, options: FitOptions) -> Plan:
     sds = {n: priors.get(n, usual[n]) for n in names}
     coordinates = Coordinates.of({n: float(task[n]) for n in names}, bounds, {n: sd or 1.0 for n, sd in sds.items()})
     variation = target_variation(target) if options.coefficient_of_variation else None
-    part = Part("", task, target, coordinates, tuple(range(len(names))), variation, options.mean_force)
+    part = Part("", task, target, coordinates, tuple(range(len(names))), variation, mean)
     key = key_of(options.key) if isinstance(options.key, int) else options.key
     problem = FitProblem((part,), coordinates, np.array([0.0 if sds[n] is None else 1.0 for n in names]), options.residual,
                          options.method, options.dt, key, counts["seeds"], control, options.progress)  # fmt: skip
     settings = {
         **settings_of(problem, bounds), **counts, "max_steps": options.max_steps, "dt": options.dt,
         "coefficient_of_variation": variation is not None,
-        "mean_force": None if options.mean_force is None else list(options.mean_force),
+        "mean_force": None if mean is None else list(mean),
         "spectrum": target.settings.to_dict(), "steps_per_sample": problem.steps_per_sample,
     }  # fmt: skip
     return Plan(problem, counts["starts"], options.max_steps, counts["check_seeds"], settings, options.seed)

@@ -20,7 +20,7 @@ from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.response._expected import Moments, check_line, expected_moments
 from jaxmuscle.response._linearised import check_inputs
 from jaxmuscle.response._second_order import warn_beyond
-from jaxmuscle.spectra._bin_law import LEAST, bin_statistics, trial_samples, welch_law
+from jaxmuscle.spectra._bin_law import LEAST, bin_statistics, target_law, trial_samples
 from jaxmuscle.spectra._settings import WINDOW
 
 from ._consequences import Expansion, expand
@@ -63,7 +63,7 @@ def measured_bins(target: Target, mask: np.ndarray | None = None) -> Bins:
     """A target's bins with their law, those with `mask` 0 left out. Raises `ValueError` for one that states no segments."""
     if target.segments is None:
         raise ValueError(f"{target.name}: states no segments, so the law of its bins is unknown; give segments")
-    law = welch_law(target.settings, target.bins, target.segments)
+    law = target_law(target)
     kept = np.ones(len(target.bins)) if mask is None else np.asarray(mask, dtype=float)
     return Bins(np.log(target.proportional_power), law.degrees / 2, *_precision(law.correlation, kept), kept)
 

@@ -70,7 +70,8 @@ def target(target: Any, ax: Axes | None = None, *, log: bool = False) -> Axes:
 
     The band is where an expected spectrum lies at most one standard deviation from the target in log power:
     p_k exp(-bias ± sd). With ν degrees of freedom bias = ψ(ν/2) - ln(ν/2) and sd² = ψ'(ν/2), otherwise bias = 0 and
-    sd² = ln(1 + (sigma_k/p_k)²). Without segments and sigma there is no band.
+    sd² = ln(1 + (sigma_k/p_k)²). Without segments and sigma there is no band. Spectra of trials are thin lines, in the same
+    unit as their mean.
 
     **Arguments:** `target`; `ax`, or a new figure; `log`, both axes logarithmic.
 
@@ -83,6 +84,11 @@ def target(target: Any, ax: Axes | None = None, *, log: bool = False) -> Axes:
         low, high = band
         label = "± 1 SD (assumed)" if target.provenance == "reconstructed" else "± 1 SD of the estimate"
         ax.fill_between(frequency[shown], low[shown], high[shown], color="0.86", lw=0, label=label, zorder=1)
+    if target.trial_power is not None:
+        weights = np.asarray(target.segments)
+        each = target.trial_power / (weights @ target.trial_power / weights.sum()).sum()
+        ax.plot(frequency[shown], each.T[shown], color="0.6", lw=0.5, zorder=2)
+        ax.lines[-1].set_label(f"{len(each)} trials")
     name = target.name if len(target.name) <= 40 else f"{target.name[:39]}…"
     style: dict[str, Any] = {"color": BLACK, "lw": 0.6, "marker": "o", "ms": 2.8, "zorder": 3}
     (line,) = ax.plot(frequency[shown], power[shown], **style)

@@ -106,6 +106,11 @@ def at_force(task: AbstractTask, mean: Scalar) -> AbstractTask:
     here = _moments(task).mean
     factor = _number(mean) / here
     require(factor > 0, f"mean = {mean} N: the mean force of this task is {here} N; give one of the same sign")
+    return times_force(task, factor)
+
+
+def times_force(task: AbstractTask, factor: Scalar) -> AbstractTask:
+    """Forces, masses, stiffness and damping (and noise in absolute units) multiplied by one number."""
     inputs = {name: _times(getattr(task, name), factor) for name in FORCES if hasattr(task, name)}
     moved = _with_coefficients(task.with_parts(**inputs), stiffness=factor, damping=factor)
     moved = moved.replace(m_w=moved["m_w"] * factor, m_z=moved["m_z"] * factor)
@@ -180,15 +185,19 @@ def _times(value: Any, factor: Scalar) -> Any:
     return dataclasses.replace(value, **{name: getattr(value, name) * factor for name in sizes})
 
 
+def is_scalable(muscle: Any) -> bool:
+    """Whether the muscle is made of the paper's quadratic laws, so that it is known what to multiply."""
+    laws = [type(getattr(muscle, f"{kind}_{j}", None)) for kind in ("stiffness", "damping") for j in "wz"]
+    return isinstance(muscle, Muscle) and laws == [QuadraticStiffness] * 2 + [QuadraticDamping] * 2
+
+
 def _with_coefficients(
     task: AbstractTask, *, stiffness: Scalar, damping: Scalar, length: Scalar = 1.0, velocity: Scalar = 1.0
 ) -> AbstractTask:
     """K_j0, C_j0, x_ref and v_ref of both tissues multiplied by the four factors."""
-    muscle = task.muscle
-    laws = [type(getattr(muscle, f"{kind}_{j}", None)) for kind in ("stiffness", "damping") for j in "wz"]
-    if not isinstance(muscle, Muscle) or laws != [QuadraticStiffness] * 2 + [QuadraticDamping] * 2:
-        raise ValueError(f"the muscle, a {type(muscle).__name__}, is not made of the paper's quadratic laws: change its own "
-                         "parameters with replace(...)")  # fmt: skip
+    if not is_scalable(task.muscle):
+        raise ValueError(f"the muscle, a {type(task.muscle).__name__}, is not made of the paper's quadratic laws: change "
+                         "its own parameters with replace(...)")  # fmt: skip
     factors = {"k": stiffness / length**2, "x_ref": length, "c": damping / velocity**2, "v_ref": velocity}
     names = [(f"{name}_{j}", factor) for name, factor in factors.items() for j in "wz"]
     return task.replace(**{name: task[name] * factor for name, factor in names})

@@ -46,6 +46,43 @@ def _welch_law(settings: SpectrumSettings, bins: tuple[int, ...], segments: tupl
     return BinLaw(2 * power**2 / sd**2, covariance / np.outer(sd, sd))
 
 
+def target_law(target: Any) -> BinLaw:
+    """`welch_law` of a target's bins; where its trials scatter more than their segments explain, with fewer degrees."""
+    law = welch_law(target.settings, target.bins, target.segments)
+    return law._replace(degrees=law.degrees / target.overdispersion**2)
+
+
+def dispersion_of(
+    power: Float[np.ndarray, "trials bins"], segments: tuple[int, ...], settings: SpectrumSettings, bins: np.ndarray
+) -> tuple[float, float]:
+    """How many times more the mean of several trials' spectra scatters than their segments explain, and its standard error.
+
+    The mean S is weighted with the segments K_i, so that trial i, whose power is a_i times the mean's, has the share
+    `s_i = K_i a_i / Σ K a` in it. Two things make S scatter more than `welch_law` says:
+
+        d² = Σ_i s_i² |D⁻¹ C r_i|² / Σ_i E_i  ·  ΣK Σ_i s_i² / K_i,      r_ik = P_ik / (a_i S_k) - 1
+
+    The second factor is that of unequal power, since the strongest trials outweigh the others. The first is how the shapes
+    differ: V is the law's covariance of the log powers of S, D its standard deviations, C = 1 - 1/n takes out what all bins
+    have in common, and `E_i = ΣK s_i² ((1 - 2 s_i) / K_i + Σ_j s_j² / K_j) tr A`, A = D⁻¹ C V C D⁻¹, is what it expects.
+    The standard error is the larger of the law's own and that by the scatter of the trials' contributions.
+    """
+    law = welch_law(settings, bins, segments)
+    sd, counts = np.sqrt(2 / law.degrees), np.asarray(segments)
+    ratio = power / np.average(power, axis=0, weights=counts)
+    size = ratio.mean(axis=1)
+    s = counts * size / np.sum(counts * size)
+    centre = (np.eye(len(sd)) - 1 / len(sd)) / sd[:, None]
+    a = centre @ (sd[:, None] * law.correlation * sd) @ centre.T
+    each = s**2 * np.sum(((ratio / size[:, None] - 1) @ centre.T) ** 2, axis=1)
+    expected = counts.sum() * np.trace(a) * np.sum(s**2 * ((1 - 2 * s) / counts + np.sum(s**2 / counts)))
+    value = np.sqrt(np.sum(each) / expected * counts.sum() * np.sum(s**2 / counts))
+    effective = max(1 / np.sum(s**2) - 1, 0.5)
+    by_law = np.sqrt(2 * np.sum(a**2) / effective) / np.trace(a)
+    by_trials = np.sqrt(len(each)) * np.std(each, ddof=1) / np.sum(each)
+    return float(value), float(value * max(by_law, by_trials) / 2)
+
+
 class BinStatistics(NamedTuple):
     """Sampling law of a target's log powers: expected offset `bias`, standard deviation `sd`, `correlation` of bins.
 
@@ -80,7 +117,7 @@ def bin_statistics(target: Any, line_share: Float[np.ndarray, "*rows bins"] | No
     share = np.zeros(n) if line_share is None else np.asarray(line_share)
     unknown = np.full(share.shape, np.nan)
     if target.segments is not None:
-        law = welch_law(target.settings, target.bins, target.segments)
+        law = target_law(target)
         degrees = law.degrees / np.maximum(1 - share**2, LEAST)
         bias, variance = log_power_moments(degrees)
         return BinStatistics(bias, np.sqrt(variance), law.correlation, degrees / 2, True)

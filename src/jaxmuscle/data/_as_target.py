@@ -1,0 +1,80 @@
+"""Whatever a fit may be given as its data, made a target: spectra, recordings, names and paths of both."""
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from jaxmuscle._common.errors import TargetError
+
+from ._recording import Recording
+from ._recording_files import KINDS
+from ._target import Target, load_target
+from ._text_tables import SIGNS, cells_of, is_number, lines_of
+from ._trials import Trials, load_recordings
+
+LOOK = 1 << 16  # bytes of a text file that say what it is
+# Rows that the shortest recording has, and more than a figure of a spectrum does.
+ROWS, POINTS = 90, 500
+
+
+def as_target(given: Any, **options: Any) -> Target:
+    """The target that is meant.
+
+    A `Target` is taken as it is. A `Recording`, `Trials` or several recordings of one condition give theirs
+    (`Trials.target`), in the windows that they have. The path of a recording, or several of trials, is read, and the steady
+    part of each found (`Recording.steady`). Another path, or the name of a bundled target, is read as a spectrum.
+
+    **Arguments:** `options`, how files are read: as in `load_recording` or as in `load_target`.
+
+    **Raises:** `TargetError`, a `ValueError`, for anything else, with the remedy.
+    """
+    if isinstance(given, Target):
+        return given
+    if isinstance(given, Recording):
+        return given.target()
+    if isinstance(given, Trials):
+        return given.target()
+    if isinstance(given, str | os.PathLike):
+        if not is_recording(given):
+            return load_target(given, **options)
+        return load_recordings([given], **options).steady().target()
+    if isinstance(given, Sequence) and len(given) > 0:
+        if all(isinstance(one, Recording) for one in given):
+            return Trials(given).target()
+        if all(isinstance(one, str | os.PathLike) and is_recording(one) for one in given):
+            return load_recordings(given, **options).steady().target()
+    raise TargetError(_remedy(given))
+
+
+def _remedy(given: Any) -> str:
+    what = f"target: this is a {type(given).__name__}; give"
+    usual = "a Target, the name of a bundled one, a Recording, a list of the recordings of one condition, or their paths"
+    if hasattr(given, "columns") and hasattr(given, "index"):
+        return f"{what} a recording made of it: jaxmuscle.Recording.from_dataframe(...)"
+    if hasattr(given, "shape"):
+        return f"{what} a recording, which knows its rate: jaxmuscle.Recording(samples, rate)"
+    if isinstance(given, Sequence) and len(given) > 0:
+        return ("target: a list holds the recordings of one condition, or their paths; spectra of several people are "
+                "fitted by fit_cohort, those of one person by fit_joint")  # fmt: skip
+    return f"{what} {usual}"
+
+
+def is_recording(path: str | os.PathLike[str]) -> bool:
+    """Whether a file holds a recording rather than a spectrum: by its ending, a .csv by its header and number of rows."""
+    path = Path(path).expanduser()
+    kind = path.suffix.lower()
+    if kind != ".csv" or not path.is_file():
+        return kind in KINDS and kind != ".csv"
+    with path.open("rb") as file:
+        text = file.read(LOOK).decode("utf-8", errors="replace")
+    rows = [line.body for line in lines_of(text) if line.body.strip()]
+    if not rows:
+        return False
+    delimiter = next((sign for sign in SIGNS if sign in rows[0]), None)
+    names = [cell.casefold() for cell in cells_of(rows[0], delimiter)]
+    if all(is_number(name, delimiter) for name in names):
+        return len(rows) > POINTS
+    spectral = any(name.startswith(("freq", "proportional", "power")) or name in ("f", "hz") for name in names)
+    figure = len(rows) > 1 and set(map(str.casefold, cells_of(rows[1], delimiter))) == {"x", "y"}
+    return not spectral and not figure and len(rows) > ROWS

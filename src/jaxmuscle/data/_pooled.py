@@ -1,0 +1,78 @@
+"""The target that recordings of one condition give together: absolute spectra averaged, means, variations, notices."""
+
+import math
+from collections import Counter
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+import scipy
+from jaxtyping import Float
+
+from jaxmuscle.spectra._settings import SpectrumSettings, require
+
+from ._target import Target
+
+if TYPE_CHECKING:
+    from ._recording import Recording
+
+DRIFT = 0.5  # share of the variance
+
+
+def pooled_target(
+    recordings: "Sequence[Recording]",
+    name: str,
+    quantity: str | None,
+    provenance: str,
+    mvc: float | int | None,
+    settings: SpectrumSettings,
+) -> Target:
+    """The target of one or more recordings of the same unit, see `Trials.target`."""
+    unit = recordings[0].unit
+    quantity = recordings[0].quantity if quantity is None else quantity
+    require(quantity is not None, "quantity", quantity, f"unit {unit} does not tell; give force, torque, ...")
+    rows = np.stack([np.asarray(recording.spectrum(settings).power) for recording in recordings])
+    segments = [recording.segments(settings) for recording in recordings]
+    signals = [recording.filtered(settings) for recording in recordings]
+    means = np.array([float(np.mean(x)) for x in signals])
+    variations = [float(np.std(x)) / max(abs(m), 1e-300) for x, m in zip(signals, means, strict=True)]
+    mean = abs(float(np.mean(means)))
+    full = 100.0 if mvc is None and unit == "% MVC" else mvc
+    require(full is None or 0 < mean <= full < math.inf, "mvc", mvc, f"give a force above the mean, {mean:.4g}")
+    varying = quantity in ("force", "torque") and max(variations) <= 1
+    power = np.average(rows, axis=0, weights=segments)
+    drifts = [_drift(x) if varying else () for x in signals]
+    each = list(dict.fromkeys(f"{recording.source}, {recording.window_in_words}" for recording in recordings))
+    return Target(
+        name,
+        power / np.sum(power),
+        quantity=str(quantity),
+        provenance=provenance,
+        source="; ".join(each) if len(rows) == 1 else f"{len(rows)} trials: {'; '.join(each)}",
+        segments=segments,
+        coefficient_of_variation=variations if varying else None,
+        mvc_fraction=None if full is None else mean / full,
+        mean=np.abs(means).tolist() if varying else None,
+        unit=unit,
+        trial_power=rows if len(rows) > 1 else None,
+        settings=settings,
+        notices=_notices(recordings, drifts),
+    )
+
+
+def _notices(recordings: "Sequence[Recording]", more: list[tuple[str, ...]]) -> tuple[str, ...]:
+    """Those of every trial, by its name unless all say the same."""
+    said = [(r.name, notice) for r, own in zip(recordings, more, strict=True) for notice in (*r.notices, *own)]
+    often = Counter(notice for _, notice in said)
+    return tuple(dict.fromkeys(n if often[n] == len(recordings) else f"{name}: {n}" for name, n in said))
+
+
+def _drift(x: Float[np.ndarray, " times"]) -> tuple[str, ...]:
+    """What to say where a straight line makes more than half of the variance; the model has none."""
+    before, after = np.std(x), np.std(scipy.signal.detrend(x))
+    if after**2 > DRIFT * before**2:
+        return ()
+    mean = abs(float(np.mean(x)))
+    return (f"a straight drift makes {100 * (1 - (after / before) ** 2):.0f} % of the variance: coefficient of variation "
+            f"{before / mean:.3g} with it, {after / mean:.3g} without; the model knows no drift, so remove it first "
+            "(scipy.signal.detrend, and add the mean), or choose a steadier window",)  # fmt: skip

@@ -1,0 +1,117 @@
+"""Several recordings of one person in one condition: together they make one target."""
+
+import itertools
+import os
+from collections.abc import Iterable, Iterator, Sequence
+from typing import Any, overload
+
+import numpy as np
+
+from jaxmuscle._common.text import folded
+from jaxmuscle.spectra._settings import SpectrumSettings, require
+
+from ._pooled import pooled_target
+from ._recording import RECORDED, Recording
+from ._recording_files import load_columns, load_recording
+from ._target import Target
+
+
+class Trials(Sequence[Recording]):
+    """Recordings of one person in one condition: a sequence of `Recording`s that gives one `Target`.
+
+    **Arguments:** `recordings`, one or more of the same unit. Their rates, lengths and windows may differ.
+
+    **Raises:** `ValueError` for none, for something else than recordings, and for different units.
+    """
+
+    recordings: tuple[Recording, ...]
+
+    def __init__(self, recordings: Iterable[Recording]):
+        self.recordings = tuple(recordings)
+        require(len(self.recordings) > 0, "recordings", [], "give at least one")
+        for other in self.recordings:
+            require(isinstance(other, Recording), "recordings", other, "give Recordings, as load_recording returns them")
+        units = dict.fromkeys(recording.unit for recording in self.recordings)
+        if len(units) > 1:
+            raise ValueError(f"recordings: the units {' and '.join(units)} cannot be averaged; bring all trials to one unit "
+                             "(nothing is converted by itself)")  # fmt: skip
+
+    def __len__(self) -> int:
+        return len(self.recordings)
+
+    def __iter__(self) -> Iterator[Recording]:
+        return iter(self.recordings)
+
+    @overload
+    def __getitem__(self, index: int) -> Recording: ...
+    @overload
+    def __getitem__(self, index: slice) -> "Trials": ...
+    def __getitem__(self, index: int | slice) -> "Recording | Trials":
+        return Trials(self.recordings[index]) if isinstance(index, slice) else self.recordings[index]
+
+    @property
+    def name(self) -> str:
+        """What the names of the recordings have in common, or how many there are."""
+        names = [recording.name for recording in self.recordings]
+        if len(names) == 1:
+            return names[0]
+        same = itertools.takewhile(lambda letters: len(set(letters)) == 1, zip(*names, strict=False))
+        return "".join(letters[0] for letters in same).rstrip("_- .0123456789") or f"{len(names)} trials"
+
+    def steady(self, window: Sequence[float | int] | None = None) -> "Trials":
+        """Every recording with its steady part as window, see `Recording.steady`."""
+        return Trials(recording.steady(window) for recording in self.recordings)
+
+    def target(
+        self,
+        name: str | None = None,
+        *,
+        quantity: str | None = None,
+        provenance: str = "measured",
+        mvc: float | int | None = None,
+        settings: SpectrumSettings | None = None,
+    ) -> Target:
+        """One target: the trials' absolute spectra averaged, weighted with their Welch segments, which add up.
+
+            p_k ∝ Σ_i K_i P_ik / Σ_i K_i
+
+        It states segments, mean and, for a force or torque, the coefficient of variation of every trial; and keeps the
+        trials' spectra, whose scatter gives the dispersion (`Target.dispersion`).
+
+        **Arguments:** `name`, or what the trials' names have in common; `quantity`, or that of the unit; `provenance`; `mvc`
+        [`unit`], the maximal voluntary contraction, for the level (recordings in % MVC need none); `settings`, by default
+        those of `Recording.spectrum`.
+
+        **Raises:** `ValueError` if the unit (V, a.u.) does not say what was measured, and as `Recording.spectrum` does.
+        """
+        settings = RECORDED if settings is None else settings
+        return pooled_target(self.recordings, self.name if name is None else name, quantity, provenance, mvc, settings)
+
+    def __str__(self) -> str:
+        head = f"{self.name}: {len(self)} recordings [{self.recordings[0].unit}]"
+        rows = [f"  {r.name}: {r.window_in_words}, mean {np.mean(r.samples):.4g} {r.unit}" for r in self.recordings]
+        return folded([head, *rows])
+
+    def __repr__(self) -> str:
+        return f"Trials({len(self)} recordings, {self.name!r})"
+
+
+def load_recordings(
+    paths: "Iterable[str | os.PathLike[str]] | str | os.PathLike[str]", *, columns: Iterable[str | int] | None = None,
+    **options: Any,
+) -> Trials:  # fmt: skip
+    """Load the trials of one person in one condition.
+
+        target = jm.load_recordings(["trial1.csv", "trial2.csv"]).steady().target("anna")
+
+    **Arguments:** `paths`, several files, or one file that has a column for each trial; `columns`, which of that file's
+    columns are trials (all but the time by default); `options` as in `load_recording`, the same for all files.
+
+    **Returns:** `Trials`, in the order given. **Raises:** `ValueError` as `load_recording` does, and for different units.
+    """
+    if isinstance(paths, str | os.PathLike):
+        return Trials(load_columns(paths, columns, **options))
+    files = list(paths)
+    if columns is not None:
+        raise ValueError("columns: these are for one file that holds all trials; give its path alone, as a text")
+    return Trials(load_recording(path, **options) for path in files)
