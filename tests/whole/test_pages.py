@@ -42,9 +42,9 @@ def in_a_folder_of_its_own(tmp_path, monkeypatch):
     plt.close("all")
 
 
-def write_recording(path):
+def write_recording(path, key=5):
     """A trial as a force sensor writes it: 2048 Hz, rest, ramp, hold of a known task, release."""
-    run = jm.simulate(jm.settled(TRUTH), jax.random.key(5), duration=40.0, rate=1000.0)
+    run = jm.simulate(jm.settled(TRUTH), jax.random.key(key), duration=40.0, rate=1000.0)
     held = np.interp(np.arange(40 * 2048) / 2048, run.time, np.asarray(run.output, dtype=float))
     level = held.mean()
     force = np.concatenate([np.zeros(4096), level * np.linspace(0, 1, 4096), held, level * np.linspace(1, 0, 2048)])
@@ -86,7 +86,8 @@ def readme(once, tmp_path_factory):
     """What the README leaves behind."""
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(tmp_path_factory.mktemp("readme"))
-        write_recording("trial.csv")
+        for number, name in enumerate(("trial.csv", "trial1.csv", "trial2.csv", "trial3.csv")):
+        write_recording(name, 5 + number)
         for seed, name in enumerate("abc"):
             write_spectrum(f"{name}.csv", seed)
         with contextlib.redirect_stdout(io.StringIO()) as printed:

@@ -75,6 +75,8 @@ def dispersion_of(
     centre = (np.eye(len(sd)) - 1 / len(sd)) / sd[:, None]
     a = centre @ (sd[:, None] * law.correlation * sd) @ centre.T
     each = s**2 * np.sum(((ratio / size[:, None] - 1) @ centre.T) ** 2, axis=1)
+    if not np.any(each > 0):  # the same trial twice
+        return 0.0, 0.0
     expected = counts.sum() * np.trace(a) * np.sum(s**2 * ((1 - 2 * s) / counts + np.sum(s**2 / counts)))
     value = np.sqrt(np.sum(each) / expected * counts.sum() * np.sum(s**2 / counts))
     effective = max(1 / np.sum(s**2) - 1, 0.5)
