@@ -39,7 +39,7 @@ class Target(eqx.Module):
     - `sigma`: standard deviation of p_k, scaled together with it.
     - `segments`: Welch segments K of each trial averaged.
     - `coefficient_of_variation`: standard deviation over mean of each trial, a fraction; of the force as the spectrum sees
-      it, low-passed as `settings` say.
+      it, low-passed as `settings` say. An acceleration has none, since its mean is zero.
     - `mvc_fraction`: mean level as a fraction of the maximum voluntary contraction.
     - `settings`: how the spectrum was estimated, and thus how the model's is.
     - `notices`: what was done to the numbers, in sentences.
@@ -85,6 +85,8 @@ class Target(eqx.Module):
         self.provenance = check.metadata("provenance", provenance)
         self.segments = check.metadata("segments", segments)
         self.coefficient_of_variation = check.metadata("coefficient_of_variation", coefficient_of_variation)
+        if self.quantity == "acceleration" and coefficient_of_variation is not None:
+            raise TargetError("coefficient_of_variation: the mean of an acceleration is zero; leave it out")
         self.mvc_fraction = check.metadata("mvc_fraction", mvc_fraction)
         self.reason = check.metadata("reason", reason)
         self.settings = settings
