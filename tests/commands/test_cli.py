@@ -173,6 +173,15 @@ def test_the_nearest_preset_is_named(tmp_path):
         assert result.exit_code == 2 and f"did you mean '{name}'" in result.stderr
 
 
+@pytest.mark.slow
+def test_what_is_observed_of_a_motion(tmp_path):
+    arguments = ["simulate", "zagrodny-slifkin", "--observe", "acceleration", "--seeds", 4, "--out", tmp_path]
+    refused = run(*arguments)
+    assert refused.exit_code == 2 and "has no motion; add --task prescribed-force" in refused.stderr
+    outcome = run(*arguments, "--task", "prescribed-force")
+    assert outcome.exit_code == 0 and "a_z: mean" in outcome.stdout and "m/s^2, standard deviation" in outcome.stdout
+
+
 # --- listings
 
 

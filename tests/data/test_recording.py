@@ -8,6 +8,7 @@ import scipy.signal
 from matplotlib.figure import Figure
 
 from jaxmuscle.data._recording import LOWEST_RATE, UNITS, Recording, known_unit
+from jaxmuscle.data._target import Target
 from jaxmuscle.spectra._measures import peaks
 from jaxmuscle.spectra._settings import SpectrumSettings
 
@@ -186,6 +187,20 @@ def test_quantity_follows_the_unit(unit, quantity):
     target = Recording(noisy(rate=200), 200, unit=unit).target()
     assert target.quantity == quantity
     assert (target.coefficient_of_variation is None) == (quantity == "displacement")
+
+
+@pytest.mark.parametrize("unit", ["m/s^2", "m/s²", "(m/s2)", "mm/s^2", "g", "mg"])
+def test_an_acceleration_is_steady_and_has_no_variation(unit):
+    """About zero, or about a part of gravity, which an accelerometer reads too."""
+    for level in (0.0, 9.81):
+        recording = Recording(noisy(level=level, rate=200), 200, unit=unit)
+        part = recording.steady()
+        assert part.window == (0.0, 20.0) and recording.quantity == "acceleration"
+        target = part.target()
+        assert (target.quantity, target.coefficient_of_variation) == ("acceleration", None)
+        assert ("none, the mean is near zero" in str(part.summary())) == (level == 0.0)
+    with pytest.raises(ValueError, match="the mean of an acceleration is zero; leave it out"):
+        Target("x", target.proportional_power, quantity="acceleration", coefficient_of_variation=0.01)
 
 
 def test_level_of_a_recording_in_percent():

@@ -447,6 +447,20 @@ def test_the_task_follows_from_the_quantity():
     assert isinstance(jm.task_for(simple_target(quantity="torque")), jm.Isometric)
     moved = jm.task_for(simple_target(quantity="displacement"), noise="ornstein-uhlenbeck")
     assert isinstance(moved, jm.PrescribedForce) and isinstance(moved.noise, jm.OrnsteinUhlenbeckNoise)
+    felt = simple_target(quantity="acceleration")
+    assert moved.quantity == "displacement" and jm.task_for(felt).quantity == "acceleration"
+    assert jm.task_for(felt, jm.PrescribedForce).quantity == "acceleration"
+    assert isinstance(jm.task_for(felt, jm.PrescribedMotion), jm.PrescribedMotion)
+
+
+def test_an_acceleration_is_fitted_as_one():
+    felt, free = simple_target(quantity="acceleration"), ("c_w",)
+    with pytest.raises(ValueError, match="target 'hump' is an acceleration, but its task PrescribedForce gives x_z in m"):
+        jm.fit(jm.PrescribedForce(), felt, free=free)
+    with pytest.raises(ValueError, match="target 'hump' is a force, but its task PrescribedForce gives a_z in m/s"):
+        jm.fit(jm.task_for(felt), simple_target(), free=free)
+    with pytest.raises(ValueError, match="the mean of an acceleration is zero; leave it out"):
+        jm.fit(jm.task_for(felt), felt, free=free, mean_force=(1.0, 0.1))
 
 
 def test_white_noise_works_where_the_output_does_not_contain_it():

@@ -46,6 +46,50 @@ def test_white_noise_in_the_output_is_refused_by_default():
     jm.PrescribedForce(noise=jm.WhiteNoise())
 
 
+def test_the_acceleration_contains_the_noise_of_the_passive_tissue():
+    """White noise on K_z and C_z has no value at an instant; that on K_w, C_w and the drive is smoothed on its way."""
+    for channel in ("K_z", "C_z"):
+        with pytest.raises(ValueError, match=rf"WhiteNoise on {channel} .* directly in the output a_z.*BandLimited"):
+            jm.PrescribedForce(noise=jm.WhiteNoise({channel: 0.01}), observe="acceleration")
+        jm.PrescribedForce(noise=jm.OrnsteinUhlenbeckNoise({channel: 0.01}), observe="acceleration")
+    jm.PrescribedForce(noise=jm.WhiteNoise((0.01, 0.0, 0.01, 0.0, 0.01)), observe="acceleration")
+
+
+def test_what_is_observed_of_a_motion():
+    moved, felt = jm.PrescribedForce(), jm.PrescribedForce(observe="acceleration")
+    assert (moved.output_name, moved.output_unit, moved.quantity) == ("x_z", "m", "displacement")
+    assert (felt.output_name, felt.output_unit, felt.quantity) == ("a_z", "m/s^2", "acceleration")
+    assert jm.Isometric().quantity == jm.PrescribedMotion().quantity == "force"
+    assert felt.replace(k_w=4e5).observe == "acceleration"
+    assert felt.with_parts(observe="displacement") == moved
+    assert jm.Isometric().as_task(jm.PrescribedForce, observe="acceleration").quantity == "acceleration"
+    # Here jaxtyping's check of the type is first.
+    with pytest.raises((ValueError, TypeError), match="'velocity'"):
+        jm.PrescribedForce(observe="velocity")  # pyright: ignore[reportArgumentType]
+
+
+def test_the_acceleration_is_equation_1b(x64):
+    task = jm.PrescribedForce(5.0, SmoothStep(6.0, 0.3, 1.2), observe="acceleration").replace(m_z=0.7, c_z=8.0)
+    p = {name: float(value) for name, value in task.parameters.items()}
+    rng = np.random.default_rng(5)
+    for t in (0.1, 0.8, 3.0):
+        y, u = rng.normal(size=4) * [0.03, 0.5, 0.03, 0.5], rng.normal(size=5) * [20, 20, 5, 1, 0.1]
+        _, expected = references.accelerations(p, y, 0.0, references.smooth_step(t, 6.0, 0.3, 1.2), u)
+        np.testing.assert_allclose(task.output(t, jnp.asarray(y), jnp.asarray(u), jnp.ones(5)), expected, rtol=1e-12)
+
+
+def test_what_is_observed_is_saved(tmp_path):
+    task = jm.PrescribedForce(5.0, 1.0, observe="acceleration")
+    jm.save_preset(tmp_path / "task.toml", task)
+    assert jm.load_preset(tmp_path / "task.toml") == task
+    text = (tmp_path / "task.toml").read_text()
+    (tmp_path / "old.toml").write_text(text.replace('observe = "acceleration"', ""))
+    assert getattr(jm.load_preset(tmp_path / "old.toml"), "observe") == "displacement"  # noqa: B009
+    (tmp_path / "wrong.toml").write_text(text.replace('observe = "acceleration"', 'observe = "velocity"'))
+    with pytest.raises(jm.errors.PresetError, match=r"wrong.toml: (.|\n)*'velocity'"):
+        jm.load_preset(tmp_path / "wrong.toml")
+
+
 def test_motion_needs_damping_of_the_passive_tissue():
     for values in ({"c_z": 0.0}, {"v_ref_z": 0.0}):
         with pytest.raises(ValueError, match="C_z0 = c_z v_ref_z\\^2 = 0: in PrescribedMotion"):

@@ -201,6 +201,8 @@ def test_trajectory_of_an_ensemble_in_a_window():
 def test_trajectory_of_a_displacement():
     ax = plot.trajectory(trajectories((), PrescribedForce()))
     assert ax.get_ylabel() == r"Displacement $x_\mathrm{z}$ (m)"
+    ax = plot.trajectory(trajectories((), PrescribedForce(observe="acceleration")))
+    assert ax.get_ylabel() == r"Acceleration $a_\mathrm{z}$ (m/s²)"
 
 
 def test_simulation_shows_run_window_and_spectra():

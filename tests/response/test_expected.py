@@ -17,7 +17,8 @@ from jaxmuscle._common.arrays import as_arrays
 from jaxmuscle.model import Constant, Decay, RampHold
 from jaxmuscle.objective._problem import target_variation
 from jaxmuscle.response._expected import _Autocovariance, covariance_operator, expected_moments
-from jaxmuscle.response._linearised import has_response
+from jaxmuscle.response._linearised import has_response, linearised
+from jaxmuscle.response._transfer import system_of, transfer
 
 KEY = jax.random.key(31)
 WINDOW, SHIFTED = (5.0, 15.0), (2.7, 12.7)
@@ -70,7 +71,13 @@ def prescribed_motion(p, s):
     return x + 0 * s, along * (p["m_w"] * s**2 + C_w * s + K_w), 0 * s, active(p, x) + p["F_ext"]
 
 
-RESPONSES = {"Isometric": isometric, "PrescribedForce": prescribed_force, "PrescribedMotion": prescribed_motion}
+def acceleration(p, s):
+    """Responses of x_z'': s² those of x_z."""
+    *moved, _ = prescribed_force(p, s)
+    return *(s**2 * H for H in moved), 0.0
+
+
+RESPONSES = {"F_ext": isometric, "x_z": prescribed_force, "a_z": acceleration, "P_w": prescribed_motion}
 
 
 def stiffness(p):
@@ -80,7 +87,7 @@ def stiffness(p):
 def replies(task, p, f):
     """Of the output to a relative change of K_w, K_z, C_w, C_z and P_w; at rest damping does nothing."""
     s = 2j * np.pi * f
-    H_w, H_z, H_P, _ = RESPONSES[type(task).__name__](p, s)
+    H_w, H_z, H_P, _ = RESPONSES[task.output_name](p, s)
     (K_w, K_z), twitch = stiffness(p), 1 / (1 + s * p.get("activation_time", 0.0)) ** 2
     return np.stack([K_w * H_w * twitch, K_z * H_z, 0 * s, 0 * s, p.get("P_w", 0.0) * H_P * twitch])
 
@@ -190,7 +197,7 @@ def by_quadrature(task, settings, window, points=4096):
     turn = np.exp(2j * np.pi * f / settings.rate)
     mean = np.where(f == 0, samples, (turn**samples - 1) / np.where(f == 0, 1, turn - 1)) / samples
     variance = np.sum(S * (1 - np.abs(mean) ** 2)) * settings.rate / points
-    return noise, line, RESPONSES[type(task).__name__](p, np.zeros(1))[-1], variance + swing
+    return noise, line, RESPONSES[task.output_name](p, np.zeros(1))[-1], variance + swing
 
 
 BOTH = {"K_w": 0.15, "K_z": 0.05}
@@ -232,12 +239,31 @@ def test_closed_form_is_the_quadrature_of_the_transfer_functions(x64, name):
     assert_as_by_quadrature(kind(*INPUTS[kind], noise=noise, harmonic=RHYTHM), settings, window)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("sampling", ["instant", "average"])
+def test_acceleration_in_closed_form_is_the_quadrature(x64, sampling):
+    """Of noise on all that moves it: band-limited, resonant on the drive, the active part slowed."""
+    noise = jm.BandLimitedNoise((0.15, 0.05, 0.0, 0.0, 0.02)) + jm.ResonantNoise(0.05)
+    task = jm.PrescribedForce(5.0, 1.0, noise=noise, harmonic=RHYTHM, activation=jm.Activation(0.06), observe="acceleration")
+    assert_as_by_quadrature(task, Settings(sampling=sampling), WINDOW)
+
+
+@pytest.mark.parametrize("f", [0.4, 3.0, 11.0, 60.0])
+def test_the_transfer_function_of_acceleration_is_that_of_displacement_twice_differentiated(x64, f):
+    moved, felt = (jm.PrescribedForce(5.0, 1.0, observe=what) for what in ("displacement", "acceleration"))
+    omega = jnp.asarray(2 * np.pi * f)
+    for base in np.eye(5)[[0, 1, 4]]:
+        x, a = (transfer(system_of(task, linearised(task).system, jnp.asarray(base)), omega) for task in (moved, felt))
+        np.testing.assert_allclose(a, -(omega**2) * x, rtol=1e-11)
+
+
 def assert_as_by_quadrature(task, settings, window):
     moments, _ = expected_moments(as_arrays(task), settings, window)
     noise, line, mean, variance = by_quadrature(task, settings, window)
     np.testing.assert_allclose(moments.power, noise + line, rtol=ALIASES)
     np.testing.assert_allclose(moments.line, line, rtol=1e-8, atol=1e-12 * line.max())  # rounding, of the peak far from it
-    np.testing.assert_allclose(moments.mean, mean, rtol=1e-10)
+    # The mean of an acceleration is the rounding of forces of a few newtons.
+    np.testing.assert_allclose(moments.mean, mean, rtol=1e-10, atol=1e-12 if task.quantity == "acceleration" else 0.0)
     np.testing.assert_allclose(moments.variance, variance, rtol=ALIASES)
     np.testing.assert_array_equal(jm.expected_spectrum(task, settings, window).power, moments.power)
 
@@ -365,6 +391,7 @@ def test_settled_tasks_rest(x64):
 DIFFERENTIATED = {
     "isometric": jm.Isometric(5.0, 0.003, noise=jm.OrnsteinUhlenbeckNoise(0.05)),
     "force": jm.PrescribedForce(5.0, 1.0, noise=jm.WhiteNoise(0.05)),
+    "acceleration": jm.PrescribedForce(5.0, 1.0, noise=jm.OrnsteinUhlenbeckNoise(0.05), observe="acceleration"),
     "motion": jm.PrescribedMotion(0.004, 5.0),
     "all": jm.Isometric(
         5.0,
@@ -375,7 +402,8 @@ DIFFERENTIATED = {
 }
 # At rest nothing moves: noise on damping has no first-order effect, nor has the mass of an insertion that is held.
 SILENT = {"noise_C_w", "noise_C_z"}
-SILENT_IN = {"isometric": SILENT | {"m_z"}, "force": SILENT, "motion": SILENT | {"m_z"}, "all": SILENT | {"m_z"}}
+SILENT_IN = {"isometric": SILENT | {"m_z"}, "force": SILENT, "acceleration": SILENT, "motion": SILENT | {"m_z"},
+             "all": SILENT | {"m_z"}}  # fmt: skip
 
 
 @pytest.mark.slow

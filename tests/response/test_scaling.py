@@ -310,5 +310,9 @@ def test_carrying_back_is_the_task_and_a_displacement_cannot_be_carried(x64):
     assert_same(jm.at_force(there, float(moments(task).mean)), task)
     with pytest.raises(ValueError, match="the output of PrescribedForce is x_z in m, not a force"):
         jm.at_force(TASKS["prescribed-force"], 10.0)
+    felt = TASKS["prescribed-force"].with_parts(observe="acceleration")
+    for move in (lambda: at_level(felt, 0.5), lambda: scaled(felt, 2.0)):
+        with pytest.raises(ValueError, match=r"an acceleration has no coefficient of variation, .* observe='displacement'"):
+            move()
     with pytest.raises(ValueError, match="give one of the same sign"):
         jm.at_force(task, -3.0)

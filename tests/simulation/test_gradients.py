@@ -12,6 +12,9 @@ SETTINGS = jm.SpectrumSettings(first_bin=2, last_bin=13)
 TASKS = {
     "motion": jm.PrescribedMotion(0.004, 5.0, settings=SETTINGS),
     "force": jm.PrescribedForce(5.0, 1.0, noise=jm.WhiteNoise(0.05), settings=SETTINGS),
+    "acceleration": jm.PrescribedForce(
+        5.0, 1.0, noise=jm.OrnsteinUhlenbeckNoise(0.05), settings=SETTINGS, observe="acceleration"
+    ),
     "isometric": jm.Isometric(5.0, 0.003, noise=jm.OrnsteinUhlenbeckNoise(0.05), settings=SETTINGS),
     "all": jm.Isometric(
         5.0,
@@ -22,7 +25,7 @@ TASKS = {
     ),
 }
 SUBSTEPS = {"isometric": 2}
-WITHOUT_INFLUENCE = {"motion": (), "force": (), "isometric": ("m_z",), "all": ("m_z",)}
+WITHOUT_INFLUENCE = {"motion": (), "force": (), "acceleration": (), "isometric": ("m_z",), "all": ("m_z",)}
 
 
 @pytest.mark.slow

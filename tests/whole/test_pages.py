@@ -52,6 +52,14 @@ def write_recording(path, key=5):
     Path(path).write_text("time,force\n" + rows, encoding="utf-8")
 
 
+def write_tremor(path):
+    """What an accelerometer writes: 1000 Hz, in g, with gravity."""
+    task = jm.settled(jm.PrescribedForce(observe="acceleration"))
+    run = jm.simulate(task, jax.random.key(6), duration=30.0, rate=1000.0)
+    rows = "".join(f"{t:.3f},{a / 9.81 + 0.5:.8f}\n" for t, a in zip(run.time, np.asarray(run.output), strict=True))
+    Path(path).write_text("time,acc\n" + rows, encoding="utf-8")
+
+
 def write_spectrum(path, seed=0, task=None):
     """Twelve Welch segments of a known task."""
     expected = np.asarray(jm.expected_spectrum(TRUTH if task is None else task).proportional)
@@ -161,7 +169,10 @@ def test_own_data():
     write_spectrum("mine.csv")
     assert pages.run("docs/fit-a-csv.md")["target"].segments == (6,) * 10
     write_recording("trial.csv")
-    assert pages.run("docs/recordings.md")["result"].success
+    write_tremor("tremor.csv")
+    quick = {"jm.task_for(tremor), tremor": "jm.task_for(tremor), tremor, rungs=0, starts=8, seeds=0, check_seeds=0"}
+    names = pages.run("docs/recordings.md", {}, quick)
+    assert names["result"].success and names["moving"].task.quantity == "acceleration"
     assert Path("trial.png").exists()
 
 

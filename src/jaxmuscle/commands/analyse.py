@@ -18,7 +18,7 @@ def analyse(
     path: Annotated[str, typer.Argument(metavar="RECORDING", help="CSV, TSV, .mat, .npy, .npz or .c3d file.")],
     column: Annotated[str | None, typer.Option(metavar="NAME", help="Column, point, or Data:74 (counted from 0).")] = None,
     rate: Annotated[float | None, typer.Option(metavar="HZ", help="Sampling rate, if the file does not state it.")] = None,
-    units: Annotated[str | None, typer.Option(metavar="U", help="N, Nm, m, mm, % MVC, ...; by default the file's.")] = None,
+    units: Annotated[str | None, typer.Option(metavar="U", help="N, Nm, mm, m/s^2, % MVC; by default the file's.")] = None,
     axis: Annotated[str | None, typer.Option(help="Of a point: x, y, z or principal.")] = None,
     reference: Annotated[str | None, typer.Option(metavar="NAME", help="Column or point to subtract.")] = None,
     window: Annotated[

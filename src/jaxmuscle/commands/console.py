@@ -14,7 +14,7 @@ from rich.console import Console
 
 import jaxmuscle as jm
 
-from .options import TaskName
+from .options import Observed, TaskName
 
 if TYPE_CHECKING:
     from jaxmuscle.fits import FitResult
@@ -26,10 +26,16 @@ out = Console(soft_wrap=False)
 err = Console(stderr=True, soft_wrap=not sys.stderr.isatty())  # a message is one line of a log
 
 
-def task_of(preset: str, task: TaskName | None) -> Any:
-    """The task of a preset, its muscle put into another task if one is named."""
+def task_of(preset: str, task: TaskName | None, observe: Observed | None = None) -> Any:
+    """The task of a preset, its muscle put into another task if one is named; what it observes, if that is."""
     model = jm.load_preset(preset)
-    return model if task is None or type(model) is jm.model.TASKS[task] else model.as_task(jm.model.TASKS[task])
+    if task is not None and type(model) is not jm.model.TASKS[task]:
+        model = model.as_task(jm.model.TASKS[task])
+    if observe is None:
+        return model
+    if not isinstance(model, jm.PrescribedForce):
+        raise ValueError(f"--observe {observe}: {type(model).__name__} has no motion; add --task prescribed-force")
+    return model.with_parts(observe=str(observe))
 
 
 def aim_of(name: str, task: TaskName | None, read: dict[str, Any]) -> tuple[Any, Any]:
@@ -37,7 +43,7 @@ def aim_of(name: str, task: TaskName | None, read: dict[str, Any]) -> tuple[Any,
     target = jm.load_target(name, **read)
     for notice in target.notices:
         err.print(f"[yellow]notice:[/] {plain(notice)}", highlight=False)
-    return target, jm.task_for(target) if task is None else jm.model.TASKS[task](settings=target.settings)
+    return target, jm.task_for(target, None if task is None else jm.model.TASKS[task])
 
 
 @contextlib.contextmanager

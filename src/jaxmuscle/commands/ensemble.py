@@ -15,7 +15,7 @@ import jaxmuscle as jm
 from jaxmuscle._common.progress import told
 
 from .console import NOT_CONVERGED, err, out, reporting, task_of
-from .options import OtherTask, Preset, Seed
+from .options import Observe, OtherTask, Preset, Seed
 
 if TYPE_CHECKING:
     from jaxmuscle.ensembles import Pace
@@ -36,6 +36,7 @@ def ensemble(
     seeds: Annotated[int, typer.Option(help="Noise paths.")],
     output: Annotated[Path, typer.Option("--out", metavar="FILE.zarr", help="The store.")],
     task: OtherTask = None,
+    observe: Observe = None,
     seed: Seed = 0,
     vary: Annotated[
         list[str] | None, typer.Option(metavar="NAME=VALUES", help="Sweep: k_w=4e5,5e5; several make a grid.")
@@ -73,7 +74,7 @@ def ensemble(
         if jm.ensembles.launched() or any(given is not None for given in (coordinator, processes, process_id)):
             jm.ensembles.join(coordinator, processes, process_id)
         keep_compiled_programs()
-        model = task_of(preset, task)
+        model = task_of(preset, task, observe)
         settings = {"duration": duration, "dt": dt, "chunk": chunk, "resume": resume, "states": states}
         if not run(model, swept(model, vary or []), seeds, seed, output, settings, reduce=reduce, as_json=as_json):
             raise typer.Exit(NOT_CONVERGED)

@@ -36,10 +36,16 @@ class TaskName(StrEnum):
     force = "prescribed-force"
 
 
+class Observed(StrEnum):
+    displacement = "displacement"
+    acceleration = "acceleration"
+
+
 Output = Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for the results.")]
 Seed = Annotated[int, typer.Option(help="Seed of all random numbers.")]
 Preset = Annotated[str, typer.Argument(help="Bundled preset (see `jaxmuscle presets`), preset file or fit.json.")]
 OtherTask = Annotated[TaskName | None, typer.Option(help="Put the same muscle into another task.")]
+Observe = Annotated[Observed | None, typer.Option(help="What is observed of the motion in prescribed-force.")]
 TargetTask = Annotated[TaskName | None, typer.Option(help="Default: follows from what the target measured.")]
 Noise = Annotated[
     NoiseName | None, typer.Option(help="Colour of the noise (band-limited); if it is given, no richer model is tried.")
@@ -47,7 +53,7 @@ Noise = Annotated[
 Free = Annotated[str | None, typer.Option(metavar="NAMES", help="Comma-separated; replaces the default set.")]
 Fix = Annotated[list[str] | None, typer.Option(metavar="NAME=VALUE", help="Set a parameter and keep it; repeatable.")]
 Segments = Annotated[int | None, typer.Option(min=1, help="Welch segments behind the target.")]
-Quantity = Annotated[str | None, typer.Option(help="force, torque or displacement.")]
+Quantity = Annotated[str | None, typer.Option(help="force, torque, displacement or acceleration.")]
 
 
 def names_in(free: str | None) -> list[str] | None:

@@ -8,7 +8,7 @@ import typer
 import jaxmuscle as jm
 
 from .console import csv_text, out, reporting, save_figure, task_of, writable
-from .options import OtherTask, Output, Preset, Seed
+from .options import Observe, OtherTask, Output, Preset, Seed
 
 if TYPE_CHECKING:
     from jaxmuscle.model import AbstractTask
@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 def simulate(
     preset: Preset,
     task: OtherTask = None,
+    observe: Observe = None,
     seeds: Annotated[int, typer.Option(min=1, help="Noise paths.")] = 50,
     seed: Seed = 0,
     output: Output = Path("out"),
@@ -29,13 +30,13 @@ def simulate(
 
         jaxmuscle simulate zagrodny-slifkin --seeds 200 --out out/simulate
 
-        jaxmuscle simulate out/fit/fit.json --task prescribed-force
+        jaxmuscle simulate out/fit/fit.json --task prescribed-force --observe acceleration
     """
     with reporting():
         from jaxmuscle._common.environment import keep_compiled_programs
 
         keep_compiled_programs()
-        model = task_of(preset, task)
+        model = task_of(preset, task, observe)
         writable(output)
         _simulate(model, seeds, seed, output)
 
@@ -60,10 +61,12 @@ def _simulate(model: "AbstractTask", seeds: int, seed: int, folder: Path) -> Non
     save_figure(jm.plot.simulation(runs), folder / "simulate.png")
     held = runs.filtered()
     found = jm.spectra.peaks(mean)
-    variation = 100 * np.mean(jm.spectra.coefficient_of_variation(held))
+    spread = f"coefficient of variation {100 * np.mean(jm.spectra.coefficient_of_variation(held)):.3g} %"
+    if model.quantity == "acceleration":  # about a mean of zero
+        spread = f"standard deviation {held.std():.3g} {model.output_unit}"
     out.print(f"{type(model).__name__}, {seeds} seeds of {runs.time[-1]:g} s", highlight=False)
     level = f"{held.mean():.4g} {model.output_unit}"
-    out.print(f"{model.output_name}: mean {level}, coefficient of variation {variation:.3g} %", highlight=False)
+    out.print(f"{model.output_name}: mean {level}, {spread}", highlight=False)
     locals_ = ", ".join(f"{p.frequency:.3f}" for p in found.local_maxima) or "none"
     out.print(f"Spectrum: maximum at {found.maximum.frequency:.3f} Hz, local maxima at {locals_} Hz", highlight=False)
     out.print(f"Written: {folder}/trajectories.nc, spectrum.csv, simulate.png", highlight=False)

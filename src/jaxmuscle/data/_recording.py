@@ -1,4 +1,4 @@
-"""Recordings: a force, torque or displacement that was measured, its steady part, its spectra, and the target it gives."""
+"""Recordings: what was measured (force, torque, motion), its steady part, its spectra, and the target it gives."""
 
 import math
 from collections.abc import Iterable, Sequence
@@ -27,16 +27,16 @@ LOWEST_RATE = 24.0  # Hz; half of it lies above bin 30
 SEGMENTS = 2  # a steady part holds at least this many
 UNITS: dict[str, Quantity | None] = {
     "N": "force", "mN": "force", "kN": "force", "% MVC": "force", "N m": "torque", "N cm": "torque", "N mm": "torque",
-    "m": "displacement", "cm": "displacement", "mm": "displacement", "um": "displacement", "V": None, "mV": None,
-    "a.u.": None,
+    "m": "displacement", "cm": "displacement", "mm": "displacement", "um": "displacement", "m/s^2": "acceleration",
+    "mm/s^2": "acceleration", "g": "acceleration", "mg": "acceleration", "V": None, "mV": None, "a.u.": None,
 }  # fmt: skip
 _SPELLINGS = {"nm": "N m", "ncm": "N cm", "nmm": "N mm", "%mvc": "% MVC", "%": "% MVC", "µm": "um", "au": "a.u."}
 
 
 def known_unit(unit: str) -> str | None:
-    """The unit as `UNITS` writes it (`Nm`, `N·m` and `N*m` are `N m`), or `None` if it is not there."""
-    bare = "".join(unit.replace("μ", "µ").translate(str.maketrans("", "", "·*.()[]")).split())
-    exact = {"".join(name.replace(".", "").split()): name for name in UNITS}
+    """The unit as `UNITS` writes it (`Nm`, `N·m`, `N*m` are `N m`; `m/s²`, `m/s2` are `m/s^2`), or `None` if not there."""
+    bare = "".join(unit.replace("μ", "µ").replace("²", "2").translate(str.maketrans("", "", "·*.^()[]")).split())
+    exact = {"".join(name.replace(".", "").replace("^", "").split()): name for name in UNITS}
     return exact.get(bare) or _SPELLINGS.get(bare.casefold())
 
 
@@ -47,7 +47,8 @@ class Recording(eqx.Module):
 
     - `samples`: the signal [`unit`], shape `(times,)`.
     - `rate`: samples per second [Hz], at least 24, so that bin 30 lies below half of it.
-    - `unit`: N, mN, kN, % MVC (force); N m, N cm, N mm (torque); m, cm, mm, um (displacement); V, mV, a.u.
+    - `unit`: N, mN, kN, % MVC (force); N m, N cm, N mm (torque); m, cm, mm, um (displacement); m/s^2, mm/s^2,
+      g, mg (acceleration; g is 9.81 m/s^2); V, mV, a.u.
     - `name`, `source`: how reports call it and where it comes from.
     - `start`: time of the first sample [s]; other than 0 if the file begins with a gap.
     - `window`: (start, stop) [s] of the part that is analysed, or all of it.
@@ -131,7 +132,7 @@ class Recording(eqx.Module):
 
     @property
     def quantity(self) -> Quantity | None:
-        """What the unit measures: force, torque, displacement, or `None` (V, a.u.)."""
+        """What the unit measures: force, torque, displacement, acceleration, or `None` (V, a.u.)."""
         return UNITS[self.unit]
 
     def resampled(self, rate: float | int = 100.0) -> "Recording":
@@ -157,7 +158,7 @@ class Recording(eqx.Module):
         The plateau is the longest stretch in which the running median over 1 s stays within a tenth of its level,
         which is the median of what lies more than half-way between rest and extreme. It has to hold at least half of
         the time spent beyond half-way; one second is taken off at the ramps. Without a ramp (running median within
-        a fifth of its largest value) all of it is steady.
+        a fifth of its largest value) all of it is steady. So is an acceleration, which holds no level.
 
         **Arguments:** `window` (start, stop) [s], in the recording's own time.
 
@@ -166,7 +167,8 @@ class Recording(eqx.Module):
         notices = self.notices
         if window is None:
             even = self.resampled(RECORDED.rate)
-            found = plateau(even.whole, even.rate)
+            level = self.quantity != "acceleration"
+            found = plateau(even.whole, even.rate) if level else (0, even.whole.size)
             if found is None:
                 raise ValueError(
                     f"{self.name}: no plateau found (no level that is held for half of the time spent above half of it, "

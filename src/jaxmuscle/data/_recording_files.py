@@ -45,7 +45,7 @@ def load_recording(
     reference: str | int | None = None,
     max_gap: float | int = 0.2,
 ) -> Recording:
-    """Load a force, torque or displacement from CSV or TSV text, MATLAB (.mat), NumPy (.npy, .npz) or C3D.
+    """Load a force, torque, displacement or acceleration from CSV or TSV text, MATLAB (.mat), NumPy (.npy, .npz) or C3D.
 
     Text: delimiter, header and decimal commas are detected, `#` starts a comment. A column called time, t, `time (ms)`
     ... gives the rate; it has to be even, and times count from its first row. MATLAB: variables by name, `trial.force`

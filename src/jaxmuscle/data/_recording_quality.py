@@ -33,12 +33,13 @@ class RecordingSummary(eqx.Module):
 
     def rows(self) -> list[tuple[str, str]]:
         """Name and value of every number, as tables print them."""
+        variation = self.coefficient_of_variation
         local = ", ".join(f"{peak.interpolated:.3f}" for peak in self.peaks.local_maxima) or "none"
         return [
             ("window", f"{self.duration:.2f} s, {self.segments} Welch segments"),
             ("mean", f"{self.mean:.4g} {self.unit}"),
             ("standard deviation", f"{self.standard_deviation:.4g} {self.unit}"),
-            ("coefficient of variation", f"{100 * self.coefficient_of_variation:.3g} %"),
+            ("coefficient of variation", f"{100 * variation:.3g} %" if variation < 10 else "none, the mean is near zero"),
             ("signal-to-noise ratio", f"{self.signal_to_noise:.4g}"),
             ("approximate entropy", f"{self.approximate_entropy:.4f}"),
             ("sample entropy", f"{self.sample_entropy:.4f}"),

@@ -43,7 +43,7 @@ class Target(eqx.Module):
     - `sigma`: standard deviation of p_k, scaled together with it.
     - `segments`: Welch segments K of each trial averaged.
     - `coefficient_of_variation`: standard deviation over mean of each trial, a fraction; of the force as the spectrum sees
-      it, low-passed as `settings` say.
+      it, low-passed as `settings` say. An acceleration has none, since its mean is zero.
     - `mvc_fraction`: mean level as a fraction of the maximum voluntary contraction.
     - `mean`, `unit`: mean force or torque of each trial, and in what. One in newtons fixes the scale of force in a fit.
     - `trial_power`: spectrum of each trial [unit²/Hz], shape `(trials, bins)`; `proportional_power` is their mean, weighted
@@ -102,6 +102,8 @@ class Target(eqx.Module):
         self.provenance = check.metadata("provenance", provenance)
         self.segments = check.metadata("segments", segments)
         self.coefficient_of_variation = check.metadata("coefficient_of_variation", coefficient_of_variation)
+        if self.quantity == "acceleration" and coefficient_of_variation is not None:
+            raise TargetError("coefficient_of_variation: the mean of an acceleration is zero; leave it out")
         self.mvc_fraction = check.metadata("mvc_fraction", mvc_fraction)
         self.mean, self.unit = check.metadata("mean", mean), check.metadata("unit", unit)
         self.reason = check.metadata("reason", reason)

@@ -12,7 +12,7 @@ from jaxmuscle._common.errors import TargetError
 from jaxmuscle._common.text import choices
 from jaxmuscle.spectra._settings import SpectrumSettings
 
-Quantity = Literal["force", "torque", "displacement"]
+Quantity = Literal["force", "torque", "displacement", "acceleration"]
 Provenance = Literal["measured", "digitised", "reconstructed", "user"]
 
 # In bins: frequencies rounded to two decimals still count as on the default grid,

@@ -14,6 +14,7 @@ from jaxtyping import Int
 from jaxmuscle._common.arrays import as_numbers
 from jaxmuscle._common.environment import versions
 from jaxmuscle._common.errors import SimulationError, StoreError
+from jaxmuscle._common.text import squared
 from jaxmuscle.model._parameters import PARAMETERS
 from jaxmuscle.response._expected import linear_spectrum
 from jaxmuscle.simulation._trajectory import run_attributes
@@ -238,7 +239,7 @@ def _variables(layout: Layout, *, states: bool) -> tuple[dict[str, Variable], li
         bins, frequency = _bins(layout), task.settings.frequency
         found["frequency"] = Variable(("frequency",), (bins,), (bins,), float, "Hz", frequency)
         found["power"] = Variable((*lead, "seed", "frequency"), (*shape, seeds, bins), (*cut, width, bins), dtype,
-                                  f"{task.output_unit}^2/Hz")  # fmt: skip
+                                  squared(task.output_unit) + "/Hz")  # fmt: skip
         coordinates.append("frequency")
     if isinstance(layout.task, Sweep):
         for name, values in layout.task.labels.items():

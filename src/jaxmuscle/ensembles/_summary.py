@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxmuscle import plot
-from jaxmuscle._common.text import folded, listed
+from jaxmuscle._common.text import folded, listed, squared
 from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.spectra._mean import SpectrumEstimate, from_moments
 from jaxmuscle.spectra._settings import SpectrumSettings
@@ -105,7 +105,7 @@ class EnsembleSummary(eqx.Module):
             "time": (("time",), self.time, "s"),
             "quantile": (("quantile",), np.array(self.levels), "1"),
             "mean": ((*lead, "time"), self.mean, unit),
-            "variance": ((*lead, "time"), self.variance, f"{unit}^2"),
+            "variance": ((*lead, "time"), self.variance, squared(unit)),
             "quantiles": ((*lead, "quantile", "time"), self.quantile, unit),
         }
         if self.spectra:
@@ -116,7 +116,7 @@ class EnsembleSummary(eqx.Module):
                 rows = [getattr(spectrum, name) for spectrum in self.spectra]
                 if rows[0] is not None:
                     values = np.stack(rows) if swept else rows[0]
-                    found[label] = ((*lead, "frequency"), values, f"{unit}^2/Hz")
+                    found[label] = ((*lead, "frequency"), values, squared(unit) + "/Hz")
         if isinstance(self.task, Sweep):
             found |= {name: (("point",), values, "") for name, values in self.task.labels.items()}
         return found
@@ -142,7 +142,7 @@ class EnsembleSummary(eqx.Module):
             f"ensemble: {type(self._first).__name__}, {self.seeds} seeds{where}, {self.time[-1]:g} s",
             f"  {self.message}",
         ]
-        if self.spectra and not swept:
+        if self.spectra and not swept and self._first.quantity != "acceleration":
             value, error = self.coefficient_of_variation
             lines.append(f"  coefficient of variation {100 * value:.4g} % +- {100 * error:.2g} %")
         return folded(lines)

@@ -212,8 +212,7 @@ def fit_cohort(
     with told(progress, f"fitting {len(loaded)} targets") as tell, jax.enable_x64(True):
         batches: dict[Any, dict[str, Plan]] = {}
         for name, target in loaded.items():
-            model = task_for(target) if task is None else task(settings=target.settings)
-            model = with_noise(model, noise, fix)
+            model = with_noise(task_for(target, task), noise, fix)
             try:
                 model, given = at_mean(on_rung(model, rung) if rung else model, target, options)
                 plan = planned(model, target, options_for(model, given))
@@ -250,4 +249,5 @@ def _alike(plan: Plan) -> Any:
     target, task = part.target, part.task
     length = round(2 * np.log2(trial_samples(target)))
     present = part.variation is not None, part.mean is not None
-    return type(task), type(task.noise), tuple(task.parameters.items()), target.settings, tuple(target.bins), present, length
+    kind = type(task), task.quantity, type(task.noise), tuple(task.parameters.items())
+    return *kind, target.settings, tuple(target.bins), present, length

@@ -17,6 +17,7 @@ from jaxmuscle.objective._arguments import (
     FitOptions,
     Plan,
     base_of,
+    check_quantity,
     check_shared,
     free_names,
     joint_names,
@@ -151,9 +152,7 @@ def _models(targets: dict[str, Target], tasks: Mapping[str, AbstractTask], noise
     found, fixed = {}, {t: {base_of(n): v for n, v in fix.items() if target_of(n) in ("", t)} for t in targets}
     for name, target in targets.items():
         task = tasks[name] if name in tasks else task_for(target)
-        if (target.quantity == "displacement") != (task.output_unit == "m"):
-            raise ValueError(f"target {name!r} is a {target.quantity}, but its task {type(task).__name__} gives "
-                             f"{task.output_name} in {task.output_unit}: give tasks={{{name!r}: ...}}")  # fmt: skip
+        check_quantity(task, target, name, f"give tasks={{{name!r}: ...}}")
         found[name] = with_noise(task.with_parts(settings=target.settings), noise, fixed[name])
     held = {name: _holders("fix", name, found) for name in fix}
     return {t: task.replace(**{base_of(n): fix[n] for n in fix if t in held[n]}) for t, task in found.items()}

@@ -93,7 +93,8 @@ class FittedPart(eqx.Module):
     def model(self) -> str:
         """Task and noise in words."""
         parts = [type(noise).__name__ for noise in self.task.noise.components]
-        return ", ".join([type(self.task).__name__, " + ".join(parts), *["activation"] * (self.task.activation is not None)])
+        kind = type(self.task).__name__ + " (acceleration)" * (self.task.quantity == "acceleration")
+        return ", ".join([kind, " + ".join(parts), *["activation"] * (self.task.activation is not None)])
 
     @property
     def remarks(self) -> tuple[str, ...]:

@@ -217,7 +217,8 @@ def correction_at(problem: FitProblem, part: Part, task: AbstractTask) -> Moment
         return None
     mean = jax.tree.map(lambda x: np.asarray(x).mean(axis=0), each)
     power = mean.power[part.chosen] / np.asarray(expected.power)[part.chosen]
-    found = power, np.ones(len(power)), mean.mean / expected.mean, mean.variance / expected.variance
+    level = np.ones(()) if task.quantity == "acceleration" else mean.mean / expected.mean  # the mean of one is zero
+    found = power, np.ones(len(power)), level, mean.variance / expected.variance
     resonant = tuple(np.ones(len(power)) for _ in expected.resonant)
     return (
         Moments(*found, np.ones(()), np.ones(()), resonant)

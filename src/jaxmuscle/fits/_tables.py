@@ -8,7 +8,7 @@ import numpy as np
 
 from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.objective._arguments import SAME, base_of
-from jaxmuscle.objective._consequences import DERIVED, unit_of
+from jaxmuscle.objective._consequences import derived_names, unit_of
 from jaxmuscle.objective._covariance import Identifiability, common_scales
 from jaxmuscle.objective._problem import FitProblem, Part
 
@@ -64,7 +64,7 @@ def derived_table(
     Their errors are those of the parameters and, where a value comes from fresh seeds, their sampling error.
     """
     table = {}
-    for name in (n for n in DERIVED if n in values):
+    for name in (n for n in derived_names(part.task) if n in values):
         g = np.asarray(slopes[name])
         free = bool(np.any(g != 0))
         determined = free and known.determines(g)

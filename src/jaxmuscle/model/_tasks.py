@@ -3,7 +3,7 @@
 import abc
 import dataclasses
 from collections.abc import Mapping
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal, get_args
 
 import equinox as eqx
 import jax
@@ -31,6 +31,7 @@ NOISES: dict[str, type[AbstractNoise]] = {
 }
 
 State = Float[Array, " states"]
+Observed = Literal["displacement", "acceleration"]
 
 
 class AbstractTask(eqx.Module):
@@ -87,6 +88,11 @@ class AbstractTask(eqx.Module):
     def common(self) -> dict[str, Any]:
         """What all tasks have: muscle, noise, harmonic, activation and spectrum settings."""
         return {n: getattr(self, n) for n in ("muscle", "noise", "harmonic", "activation", "settings")}
+
+    @property
+    def quantity(self) -> str:
+        """What the output is, by its unit: "force", "displacement" or "acceleration", as a `Target` calls it."""
+        return {"m": "displacement", "m/s^2": "acceleration"}.get(self.output_unit, "force")
 
     def with_input(self, name: str) -> "AbstractTask":
         """A copy with the activation (`activation_time`) or the drive's channel of the noise (`noise_P_w`) switched on."""
@@ -175,7 +181,8 @@ def _check_task(task: AbstractTask) -> None:
 
 def _check_noise(task: AbstractTask) -> None:
     """Refuse a noise that is rougher than the task can sample or differentiate, where its amplitude is not zero."""
-    what = {1: "appears directly in the output, where white noise has no value", 2: "must be differentiable in time"}
+    what = {1: f"appears directly in the output {task.output_name}, where white noise has no value",
+            2: "must be differentiable in time"}  # fmt: skip
     needed = (*task.smoothness_needed, 0)
     for noise in task.noise.components:
         if not is_concrete(noise.amplitude):
@@ -245,21 +252,44 @@ class PrescribedMotion(AbstractTask):
 class PrescribedForce(AbstractTask):
     """Task 2: the muscle pulls with a prescribed force P_w, how does the insertion move?
 
-    State (x_w, x_w', x_z, x_z'), equations (1a) and (1b); output x_z.
+    State (x_w, x_w', x_z, x_z'), equations (1a) and (1b). Output: x_z [m]; or with `observe="acceleration"`, what an
+    accelerometer on the insertion reads but for gravity,
 
-    **Arguments:** `P_w` and `F_ext` [N], numbers (smooth steps from zero) or signals; the common fields.
+        x_z'' = -(F_ext + passive_force(x_w, x_w', x_z, x_z', u)) / m_z    [m/s^2]
+
+    Its mean is zero. So it has no coefficient of variation.
+
+    **Arguments:** `P_w` and `F_ext` [N], numbers (smooth steps from zero) or signals; `observe`, "displacement" or
+    "acceleration"; the common fields.
+
+    **Raises:** `ValueError` for another `observe`, and for white noise on K_z or C_z, which x_z'' contains directly.
     """
 
     P_w: AbstractSignal = eqx.field(converter=as_signal, default=default("P_w"))
     F_ext: AbstractSignal = eqx.field(converter=as_signal, default=default("F_ext"))
+    observe: Observed = eqx.field(static=True, default="displacement", kw_only=True)
     state_names: ClassVar[tuple[str, ...]] = ("x_w", "v_w", "x_z", "v_z")
     state_units: ClassVar[tuple[str, ...]] = ("m", "m/s", "m", "m/s")
-    output_name: ClassVar[str] = "x_z"
-    output_unit: ClassVar[str] = "m"
-    smoothness_needed: ClassVar[tuple[int, ...]] = (0, 0, 0, 0, 0)
 
     def __check_init__(self):
+        if self.observe not in get_args(Observed):
+            raise ValueError(f"observe = {self.observe!r}: {choices(str(self.observe), get_args(Observed))}")
         _check_task(self)
+
+    @property
+    def output_name(self) -> str:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """x_z, or a_z for x_z''."""
+        return "x_z" if self.observe == "displacement" else "a_z"
+
+    @property
+    def output_unit(self) -> str:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """That of the output."""
+        return "m" if self.observe == "displacement" else "m/s^2"
+
+    @property
+    def smoothness_needed(self) -> tuple[int, ...]:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """x_z'' contains the noise on K_z and C_z."""
+        return (0, 0, 0, 0, 0) if self.observe == "displacement" else (0, 1, 0, 1, 0)
 
     def vector_field(self, t: Scalar, y: State, u: Perturbation) -> State:
         x_w, v_w, x_z, v_z = y[0], y[1], y[2], y[3]
@@ -269,7 +299,7 @@ class PrescribedForce(AbstractTask):
         return jnp.stack([v_w, a_w, v_z, -(self.F_ext(t) + passive) / muscle.m_z])
 
     def output(self, t: Scalar, y: State, u: Perturbation, du: Perturbation) -> Scalar:
-        return y[2]
+        return y[2] if self.observe == "displacement" else self.vector_field(t, y, u)[3]
 
 
 class Isometric(AbstractTask):

@@ -3,7 +3,7 @@
 import dataclasses
 import itertools
 from collections.abc import Iterable, Mapping
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, get_args
 
 import jax
 import numpy as np
@@ -17,7 +17,7 @@ from jaxmuscle.data._target import Target
 from jaxmuscle.model._muscle import Muscle
 from jaxmuscle.model._noise import AbstractNoise
 from jaxmuscle.model._parameters import PARAMETERS, USUALLY_FREE
-from jaxmuscle.model._tasks import AbstractTask, Isometric, PrescribedForce, with_noise
+from jaxmuscle.model._tasks import AbstractTask, Isometric, Observed, PrescribedForce, with_noise
 from jaxmuscle.response._expected import check_line
 from jaxmuscle.response._linearised import has_response
 from jaxmuscle.response._scaling import FORCES, at_force, is_scalable
@@ -34,13 +34,27 @@ COEFFICIENTS = ("k_w", "k_z", "c_w", "c_z")
 NARROW = 0.5
 
 
-def task_for(target: Target, *, noise: str | AbstractNoise | None = None) -> AbstractTask:
-    """The task that a target measured: `Isometric` for force and torque, `PrescribedForce` for displacement.
+def task_for(
+    target: Target, kind: type[AbstractTask] | None = None, *, noise: str | AbstractNoise | None = None
+) -> AbstractTask:
+    """The task that a target measured: `Isometric` for force and torque, `PrescribedForce` for displacement and
+    acceleration (with `observe="acceleration"`).
 
-    It has the target's spectrum settings and default parameters; `noise` is a name of `NOISES` or a noise object.
+    Of another `kind` if one is given. It has the target's spectrum settings and default parameters; `noise` is a name of
+    `NOISES` or a noise object.
     """
-    kind = PrescribedForce if target.quantity == "displacement" else Isometric
-    return with_noise(kind(settings=target.settings), noise)
+    what: Any = target.quantity
+    task = PrescribedForce(observe=what) if what in get_args(Observed) else Isometric()
+    task = task if kind in (None, type(task)) else kind()
+    return with_noise(task.with_parts(settings=target.settings), noise)
+
+
+def check_quantity(task: AbstractTask, target: Target, name: str, remedy: str) -> None:
+    """Refuse a task whose output is not what the target measured."""
+    what = target.quantity
+    if task.quantity != ("force" if what == "torque" else what):
+        raise ValueError(f"target {name!r} is a{'n' * (what[0] == 'a')} {what}, but its task {type(task).__name__} gives "
+                         f"{task.output_name} in {task.output_unit}: {remedy}")  # fmt: skip
 
 
 def free_names(task: AbstractTask, free: Iterable[str] | None, fix: Mapping[str, float], bins: int) -> tuple[str, ...]:
@@ -141,6 +155,8 @@ def planned(task: AbstractTask, target: Target, options: FitOptions) -> Plan:
     """The fit of one target, its arguments checked (see `fit`). Needs double precision."""
     bounds, priors, fix = dict(options.bounds or {}), dict(options.priors or {}), dict(options.fix or {})
     task = as_numbers(task.with_parts(settings=target.settings).replace(**fix))
+    if "acceleration" in (task.quantity, target.quantity):
+        check_quantity(task, target, target.name, "fit jaxmuscle.task_for(target), or state the target's quantity")
     names = free_names(task, options.free, fix, len(target.bins))
     names += tuple(name for name in options.also_free if name not in names)
     mean = options.mean_force if isinstance(options.mean_force, tuple) else None
@@ -176,6 +192,8 @@ def planned(task: AbstractTask, target: Target, options: FitOptions) -> Plan:
 
 def _check_mean(task: AbstractTask, free: tuple[str, ...], mean: tuple[float, float] | None) -> None:
     """Refuse a mean force that no stiffness can reach: at x_z = 0, `F_ext = P_w - K_w x_w` lies between 0 and P_w."""
+    if mean is not None and task.quantity == "acceleration":
+        raise ValueError(f"mean_force = {mean}: the mean of an acceleration is zero; leave it out")
     if mean is None or not isinstance(task, Isometric) or not isinstance(task.muscle, Muscle):
         return
     value, most = mean[0], float(task["P_w"])

@@ -46,6 +46,8 @@ def derived_names(task: Any) -> tuple[str, ...]:
     missing |= set() if task.activation is not None else {"contraction_time"}
     missing |= {"tremor_frequency", "tremor_width", "tremor_share"} if resonances < 1 else set()
     missing |= {"resonance_2_share"} if resonances < 2 else set()
+    # About a mean of zero, and where the response begins with f².
+    missing |= {"coefficient_of_variation", "mean", "half_power_frequency"} if task.quantity == "acceleration" else set()
     return tuple(name for name in DERIVED if name not in missing)
 
 
@@ -57,7 +59,8 @@ def derived(task: Any, moments: Moments, frequency: Float[Array | np.ndarray, " 
     `tremor_width` and `tremor_share` of the compared power, and `resonance_2_share` of a second one, both from half the
     resonance's frequency on (what activation and muscle let through below is no peak and can hardly be told from the rest);
     `harmonic_share` of the compared power; `harmonic_frequency`; `high_frequency_floor`, mean proportional power per bin
-    over the highest third of the bins; the base coefficients; `coefficient_of_variation` and `mean` of the output;
+    over the highest third of the bins; the base coefficients; `coefficient_of_variation` and `mean` of the output (not of
+    an acceleration, whose mean is zero, and which has no `half_power_frequency`);
     `band_4_8` and so on, the proportional power of the bins from 4 Hz to below 8 Hz.
     """
     base, seen = task.muscle.base(), observed(moments)
@@ -77,9 +80,8 @@ def derived(task: Any, moments: Moments, frequency: Float[Array | np.ndarray, " 
         found[f"{name}_share"] = jnp.sum(jnp.where(peak, own, 0.0)) / whole
     proportional = moments.power / whole
     for name, (low, high) in BANDS.items():
-        if name in derived_names(task):
-            found[name] = jnp.sum(jnp.where((at >= low) & (at < high), proportional, 0.0))
-    return found | {
+        found[name] = jnp.sum(jnp.where((at >= low) & (at < high), proportional, 0.0))
+    found |= {
         "harmonic_share": seen["harmonic_share"],
         "harmonic_frequency": task.harmonic.frequency * jnp.ones(()),
         "high_frequency_floor": seen["high_frequency_floor"],
@@ -90,6 +92,7 @@ def derived(task: Any, moments: Moments, frequency: Float[Array | np.ndarray, " 
         "coefficient_of_variation": seen["coefficient_of_variation"],
         "mean": seen["mean"],
     }
+    return {name: value for name, value in found.items() if name in derived_names(task)}
 
 
 def frequency_of(part: PartResiduals) -> Float[Array, " bins"]:

@@ -74,14 +74,14 @@ def canvas(ax: Axes | None, size: tuple[float, float], **pads: float) -> Figure 
 
 def output_label(name: str, unit: str) -> str:
     """Axis label of a task's output, as `Force $F_\\mathrm{ext}$ (N)`."""
-    quantity = {"N": "Force ", "m": "Displacement "}.get(unit, "")
+    quantity = {"N": "Force ", "m": "Displacement ", "m/s^2": "Acceleration "}.get(unit, "")
     base, _, index = name.partition("_")
     symbol = rf"${base}_\mathrm{{{index}}}$" if base.isalpha() and index.isalnum() else name
-    return f"{quantity}{symbol} ({unit})"
+    return f"{quantity}{symbol} ({unit.replace('^2', '²')})"
 
 
 def density_unit(unit: str) -> str:
-    return f"{unit}²/Hz" if unit.isalpha() else f"({unit})²/Hz"
+    return f"{unit}²/Hz" if unit.isalpha() else f"({unit.replace('^2', '²')})²/Hz"
 
 
 def axes_or_new(ax: Axes | None) -> Axes:

@@ -48,8 +48,9 @@ class Moments(NamedTuple):
 
     @property
     def variation(self) -> Scalar:
-        """Coefficient of variation."""
-        return self.variance**0.5 / abs(self.mean)
+        """Coefficient of variation; infinite about a mean of zero."""
+        with np.errstate(divide="ignore"):
+            return self.variance**0.5 / abs(self.mean)
 
 
 def _sylvester(A: Array, F: Array, Q: Array) -> Array:

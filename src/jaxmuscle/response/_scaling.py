@@ -205,6 +205,9 @@ def _with_coefficients(
 
 def _with_variation(task: AbstractTask, before: AbstractTask, factor: Scalar) -> AbstractTask:
     """The task with all amplitudes multiplied so that its coefficient of variation is `factor` times that of `before`."""
+    if task.quantity == "acceleration":
+        raise ValueError("an acceleration has no coefficient of variation, which sets the noise here: move the task with "
+                         "observe='displacement', then change it by with_parts(observe='acceleration')")  # fmt: skip
     now, then = _moments(task).variation, _moments(before).variation
     moving = then > 0
     if is_concrete(moving):

@@ -169,8 +169,7 @@ def _designs_for(part: Part, moments: Moments, factors: tuple[float, ...], separ
     if not varying and steady:
         designs.append(Design("the coefficient of variation", segments=0, coefficient_of_variation=True))
     if part.mean is None and steady:
-        what = "displacement" if task.output_unit == "m" else "force"
-        designs.append(Design(f"the mean {what}, known to {100 * MEAN_ERROR:g} %", segments=0, mean=MEAN_ERROR))
+        designs.append(Design(f"the mean {task.quantity}, known to {100 * MEAN_ERROR:g} %", segments=0, mean=MEAN_ERROR))
     if isinstance(task, Isometric):
         held = task.as_task(PrescribedForce, P_w=task.P_w, F_ext=mean)
         designs.append(Design(f"the displacement under a load of {mean:.3g} N", held))
@@ -252,8 +251,7 @@ def _local(like: Part, coordinates: Coordinates, task: Any, design: Design) -> P
     present, settings = like.target, task.settings
     bins = present.bins if settings == present.settings else np.arange(settings.first_bin, settings.last_bin + 1)
     counts = design.counts if design.counts and design.spectral else segments_of(present)
-    quantity = "displacement" if task.output_unit == "m" else "force"
-    target = Target(design.name, np.ones(len(bins)), bins=bins, quantity=quantity, segments=counts, settings=settings)
+    target = Target(design.name, np.ones(len(bins)), bins=bins, quantity=task.quantity, segments=counts, settings=settings)
     return Part("", task, target, coordinates, tuple(range(len(coordinates.names))), None, None)
 
 
