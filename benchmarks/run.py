@@ -16,6 +16,7 @@ import fits
 import integration
 import jax
 import linear
+import recordings
 import scale
 import usage
 import waiting
@@ -37,6 +38,7 @@ SECTIONS: dict[str, Callable[[int], list[Row]]] = {
     "cohort": lambda n: fits.cohort(),
     "posterior": lambda n: fits.posterior(),
     "alternative": lambda n: alternative.rows(),
+    "recordings": lambda n: recordings.rows(),
     "waiting": waiting.rows,
 }
 

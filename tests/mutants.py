@@ -50,7 +50,7 @@ SUBJECTS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
         ("expected", "sensitivity", "static", "scaling", "control", "fit"),
     ),
     "spectra": (
-        ("spectra/_welch", "spectra/_settings", "spectra/_measures", "spectra/_mean"),
+        ("spectra/_welch", "spectra/_settings", "spectra/_measures", "spectra/_neighbours", "spectra/_mean"),
         ("spectrum", "metrics", "uncertainty", "control", "simulate"),
     ),
     "likelihood": (
@@ -86,12 +86,18 @@ SUBJECTS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
         (
             "data/_recording",
             "data/_recording_quality",
+            "data/_recording_body",
+            "data/_recording_choice",
             "data/_recording_csv",
             "data/_recording_files",
             "data/_recording_formats",
+            "data/_recording_headers",
+            "data/_recording_labs",
             "data/_recording_table",
+            "data/_recording_time",
+            "data/_units",
         ),
-        ("recording", "recording_file", "reproduce"),
+        ("recording", "recording_file", "recording_formats", "reproduce"),
     ),
     "ensemble store": (
         (

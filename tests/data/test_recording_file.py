@@ -267,9 +267,9 @@ BAD = {
     "infinite": (H + "0,1\n0.001,inf\n", {}, "line 3: force is infinite"),
     "ragged": (H + "0,1\n0.001\n", {}, "line 3: 1 of 2 columns found"),
     "decimal commas": (H + "0,0,1,5\n0,1,2,5\n", {}, "line 2: 4 of 2 columns found; decimal commas need"),
-    "preamble": ("Subject 3\nKnee\n" + H + ROWS, {}, "of 1 columns found; decimal commas need"),
+    "preamble": ("Subject 3, knee\n" + ROWS.replace(",", ",5,"), {}, "line 2: 3 of 2 columns found; decimal commas need"),
     "column twice": ("force,force\n1,2\n", {}, "column 'force' appears twice"),
-    "no rate": (text(X), {}, "does not state its rate (no time column found); give rate in Hz"),
+    "no rate": (text(X), {}, "does not state its rate (no time column found); give `rate` in Hz"),
     "rate zero": (text(X), {"rate": 0}, "rate=0: give samples per second [Hz], above 0"),
     "rate low": (text(X), {"rate": 20}, "rate=20.0: too slow: half of it lies below the last bin, 11.72 Hz"),
     "rate contradicts": (H + ROWS, {"rate": 2048}, "rate=2048 Hz contradicts the time column 'time', which has 1000 Hz"),
@@ -281,18 +281,18 @@ BAD = {
     "unknown column": (H + ROWS, {"column": "forse"}, "no column 'forse'; did you mean 'force'? Known: time, force"),
     "column number": (H + ROWS, {"column": 7}, "no column 7; Known: time, force"),
     "time as column": (H + ROWS, {"column": "time"}, "column 'time' is the time; choose one of force"),
-    "which column": (TWO, {"rate": 100}, "holds 2 columns besides the time; choose one with column: force, torque"),
+    "which column": (TWO, {"rate": 100}, "holds 2 columns besides the time; choose one with `column`: force, torque"),
     "constant": (text(X * 0 + 3), {"rate": 100}, "column 0: samples: constant at 3"),
     "all empty": (text(TIME, [""] * 40, header="time,force"), {"column": 1}, "holds no number, only gaps"),
     "long gap": (HOLE, {}, "gaps longer than max_gap=0.2 s at 0.100 s to 0.350 s; cut the recording there"),
-    "unit": (text(X), {"rate": 100, "units": "lb"}, "unit='lb': Known: N, mN"),
-    "unit in header": (text(X, header="force (kg)"), {"rate": 100}, "unknown unit 'kg'; give units"),
+    "unit": (text(X), {"rate": 100, "units": "lb"}, "units='lb': Known: N, mN"),
+    "unit in header": (text(X, header="force (kg)"), {"rate": 100}, "unknown unit 'kg'; give `units`"),
     "axis": (POINT, {"axis": "w"}, "axis='w': choose one of x, y, z, principal"),
     "axis left out": (POINT, {"column": "finger"}, "column='finger' is a point of three columns; give axis"),
-    "which point": (POINT, {"axis": "x"}, "holds 2 points; choose one with column: finger, stand"),
+    "which point": (POINT, {"axis": "x"}, "holds 2 points; choose one with `column`: finger, stand"),
     "no point": (POINT, {"column": "thumb", "axis": "x"}, "needs a point, three columns as thumb_x, thumb_y, thumb_z"),
     "no reference": (POINT, {"column": "finger", "axis": "x", "reference": "base"}, "no point 'base' as reference"),
-    "point unit": (POINT, {"column": "finger", "axis": "x"}, "does not say in which unit finger is; give units"),
+    "point unit": (POINT, {"column": "finger", "axis": "x"}, "does not say in which unit finger is; give `units`"),
     "reference": (TWO, {"rate": 100, "reference": "torq"}, "no reference 'torq'; did you mean 'torque'?"),
     "max_gap": (text(X), {"rate": 100, "max_gap": -1}, "max_gap=-1: give a time in s"),
 }
@@ -304,14 +304,14 @@ def test_bad_text(case, tmp_path):
     with pytest.raises(ValueError) as caught:
         load_recording(write(tmp_path, content), **arguments)
     assert message in str(caught.value)
-    if not case.startswith(("axis", "rate zero", "max_gap")) or case == "axis left out":
+    if not case.startswith(("axis", "rate zero", "max_gap", "unit")) or case == "axis left out":
         assert str(tmp_path / "trial.csv") in str(caught.value)
 
 
 BAD_FILES = {
     "missing": ("nowhere.csv", "nowhere.csv: no such file"),
     "folder": (".", "is a folder"),
-    "kind": ("trial.xlsx", "a recording is one of .csv, .tsv, .txt, .mat, .npy, .npz, .c3d, not .xlsx"),
+    "kind": ("trial.xls", "a recording is one of .csv, .tsv, .txt, .dat, .asc, .xlsx, .mat, .npy, .npz, .c3d"),
     "no kind": ("trial", "not one without ending"),
     "empty": ("empty.mat", "empty.mat: is empty"),
     "no mat": ("bad.mat", "bad.mat: cannot be read as .mat: "),
@@ -329,7 +329,7 @@ BAD_FILES = {
 @pytest.mark.parametrize("case", BAD_FILES)
 def test_bad_files(case, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    for name in ("trial.xlsx", "trial", "bad.mat", "bad.npy", "bad.npz"):
+    for name in ("trial.xls", "trial", "bad.mat", "bad.npy", "bad.npz"):
         write(tmp_path, b"neither this nor that", name)
     write(tmp_path, b"", "empty.mat")
     np.save("object.npy", np.array([{}, 1], object))
@@ -411,8 +411,13 @@ def test_command(tmp_path):
         (("--window", "8-9"), "--window 8-9: give start and end in s"),
         (("--window", "1:2"), "Welch segments needed"),
         (("--column", "forse"), "did you mean 'force (N)'"),
-        (("--rate", "2048"), "contradicts the time column"),
-        (("--axis", "w"), "axis='w': choose one of"),
+        (("--rate", "2048"), "--rate 2048 Hz contradicts the time column"),
+        (("--rate", "0"), "--rate 0.0: give samples per second"),
+        (("--axis", "w"), "--axis 'w': choose one of"),
+        (("--max-gap", "-1"), "--max-gap -1.0: give a time in s"),
+        (("--skip-rows", "9999"), "holds no data"),
+        (("--time", "clock"), "no time 'clock'"),
+        (("--units", "lb"), "--units 'lb': Known"),
         (("--save-target", "held.csv"), "a target is saved as TOML"),
     ],
 )

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import jaxtyping
 import numpy as np
 import pytest
+from scipy.spatial import KDTree
 from scipy.special import erf
 
 from jaxmuscle.spectra._measures import (
@@ -16,6 +17,7 @@ from jaxmuscle.spectra._measures import (
     signal_to_noise,
     spearman,
 )
+from jaxmuscle.spectra._neighbours import FEW, neighbours
 from jaxmuscle.spectra._settings import SpectrumSettings
 from jaxmuscle.spectra._welch import Spectrum, spectrum_of
 
@@ -88,6 +90,18 @@ def test_entropy_of_ten_thousand_samples_is_near_that_of_its_parts():
     assert sample_entropy(x) == pytest.approx(-np.log(erf(0.1)), rel=0.05)
     sine = np.sin(np.arange(10_000) / 50)
     assert 0 < approximate_entropy(sine) < 0.1 < 2 < approximate_entropy(x)
+
+
+@pytest.mark.parametrize("m", [2, 3])
+@pytest.mark.parametrize("kind", ["noise", "slow", "few values", "mostly constant"])
+def test_neighbours_of_a_long_record_are_those_of_a_tree(kind, m):
+    rng = np.random.default_rng(4)
+    x = rng.standard_normal(FEW + 500)
+    x = {"noise": x, "slow": np.cumsum(x), "few values": np.round(x), "mostly constant": x * (x > 2)}[kind]
+    templates = np.lib.stride_tricks.sliding_window_view(x, m)
+    radius = 1.0 if kind == "few values" else 0.2 * np.std(x)  # whole numbers lie at the very bound
+    tree = KDTree(templates, leafsize=100).query_ball_point(templates, radius, p=np.inf, return_length=True)
+    np.testing.assert_array_equal(neighbours(templates, radius), tree)
 
 
 def test_entropy_does_not_depend_on_unit_or_offset():

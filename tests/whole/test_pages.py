@@ -94,8 +94,7 @@ def readme(once, tmp_path_factory):
     """What the README leaves behind."""
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(tmp_path_factory.mktemp("readme"))
-        for number, name in enumerate(("trial.csv", "trial1.csv", "trial2.csv", "trial3.csv")):
-        write_recording(name, 5 + number)
+        write_recording("trial.csv")
         for seed, name in enumerate("abc"):
             write_spectrum(f"{name}.csv", seed)
         with contextlib.redirect_stdout(io.StringIO()) as printed:
@@ -168,7 +167,8 @@ def test_identifiability():
 def test_own_data():
     write_spectrum("mine.csv")
     assert pages.run("docs/fit-a-csv.md")["target"].segments == (6,) * 10
-    write_recording("trial.csv")
+    for number, name in enumerate(("trial.csv", "trial1.csv", "trial2.csv", "trial3.csv")):
+        write_recording(name, 5 + number)
     write_tremor("tremor.csv")
     quick = {"jm.task_for(tremor), tremor": "jm.task_for(tremor), tremor, rungs=0, starts=8, seeds=0, check_seeds=0"}
     names = pages.run("docs/recordings.md", {}, quick)

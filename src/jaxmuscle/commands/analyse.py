@@ -5,27 +5,22 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-import jaxmuscle as jm
-
 from .console import csv_text, err, out, plain, reporting, save_figure, writable
-from .options import Output
+from .options import Output, Window
+from .recordings import read, reads_recordings
 
 if TYPE_CHECKING:
     from jaxmuscle import Recording
 
 
+@reads_recordings
 def analyse(
-    path: Annotated[str, typer.Argument(metavar="RECORDING", help="CSV, TSV, .mat, .npy, .npz or .c3d file.")],
-    column: Annotated[str | None, typer.Option(metavar="NAME", help="Column, point, or Data:74 (counted from 0).")] = None,
-    rate: Annotated[float | None, typer.Option(metavar="HZ", help="Sampling rate, if the file does not state it.")] = None,
-    units: Annotated[str | None, typer.Option(metavar="U", help="N, Nm, mm, m/s^2, % MVC; by default the file's.")] = None,
-    axis: Annotated[str | None, typer.Option(help="Of a point: x, y, z or principal.")] = None,
-    reference: Annotated[str | None, typer.Option(metavar="NAME", help="Column or point to subtract.")] = None,
-    window: Annotated[
-        str | None, typer.Option(metavar="A:B", help="Steady part in s, or `all`; found by itself if left out.")
-    ] = None,
+    path: Annotated[str, typer.Argument(metavar="RECORDING", help="Text, .xlsx, .mat, .npy, .npz, .c3d, .edf, ... file.")],
+    *,
+    window: Window = None,
     output: Output = Path("out"),
     save_target: Annotated[Path | None, typer.Option(metavar="FILE", help="Save the target for `jaxmuscle fit`.")] = None,
+    reading: dict[str, Any],
 ) -> None:
     """Analyse a recording: level, variability, regularity, spectrum.
 
@@ -38,31 +33,11 @@ def analyse(
         jaxmuscle analyse trial.c3d --column finger --axis principal --reference stand --window all
     """
     with reporting():
-        edges = _edges(window)
         if save_target is not None and save_target.suffix.lower() != ".toml":
             raise ValueError(f"--save-target {save_target}: a target is saved as TOML; give a name that ends in .toml")
         writable(output)
-
-        try:
-            asked: Any = {"column": column, "rate": rate, "units": units, "axis": axis, "reference": reference}
-            recording = jm.load_recording(path, **asked)
-        except ImportError as error:
-            raise ValueError(str(error)) from None
-        if edges != "all":
-            recording = recording.steady(edges)
+        recording = read(path, reading, window)
         _write(recording, output, save_target)
-
-
-def _edges(window: str | None) -> Any:
-    if window is None or window == "all":
-        return window
-    start, colon, stop = window.partition(":")
-    try:
-        if colon:
-            return float(start), float(stop)
-    except ValueError:
-        pass
-    raise ValueError(f"--window {window}: give start and end in s, as 8:25, or all")
 
 
 def _write(recording: "Recording", folder: Path, save_target: Path | None) -> None:

@@ -4,6 +4,7 @@ import contextlib
 import csv
 import io
 import os
+import re
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -14,7 +15,7 @@ from rich.console import Console
 
 import jaxmuscle as jm
 
-from .options import Observed, TaskName
+from .options import SAME_NAME, Observed, TaskName
 
 if TYPE_CHECKING:
     from jaxmuscle.fits import FitResult
@@ -67,7 +68,14 @@ def reporting() -> Iterator[None]:
 def _words(error: Exception) -> str:
     if isinstance(error, OSError) and error.filename is not None:
         return f"{error.filename}: {error.strerror}"
-    return str(error)
+    return _as_options(str(error))
+
+
+def _as_options(message: str) -> str:
+    """A message as it reads at the command line: the arguments `rate` and `rate=20` are the options --rate and --rate 20."""
+    names = "|".join(SAME_NAME)
+    message = re.sub(rf"(?<![\w.-])({names})=(?=\S)", lambda found: f"`{found[1]}` ", message)
+    return re.sub(rf"`({names})`", lambda found: "--" + found[1].replace("_", "-"), message)
 
 
 def plain(text: object) -> str:

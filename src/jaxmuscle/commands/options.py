@@ -2,7 +2,7 @@
 
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -54,6 +54,23 @@ Free = Annotated[str | None, typer.Option(metavar="NAMES", help="Comma-separated
 Fix = Annotated[list[str] | None, typer.Option(metavar="NAME=VALUE", help="Set a parameter and keep it; repeatable.")]
 Segments = Annotated[int | None, typer.Option(min=1, help="Welch segments behind the target.")]
 Quantity = Annotated[str | None, typer.Option(help="force, torque, displacement or acceleration.")]
+Window = Annotated[str | None, typer.Option(metavar="A:B", help="Steady part in s, or `all`; found by itself if left out.")]
+_Name = Annotated[str | None, typer.Option(metavar="NAME", help="Column, point, or Data:74 (counted from 0).")]
+_Rate = Annotated[float | None, typer.Option(metavar="HZ", help="Sampling rate, if the file does not state it.")]
+_Units = Annotated[str | None, typer.Option(metavar="U", help="N, Nm, mm, m/s^2, % MVC, ...; by default the file's.")]
+_Reference = Annotated[str | None, typer.Option(metavar="NAME", help="Column or point to subtract.")]
+_Time = Annotated[str | None, typer.Option(metavar="NAME", help="Column of the time, if it is not found by itself.")]
+READING: dict[str, tuple[Any, Any]] = {  # how a recording is read: annotation and default of each option
+    "column": (_Name, None),
+    "rate": (_Rate, None),
+    "units": (_Units, None),
+    "axis": (Annotated[str | None, typer.Option(help="Of a point: x, y, z or principal.")], None),
+    "reference": (_Reference, None),
+    "time": (_Time, None),
+    "skip_rows": (Annotated[int, typer.Option(min=0, metavar="N", help="Lines to leave out at the top.")], 0),
+    "max_gap": (Annotated[float, typer.Option(metavar="S", help="Longest gap in s that is closed.")], 0.2),
+}
+SAME_NAME = (*READING, "window", "quantity", "segments")  # arguments in messages that are options of the same name
 
 
 def names_in(free: str | None) -> list[str] | None:

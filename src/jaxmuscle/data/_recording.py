@@ -13,31 +13,21 @@ from jaxtyping import Float
 
 from jaxmuscle import plot
 from jaxmuscle._common.text import choices, folded
-from jaxmuscle.spectra._measures import approximate_entropy, peaks, sample_entropy
+from jaxmuscle.spectra._measures import peaks, regularity
 from jaxmuscle.spectra._settings import SpectrumSettings, require
 from jaxmuscle.spectra._welch import Spectrum, lowpass, spectrum_of
 
 from ._pooled import pooled_target
-from ._recording_quality import RecordingSummary, clipping, plateau
+from ._recording_choice import recording_of
+from ._recording_labs import frame_table
+from ._recording_quality import RecordingSummary, checked, clipping, plateau
 from ._target import Target
 from ._target_fields import Quantity
+from ._units import UNITS, known_unit
 
 RECORDED = SpectrumSettings(filter_direction="both")
 LOWEST_RATE = 24.0  # Hz; half of it lies above bin 30
 SEGMENTS = 2  # a steady part holds at least this many
-UNITS: dict[str, Quantity | None] = {
-    "N": "force", "mN": "force", "kN": "force", "% MVC": "force", "N m": "torque", "N cm": "torque", "N mm": "torque",
-    "m": "displacement", "cm": "displacement", "mm": "displacement", "um": "displacement", "m/s^2": "acceleration",
-    "mm/s^2": "acceleration", "g": "acceleration", "mg": "acceleration", "V": None, "mV": None, "a.u.": None,
-}  # fmt: skip
-_SPELLINGS = {"nm": "N m", "ncm": "N cm", "nmm": "N mm", "%mvc": "% MVC", "%": "% MVC", "µm": "um", "au": "a.u."}
-
-
-def known_unit(unit: str) -> str | None:
-    """The unit as `UNITS` writes it (`Nm`, `N·m`, `N*m` are `N m`; `m/s²`, `m/s2` are `m/s^2`), or `None` if not there."""
-    bare = "".join(unit.replace("μ", "µ").replace("²", "2").translate(str.maketrans("", "", "·*.^()[]")).split())
-    exact = {"".join(name.replace(".", "").replace("^", "").split()): name for name in UNITS}
-    return exact.get(bare) or _SPELLINGS.get(bare.casefold())
 
 
 class Recording(eqx.Module):
@@ -84,12 +74,36 @@ class Recording(eqx.Module):
         spelled = known_unit(unit)
         require(spelled is not None, "unit", unit, choices(unit, UNITS))
         self.unit = str(spelled)
-        self.whole = _samples(samples, self.rate, self.start)
+        self.whole = checked(samples, self.rate, self.start)
         own = clipping(self.whole, self.rate, self.start)
         if self.rate < RECORDED.rate:
             own.append(f"recorded at {self.rate:g} Hz: holds nothing above {self.rate / 2:g} Hz")
         self.notices = tuple(dict.fromkeys((*notices, *own)))
         self.window = None if window is None else self._checked(window)
+
+    @classmethod
+    def from_dataframe(
+        cls,
+        frame: Any,
+        *,
+        column: str | int | None = None,
+        rate: float | int | None = None,
+        units: str | None = None,
+        axis: str | None = None,
+        reference: str | int | None = None,
+        time: str | int | None = None,
+        max_gap: float | int = 0.2,
+        name: str = "recording",
+    ) -> "Recording":
+        """A recording from a pandas table, by the rules for tables in files.
+
+        **Arguments:** `frame`, a `pandas.DataFrame`. Its times are a column, or the index: numbers in s, a `DatetimeIndex`
+        or a `TimedeltaIndex`. `name` as in `Recording`; the others as in `load_recording`.
+
+        **Raises:** `ValueError` naming column, row or argument, and the remedy.
+        """
+        return recording_of(cls, frame_table(frame), column=column, rate=rate, units=units, axis=axis, reference=reference,
+                            time=time, max_gap=max_gap, name=name)  # fmt: skip
 
     def _checked(self, window: Any) -> tuple[float, float]:
         try:
@@ -240,6 +254,7 @@ class Recording(eqx.Module):
         self._require_change()
         x = self.filtered(settings)
         mean, deviation = float(np.mean(x)), float(np.std(x))
+        approximate, sample = regularity(x)
         return RecordingSummary(
             unit=self.unit,
             duration=x.size / settings.rate,
@@ -248,8 +263,8 @@ class Recording(eqx.Module):
             standard_deviation=deviation,
             coefficient_of_variation=deviation / abs(mean) if mean else math.inf,
             signal_to_noise=mean / deviation,
-            approximate_entropy=approximate_entropy(x),
-            sample_entropy=sample_entropy(x),
+            approximate_entropy=approximate,
+            sample_entropy=sample,
             peaks=peaks(self.spectrum(settings)),
         )
 
@@ -302,19 +317,3 @@ def _rate(rate: Any) -> float:
     remedy = f"too slow: half of it lies below the last bin, 11.72 Hz; record at {LOWEST_RATE:g} Hz or more"
     require(rate >= LOWEST_RATE, "rate", rate, remedy)
     return float(rate)
-
-
-def _samples(samples: Any, rate: float, start: float) -> Float[np.ndarray, " all"]:
-    try:
-        x = np.array(samples, dtype=float)
-    except (TypeError, ValueError):
-        raise ValueError("samples: give real numbers, one for each time") from None
-    require(x.ndim == 1 and x.size >= 2, "samples shape", x.shape, "give one signal of 2 samples or more")
-    wrong = np.flatnonzero(~(np.abs(x) < 1e100))
-    if wrong.size:
-        first = f"the first at {start + wrong[0] / rate:.3f} s ({x[wrong[0]]:g})"
-        raise ValueError(f"samples: {wrong.size} are no finite numbers, {first}; `load_recording` closes short gaps of NaN")
-    if np.ptp(x) <= 1e-12 * np.max(np.abs(x)):
-        raise ValueError(f"samples: constant at {x[0]:g}; is this the right column, was the sensor connected?")
-    x.setflags(write=False)
-    return x

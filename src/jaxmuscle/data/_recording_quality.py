@@ -10,6 +10,7 @@ import scipy
 from jaxtyping import Bool, Float, Int
 
 from jaxmuscle.spectra._measures import Peaks
+from jaxmuscle.spectra._settings import require
 
 
 class RecordingSummary(eqx.Module):
@@ -100,7 +101,7 @@ def filled(
         more = f" and {len(too_long) - 5} more" if len(too_long) > 5 else ""
         raise ValueError(
             f"gaps longer than max_gap={longest:g} s at {', '.join(spans)}{more}; "
-            "cut the recording there, or allow more with max_gap"
+            "cut the recording there, or allow more with `max_gap`"
         )
     if len(gaps):
         hole, index = missing[first:last], np.arange(last - first)
@@ -155,3 +156,20 @@ def plateau(x: Float[np.ndarray, " times"], rate: float) -> tuple[int, int] | No
         return None
     start, stop = start + size * (start > 0), stop - size * (stop < x.size)
     return (start, stop) if stop > start else None
+
+
+def checked(samples: Any, rate: float, start: float) -> Float[np.ndarray, " all"]:
+    """The samples as a copy that cannot be changed. **Raises:** `ValueError` if they are no signal."""
+    try:
+        x = np.array(samples, dtype=float)
+    except (TypeError, ValueError):
+        raise ValueError("samples: give real numbers, one for each time") from None
+    require(x.ndim == 1 and x.size >= 2, "samples shape", x.shape, "give one signal of 2 samples or more")
+    wrong = np.flatnonzero(~(np.abs(x) < 1e100))
+    if wrong.size:
+        first = f"the first at {start + wrong[0] / rate:.3f} s ({x[wrong[0]]:g})"
+        raise ValueError(f"samples: {wrong.size} are no finite numbers, {first}; `load_recording` closes short gaps of NaN")
+    if np.ptp(x) <= 1e-12 * np.max(np.abs(x)):
+        raise ValueError(f"samples: constant at {x[0]:g}; is this the right column, was the sensor connected?")
+    x.setflags(write=False)
+    return x

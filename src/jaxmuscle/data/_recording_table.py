@@ -1,4 +1,4 @@
-"""Tables of columns, whatever file they came from: find a column, a point of three columns, the time, the rate."""
+"""Tables of columns, whatever they came from: find a column, or a point of three columns."""
 
 import difflib
 import re
@@ -7,6 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
+
+from ._units import name_and_unit
 
 TRIPLES = (
     ("_x", "_y", "_z"),
@@ -17,18 +19,14 @@ TRIPLES = (
     (":0", ":1", ":2"),
 )
 AXES = ("x", "y", "z")
-_TIME = re.compile(r"(?:(?:elapsed[ _]?)?time|t|timestamp|seconds)[ _]*[\[(]?(s|sec|secs|seconds|ms|msec|us|µs)?[\])]?")
-_SECONDS = {"ms": 1e-3, "msec": 1e-3, "us": 1e-6, "µs": 1e-6}
-_UNIT = re.compile(r"(.+?)\s*[\[(]([^\[\]()]+)[\])]\s*")
-RATE_TOLERANCE = 5e-3
-JITTER = 0.25  # of a sampling interval
 
 
 class Table(NamedTuple):
     """Columns of a file by name.
 
     `columns` are functions, so that only those that are asked for are read; `named` is false where names are only
-    numbers; `rates` [Hz] and `units` by column, where the file states them; `lines` are those of the rows, if it has any.
+    numbers; `rates` [Hz] and `units` by column, where the file states them; `words` are columns that hold no numbers;
+    `place` is how messages call a row.
     """
 
     file: str
@@ -36,23 +34,18 @@ class Table(NamedTuple):
     named: bool = True
     rates: Mapping[str, float] = {}
     units: Mapping[str, str] = {}
-    lines: tuple[int, ...] = ()
-
-    def place(self, row: int) -> str:
-        """How messages call a row."""
-        return f"line {self.lines[row]}" if self.lines else f"sample {row}"
+    words: frozenset[str] = frozenset()
+    place: Callable[[int], str] = "sample {}".format
 
 
 def bare(name: str) -> str:
-    """A column's name in small letters, without a unit in brackets."""
-    found = _UNIT.fullmatch(name)
-    return (found[1] if found else name).strip().casefold()
+    """A column's name in small letters, without a unit."""
+    return name_and_unit(name)[0]
 
 
-def unit_in(name: str) -> str | None:
-    """The unit that a column's name holds in brackets."""
-    found = _UNIT.fullmatch(name)
-    return found[2].strip() if found else None
+def units_of(names: Iterable[str]) -> dict[str, str]:
+    """The units that names of columns hold."""
+    return {name: unit for name in names if (unit := name_and_unit(name)[1]) is not None}
 
 
 def listed(names: Iterable[str]) -> str:
@@ -145,59 +138,3 @@ def values(table: Table, names: Iterable[str]) -> Float[np.ndarray, "rows column
                 f"{table.file}, {table.place(int(wrong[0]))}: {name} is infinite; leave it empty if it is not known"
             )
     return np.stack(parts, axis=1)
-
-
-def time_name(table: Table) -> str | None:
-    """The column that holds the time, by its name."""
-    return next((name for name in table.columns if _TIME.fullmatch(name.strip().casefold())), None)
-
-
-def unnamed_time(table: Table) -> str | None:
-    """The first of several nameless columns, if it rises evenly from row to row, other than by 1 (a counter)."""
-    first = next(iter(table.columns))
-    if table.named or len(table.columns) < 2:
-        return None
-    time = table.columns[first]()
-    if time.size < 3 or not np.all(np.isfinite(time)) or np.any(np.diff(time) <= 0):
-        return None
-    even, interval, _ = _departure(time)
-    return first if even and interval != 1 else None
-
-
-def clock(table: Table, name: str, rows: int) -> tuple[float, float, float] | None:
-    """Rate [Hz], first time [s] and relative uncertainty of the rate from the time column; `None` for another length.
-
-    A column of times rounded to a fixed number of decimals is even if the exact times would be.
-
-    **Raises:** `ValueError` naming line and times where the time is missing, does not rise or is not even.
-    """
-    found = _TIME.fullmatch(name.strip().casefold())
-    time = table.columns[name]() * _SECONDS.get((found[1] or "s") if found else "s", 1.0)
-    if time.size != rows or rows < 2:
-        return None
-    for wrong, what in ((~np.isfinite(time), "holds no number"), (np.diff(time, prepend=time[0]) < 0, "runs backwards")):
-        if np.any(wrong):
-            raise ValueError(f"{table.file}, {table.place(int(np.argmax(wrong)))}: time column {name!r} {what}")
-    if not time[-1] > time[0]:
-        raise ValueError(f"{table.file}: time column {name!r} stands still at {time[0]:g}")
-    even, interval, rounding = _departure(time)
-    if not even:
-        at = int(np.argmax(np.diff(time)))
-        raise ValueError(
-            f"{table.file}: time column {name!r} is not uniform: after {time[at]:.6g} s ({table.place(at)}) comes "
-            f"{time[at + 1]:.6g} s, on average {interval:.6g} s lie between two; resample it evenly, or leave the "
-            "column out and give rate"
-        )
-    return 1 / interval, float(time[0]), rounding / (time[-1] - time[0])
-
-
-def _departure(time: Float[np.ndarray, " rows"]) -> tuple[bool, float, float]:
-    """Whether the times are even, the mean interval, and the unit of their last decimal."""
-    interval = float(time[-1] - time[0]) / (time.size - 1)
-    rounding = next((10.0**-d for d in range(9) if np.allclose(time, np.round(time, d), rtol=0, atol=1e-12)), 0.0)
-    steps = np.diff(time)
-    uneven = np.sum(np.abs(steps - np.median(steps)) > rounding / 2)
-    # One or two odd steps are lost samples, and a step as coarse as many intervals is no rounding either.
-    rounding = rounding if uneven > 2 and rounding <= 5 * interval else 0.0
-    departure = np.max(np.abs(time - time[0] - interval * np.arange(time.size)))
-    return bool(departure <= JITTER * interval + rounding), interval, rounding

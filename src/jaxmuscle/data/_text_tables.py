@@ -51,3 +51,9 @@ def is_number(cell: str, delimiter: str | None) -> bool:
     except ValueError:
         return False
     return True
+
+
+def width_remedy(delimiter: str | None) -> str:
+    """What helps where a line has another number of columns than the rest."""
+    remedy = "write a # before lines that are no data, or leave them out with `skip_rows`"
+    return f"decimal commas need a semicolon or tab between the columns; {remedy}" if delimiter == "," else remedy

@@ -1,6 +1,6 @@
 """Numbers that describe a force record and its spectrum: variability, regularity, rank correlation, peaks."""
 
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import equinox as eqx
 import jax.core
@@ -9,6 +9,7 @@ import numpy as np
 import scipy
 from jaxtyping import Array, Float, Real
 
+from ._neighbours import neighbours
 from ._settings import require
 from ._welch import Spectrum, floating
 
@@ -66,10 +67,21 @@ def _templates(x: Float[np.ndarray, " times"], m: int) -> Float[np.ndarray, "tem
     return np.lib.stride_tricks.sliding_window_view(x, m)
 
 
-def _matches(templates: Float[np.ndarray, "templates m"], radius: float) -> np.ndarray:
-    """For each template how many lie within `radius` of it in the maximum norm, itself included."""
-    # Counting without listing the neighbours: memory grows with the number of samples, not its square.
-    return scipy.spatial.KDTree(templates).query_ball_point(templates, radius, p=np.inf, return_length=True)
+def _counts(signal: Any, m: int, tolerance: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """How many templates of m, and of m + 1 samples, match each of their kind, and which of those of m match the last."""
+    x, radius = _record(signal, m, tolerance)
+    shorter, longer = (_templates(x, length) for length in (m, m + 1))
+    last = np.max(np.abs(shorter - shorter[-1]), axis=1) <= radius
+    return neighbours(shorter, radius), neighbours(longer, radius), last
+
+
+def regularity(signal: Real[Array | np.ndarray, "..."], m: int = 2, tolerance: float = 0.2) -> tuple[float, float]:
+    """`approximate_entropy` and `sample_entropy`, for which the templates are compared only once."""
+    shorter, longer, last = _counts(signal, m, tolerance)
+    phi, phi_longer = (float(np.mean(np.log(count / len(count)))) for count in (shorter, longer))
+    b, a = int(np.sum(shorter[:-1] - 1) - np.sum(last[:-1])), int(np.sum(longer - 1))
+    none = float("nan") if b == 0 else float("inf")
+    return phi - phi_longer, none if a == 0 else float(np.log(b / a))
 
 
 def approximate_entropy(signal: Real[Array | np.ndarray, "..."], m: int = 2, tolerance: float = 0.2) -> float:
@@ -84,10 +96,7 @@ def approximate_entropy(signal: Real[Array | np.ndarray, "..."], m: int = 2, tol
 
     **Source:** Pincus 1991, doi:10.1073/pnas.88.6.2297.
     """
-    x, radius = _record(signal, m, tolerance)
-    counts = [_matches(_templates(x, length), radius) for length in (m, m + 1)]
-    phi, phi_longer = (float(np.mean(np.log(count / len(count)))) for count in counts)
-    return phi - phi_longer
+    return regularity(signal, m, tolerance)[0]
 
 
 def sample_entropy(signal: Real[Array | np.ndarray, "..."], m: int = 2, tolerance: float = 0.2) -> float:
@@ -104,12 +113,7 @@ def sample_entropy(signal: Real[Array | np.ndarray, "..."], m: int = 2, toleranc
 
     **Source:** Richman & Moorman 2000, doi:10.1152/ajpheart.2000.278.6.H2039.
     """
-    x, radius = _record(signal, m, tolerance)
-    longer = _templates(x, m + 1)
-    b, a = (int(np.sum(_matches(t, radius) - 1)) for t in (longer[:, :m], longer))
-    if a == 0:
-        return float("nan") if b == 0 else float("inf")
-    return float(np.log(b / a))
+    return regularity(signal, m, tolerance)[1]
 
 
 def spearman(a: Real[Array | np.ndarray, "..."], b: Real[Array | np.ndarray, "..."]) -> float:

@@ -1,0 +1,54 @@
+"""Recordings in commands: the options with which they are read, the same for every command that does."""
+
+import functools
+import inspect
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+import jaxmuscle as jm
+
+from .options import READING
+
+if TYPE_CHECKING:
+    from jaxmuscle import Recording
+
+
+def reads_recordings(command: Callable[..., None]) -> Callable[..., None]:
+    """Give a command the options of `READING`; it gets their values together, as its argument `reading`."""
+
+    @functools.wraps(command)
+    def with_options(**given: Any) -> None:
+        reading = {name: given.pop(name) for name in READING}
+        command(**given, reading=reading)
+
+    signature = inspect.signature(command)
+    own = [parameter for name, parameter in signature.parameters.items() if name != "reading"]
+    keyword = inspect.Parameter.KEYWORD_ONLY
+    added = [inspect.Parameter(name, keyword, default=default, annotation=annotation)
+             for name, (annotation, default) in READING.items()]  # fmt: skip
+    parameters = [parameter.replace(kind=keyword) for parameter in own] + added
+    setattr(with_options, "__signature__", signature.replace(parameters=parameters))  # noqa: B010
+    with_options.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
+    return with_options
+
+
+def read(path: str, reading: dict[str, Any], window: str | None = "all") -> "Recording":
+    """The recording of a file, its steady part as window: the one that is given, `all`, or None to find it."""
+    edges = _edges(window)
+    try:
+        recording = jm.load_recording(path, **reading)
+    except ImportError as error:
+        raise ValueError(str(error)) from None
+    return recording if edges == "all" else recording.steady(edges)
+
+
+def _edges(window: str | None) -> Any:
+    if window is None or window == "all":
+        return window
+    start, colon, stop = window.partition(":")
+    try:
+        if colon:
+            return float(start), float(stop)
+    except ValueError:
+        pass
+    raise ValueError(f"--window {window}: give start and end in s, as 8:25, or all")

@@ -1,0 +1,141 @@
+"""Rows of numbers in a text: read quickly, and slowly where a line is wrong, to say which."""
+
+import array
+import dataclasses
+import io
+import itertools
+import re
+from collections.abc import Iterator
+
+import numpy as np
+from jaxtyping import Float
+
+from ._text_tables import cells_of, is_number, number_in, width_remedy
+
+MISSING = ("", "nan", "-nan", "na", "n/a", "null", "none")
+_WRITTEN = sorted({change(word) for word in MISSING for change in (str, str.upper, str.title)} | {"NaN", "-NaN"})
+_MOMENT = re.compile(
+    r"(?:\d{4}-\d\d-\d\d[T ]|\d\d?[./]\d\d?[./]\d{4} )?(\d\d?):(\d\d):(\d\d(?:[.,]\d+)?)(?:Z|[+-]\d\d:?\d\d)?"
+)
+_PIECE = 1 << 22  # bytes that are looked at together
+_ROWS = 1 << 16
+
+
+def is_value(cell: str, delimiter: str | None) -> bool:
+    """Whether a cell holds a number, a time of day, or a word for a missing number."""
+    return cell.casefold() in MISSING or is_number(cell, delimiter) or _MOMENT.fullmatch(cell) is not None
+
+
+@dataclasses.dataclass(frozen=True)
+class Body:
+    """The rows of a text from byte `start` on, which is in line `first`.
+
+    Each has `width` cells, `trailing` if another delimiter ends it; `sample` is the first one.
+    """
+
+    data: bytes
+    start: int
+    file: str
+    first: int
+    delimiter: str | None
+    width: int
+    trailing: bool
+    sample: list[str]
+
+    @property
+    def moments(self) -> list[int]:
+        """Columns of times of day, read as seconds from the first one; a date before them only says that it is one."""
+        return [j for j in range(self.width) if _MOMENT.fullmatch(self.sample[j])]
+
+    def rows(self) -> Iterator[tuple[int, list[str]]]:
+        """Line number and cells of every row."""
+        stream = io.BytesIO(self.data)
+        stream.seek(self.start)
+        for number, line in enumerate(stream, self.first):
+            if line.strip():
+                yield number, cells_of(line.decode("utf-8", errors="replace").rstrip("\n"), self.delimiter)
+
+    def place(self, row: int) -> str:
+        """What messages call a row."""
+        return f"line {next(itertools.islice(self.rows(), row, None))[0]}"
+
+    def check(self) -> None:
+        """**Raises:** `ValueError` for a line with another number of columns."""
+        if self._even():
+            return
+        for number, cells in self.rows():
+            found = len(cells) - (len(cells) == self.width + 1 and not cells[-1])
+            if found != self.width:
+                begun = re.match(rb"(Interval=)", self.data[:100]) and cells[0].startswith("Interval=")
+                remedy = "a second block begins there; save each block on its own" if begun else width_remedy(self.delimiter)
+                raise ValueError(f"{self.file}, line {number}: {found} of {self.width} columns found; {remedy}")
+
+    def _even(self) -> bool:
+        """Whether every line has as many delimiters as it should, counted in pieces of the bytes."""
+        position, expected = self.start, self.width - 1 + self.trailing
+        while position < len(self.data):
+            end = self.data.find(b"\n", min(position + _PIECE, len(self.data)))
+            end = len(self.data) if end < 0 else end + 1
+            letters = np.frombuffer(self.data, np.uint8, end - position, position)
+            if self.delimiter is None:
+                blank = (letters == 32) | ((letters >= 9) & (letters <= 13))
+                marks = np.flatnonzero(~blank & np.concatenate(([True], blank[:-1])))
+                wanted = self.width
+            else:
+                marks, wanted = np.flatnonzero(letters == ord(self.delimiter)), expected
+            ends = np.flatnonzero(letters == 10)
+            ends = ends if self.data[end - 1 : end] == b"\n" else np.append(ends, letters.size)
+            counts = np.diff(np.searchsorted(marks, ends), prepend=0)
+            begins = np.concatenate(([0], ends[:-1] + 1))
+            wrong = (counts != wanted) & (ends > begins)
+            if np.any(wrong):
+                return False
+            position = end
+        return True
+
+    def column(self, index: int, name: str) -> Float[np.ndarray, " rows"]:
+        """One column as numbers, NaN where it has none.
+
+        **Raises:** `ValueError` naming line and cell.
+        """
+        if index in self.moments:
+            time = self._slowly(index, name)
+            time = time + 86400 * np.cumsum(np.diff(time, prepend=time[0]) < -43200)  # past midnight
+            return time - time[0]
+        try:
+            return self._quickly(index)
+        except (ValueError, OverflowError):  # a cell that is no number, or written in another way than the rest
+            return self._slowly(index, name)
+
+    def _quickly(self, index: int) -> Float[np.ndarray, " rows"]:
+        import pandas
+
+        stream = io.BytesIO(self.data)
+        stream.seek(self.start)
+        comma = self.delimiter != "," and any("," in cell for cell in self.sample)
+        parts = pandas.read_csv(
+            stream, sep=self.delimiter or r"\s+", header=None, names=range(self.width + self.trailing), usecols=[index],
+            index_col=False, dtype=float, na_values=_WRITTEN, keep_default_na=False, skipinitialspace=True,
+            decimal="," if comma else ".", chunksize=_ROWS, encoding_errors="replace",
+        )  # fmt: skip
+        return np.concatenate([part[index].to_numpy() for part in parts])
+
+    def _slowly(self, index: int, name: str) -> Float[np.ndarray, " rows"]:
+        values, value = array.array("d"), _moment if index in self.moments else number_in
+        for number, cells in self.rows():
+            cell = cells[index]
+            try:
+                values.append(float("nan") if cell.casefold() in MISSING else value(cell, self.delimiter))
+            except ValueError:
+                problem = f"{self.file}, line {number}: {name} {cell!r} is not a number"
+                raise ValueError(f"{problem}; leave it empty if it is not known") from None
+        return np.frombuffer(values).copy()
+
+
+def _moment(cell: str, delimiter: str | None) -> float:
+    """The time of day in a cell [s]."""
+    found = _MOMENT.fullmatch(cell)
+    if found is None:
+        raise ValueError
+    hours, minutes, seconds = found.groups()
+    return 3600 * float(hours) + 60 * float(minutes) + float(seconds.replace(",", "."))

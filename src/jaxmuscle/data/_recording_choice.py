@@ -1,0 +1,148 @@
+"""From a table to a recording: choose a column or a point, find rate and unit, close short gaps."""
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxmuscle._common.text import choices
+from jaxmuscle.spectra._settings import require
+
+from ._recording_quality import filled
+from ._recording_table import AXES, Table, find, listed, points, triple, values
+from ._recording_time import clock, sampling
+from ._units import UNITS, known_unit
+
+
+class _Choice(NamedTuple):
+    name: str
+    columns: list[str]
+
+
+def recording_of(
+    make: Callable[..., Any],
+    table: Table,
+    *,
+    column: str | int | None = None,
+    rate: float | int | None = None,
+    units: str | None = None,
+    axis: str | None = None,
+    reference: str | int | None = None,
+    time: str | int | None = None,
+    max_gap: float | int = 0.2,
+    name: str | None = None,
+) -> Any:
+    """What `make`, the class of a recording, makes of a column; arguments as in `load_recording`."""
+    require(axis in (None, *AXES, "principal"), "axis", axis, "choose one of x, y, z, principal")
+    require(isinstance(max_gap, int | float) and 0 <= max_gap < math.inf, "max_gap", max_gap, "give a time in s")
+    times = clock(table, time)
+    chosen = _chosen(table, column, axis, reference, None if times is None else times.name)
+    signal = values(table, chosen.columns)
+    if reference is not None:
+        signal = signal - values(table, _reference(table, reference, axis, signal.shape))
+    found, notices = sampling(table, chosen.columns[0], times, signal.shape[0], rate)
+    unit = _unit(table, chosen, units, axis, notices)
+    file = Path(table.file)
+    words = [file.name, f"column {chosen.name}" if axis is None else f"point {chosen.name}, axis {axis}"]
+    words += [f"minus {reference}"] * (reference is not None) + [f"{found:.6g} Hz"]
+    try:
+        whole, start, closed = filled(signal, found, float(max_gap))
+        samples = whole[:, 0] if whole.shape[1] == 1 else _principal(whole)
+        return make(samples, found, unit=unit, name=name or file.stem, source=", ".join(words), start=start,
+                    notices=(*notices, *closed))  # fmt: skip
+    except ValueError as error:
+        raise ValueError(f"{table.file}: column {chosen.name}: {error}") from None
+
+
+def signals(table: Table, time: str | int | None) -> list[str]:
+    """All columns with numbers besides the time."""
+    times = clock(table, time)
+    return _others(table, None if times is None else times.name)
+
+
+def _chosen(
+    table: Table, column: str | int | None, axis: str | None, reference: str | int | None, time: str | None
+) -> _Choice:
+    """The column, or the columns of the point of which an axis is asked."""
+    if axis is not None:
+        return _point(table, column, axis, reference, time)
+    if column is not None:
+        name = find(table, column)
+        if name == time and len(table.columns) > 1:
+            raise ValueError(f"{table.file}: column {column!r} is the time; choose one of {listed(_others(table, time))}")
+        return _Choice(name, [name])
+    others = _others(table, time)
+    if reference is not None:
+        others = [name for name in others if name != find(table, reference, "reference")]
+    if len(others) != 1:
+        which = listed(others) or "none"
+        raise ValueError(f"{table.file}: holds {len(others)} columns besides the time; choose one with `column`: {which}")
+    return _Choice(others[0], others)
+
+
+def _others(table: Table, time: str | None) -> list[str]:
+    return [name for name in table.columns if name != time and name not in table.words]
+
+
+def _point(table: Table, column: str | int | None, axis: str, reference: str | int | None, time: str | None) -> _Choice:
+    known, others = points(table), _others(table, time)
+    if column is None:
+        stems = [stem for stem in known if reference is None or stem != str(reference).casefold()]
+        if not known and len(others) == 3:
+            return _Choice("the three columns", _axis(others, axis))
+        if len(stems) != 1:
+            raise ValueError(f"{table.file}: holds {len(stems)} points; choose one with `column`: {listed(stems) or 'none'}")
+        column = stems[0]
+    columns = triple(table, str(column))
+    if columns is None:
+        have = f"known are the points {listed(known)}" if known else "there are no points"
+        raise ValueError(
+            f"{table.file}: axis={axis!r} needs a point, three columns as {column}_x, {column}_y, {column}_z; {have}"
+        )
+    return _Choice(str(column), _axis(columns, axis))
+
+
+def _axis(columns: list[str], axis: str) -> list[str]:
+    return columns if axis == "principal" else [columns[AXES.index(axis)]]
+
+
+def _reference(table: Table, reference: str | int, axis: str | None, shape: tuple[int, ...]) -> list[str]:
+    columns = None if axis is None else triple(table, str(reference))
+    if columns is not None and axis is not None:
+        names = _axis(columns, axis)
+    elif axis is None:
+        names = [find(table, reference, "reference")]
+    else:
+        have = listed(points(table)) or "none"
+        raise ValueError(f"{table.file}: no point {reference!r} as reference; known points: {have}")
+    rows = values(table, names).shape[0]
+    if rows != shape[0]:
+        raise ValueError(f"{table.file}: reference={reference!r} has {rows} samples, the column {shape[0]}")
+    return names
+
+
+def _unit(table: Table, chosen: _Choice, units: str | None, axis: str | None, notices: list[str]) -> str:
+    stated = table.units.get(chosen.columns[0])
+    if units is not None:
+        require(known_unit(units) is not None, "units", units, choices(units, UNITS))
+        if stated is not None and known_unit(stated) not in (None, known_unit(units)):
+            notices.append(f"unit {units} as asked; the file says {stated}")
+        return units
+    if stated is not None and known_unit(stated) is not None:
+        return stated
+    if axis is not None:
+        raise ValueError(f"{table.file}: does not say in which unit {chosen.name} is; give `units`, as units='mm'")
+    if stated is not None:
+        raise ValueError(f"{table.file}: column {chosen.name}: unknown unit {stated!r}; give `units`, as units='N'")
+    notices.append("no unit stated: taken as N")
+    return "N"
+
+
+def _principal(xyz: Float[np.ndarray, "times 3"]) -> Any:
+    """The coordinate along the direction of the largest variance."""
+    centred = xyz - xyz.mean(axis=0)
+    direction = np.linalg.eigh(centred.T @ centred)[1][:, -1]
+    return xyz @ (direction * np.sign(direction[np.argmax(np.abs(direction))]))

@@ -1,0 +1,167 @@
+"""What stands above the numbers of a text: names and units, or the header of a laboratory's program."""
+
+import functools
+import itertools
+import re
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from ._recording_body import Body, is_value
+from ._recording_table import Table
+from ._text_tables import Line, number_in, width_remedy
+from ._units import known_unit, seconds
+
+Rows = list[tuple[int, str]]
+_PER_SAMPLE = re.compile(r"\s*([\d.,]+(?:e-?\d+)?)\s*([a-zµ]+)/sample", re.IGNORECASE)
+_CHANNEL = re.compile(rb'^"?CHANNEL"?[\t ,]', re.MULTILINE)
+_TYPES = {"REAL64": "<f8", "REAL32": "<f4", "INT16": "<i2", "INT32": "<i4", "WORD16": "<u2", "WORD8": "u1"}
+
+
+class Head(NamedTuple):
+    """Names and units of the columns and the rate [Hz], as far as a header has them; `counts` rows follow that are none."""
+
+    names: list[str] | None = None
+    units: Sequence[str] = ()
+    rate: float | None = None
+    counts: int = 0
+
+
+def head_of(
+    lines: list[Line], above: Rows, cells: list[list[str]], width: int, delimiter: str | None, length: int, file: str
+) -> Head:
+    """The header: `above` are its rows, `cells` those in cells and the first row of numbers; a text has `length` lines."""
+    found = _labchart(above, width) or _acqknowledge(lines, cells[-1], above, width, length)
+    return found or _names(above, cells[:-1], width, delimiter, file)
+
+
+def _names(above: Rows, cells: list[list[str]], width: int, delimiter: str | None, file: str) -> Head:
+    """The last row of words, or the last but one if the last one holds units."""
+    if not above:
+        return Head()
+    number, row = above[-1][0], cells[-1]
+    if len(row) != width:
+        raise ValueError(f"{file}, line {number + 1}: {width} of {len(row)} columns found; {width_remedy(delimiter)}")
+    for name, cell in zip(row, row, strict=True):
+        if cell and is_value(cell, delimiter):
+            raise ValueError(f"{file}, line {number}: {name!r} cannot be the name of a column; `skip_rows` leaves lines out")
+    if len(cells) > 1 and len(cells[-2]) == width and any(known_unit(cell) or seconds(cell) for cell in row if cell):
+        return Head(cells[-2], [cell.strip("[]() ") for cell in row])
+    return Head(row)
+
+
+def _labchart(above: Rows, width: int) -> Head | None:
+    """LabChart: `Interval=`, `ChannelTitle=`, `UnitName=` or the unit of `Range=`."""
+    pairs = [body.strip().partition("=") for _, body in above]
+    entries = {key: [cell.strip() for cell in re.sub(r"^ *\t?", "", rest).split("\t")] for key, _, rest in pairs}
+    if "Interval" not in entries:
+        return None
+    titles = [title for title in entries.get("ChannelTitle", []) if title]
+    titles = titles or [f"channel {i}" for i in range(1, width + 1)]
+    ranges = [cell.partition(" ")[2].strip() for cell in entries.get("Range", [])]
+    units = entries.get("UnitName", ["*"] * len(titles))
+    units = [unit if unit != "*" else (ranges[i] if i < len(ranges) else "") for i, unit in enumerate(units)]
+    step, _, unit = entries["Interval"][0].partition(" ")
+    timed = width == len(titles) + 1
+    names, units = (["time", *titles], ["s", *units]) if timed else (titles, units)
+    return Head(names[:width] if len(names) >= width else None, units, 1 / (number_in(step, None) * (seconds(unit) or 1.0)))
+
+
+def _acqknowledge(lines: list[Line], first: list[str], above: Rows, width: int, length: int) -> Head | None:
+    """AcqKnowledge: `0.5 msec/sample`, `2 channels`, name and unit of each on lines of their own, `CH1 CH2`, counts."""
+    found = next(((i, match) for i, line in enumerate(lines[:20]) if (match := _PER_SAMPLE.match(line.body))), None)
+    if found is None:
+        return None
+    at, match = found
+    count = int((re.match(r"\s*(\d+)", lines[at + 1].body) or [0, width])[1])
+    texts = [line.body.strip().strip('"') for line in lines[at + 2 : at + 2 + 2 * count]]
+    names, units = texts[::2], texts[1::2]
+    if width == count + 1:
+        scale = re.split(r"[\t,;]", above[-1][1])[0].strip() if above else ""
+        names, units = ["time", *names], [scale if seconds(scale) else "s", *units]
+    numbers = [float(cell) for cell in first if cell and cell.isdigit()]
+    counts = bool(numbers) and all(not c or c.isdigit() for c in first) and abs(max(numbers) - (length - above[-1][0])) <= 2
+    return Head(names if len(names) == width else None, units, 1 / (number_in(match[1], None) * (seconds(match[2]) or 1.0)),
+                int(counts))  # fmt: skip
+
+
+def spike2(data: bytes, file: str) -> Table | None:
+    """Spike2: `INFORMATION`, `SUMMARY`, and for each waveform `CHANNEL`, its type, name and unit, `START`, samples."""
+    if not re.match(rb'\s*"?INFORMATION"?\s*\n', data):
+        return None
+    starts = [match.start() for match in _CHANNEL.finditer(data)]
+    rates = _summary(data[: starts[0]].decode("utf-8", errors="replace")) if starts else {}
+    columns, rate, units, places = {}, {}, {}, []
+    for begin, end in itertools.pairwise([*starts, len(data)]):
+        sign = data.find(b'"START"', begin, end)
+        text = data[begin : max(sign, begin)].decode("utf-8", errors="replace").replace('"', "")
+        lines = [re.split(r"[\t,]", line) for line in text.splitlines() if line.strip()]
+        if len(lines) < 5 or lines[1][0] not in ("Waveform", "RealWave"):
+            continue
+        number, name = lines[0][1].strip(), lines[3][0].strip()
+        name = name if name and name not in columns else f"{name or 'channel'} {number}"
+        row = data.index(b"\n", sign) + 1
+        again, first = data.find(b'"START"', row, end), data.count(b"\n", 0, row) + 1
+        if again > 0:
+            place = f"line {first + data.count(bytes([10]), row, again)}"
+            raise ValueError(f"{file}, {place}: {name} has a gap before it; export a stretch without one")
+        body = Body(data[row:end].rstrip(), 0, file, first, None, 1, False, ["0"])
+        body.check()
+        columns[name] = functools.partial(body.column, 0, name)
+        step = data[sign:row].decode().split()[-1]
+        rate[name], units[name] = rates.get(number) or 1 / number_in(step, None), lines[4][0].strip()
+        places.append(body.place)
+    if not columns:
+        raise ValueError(f"{file}: holds no waveform; export one from Spike2")
+    return Table(file, columns, True, rate, {name: unit for name, unit in units.items() if unit}, place=places[0])
+
+
+def _summary(text: str) -> dict[str, float]:
+    """The rates [Hz] that a summary has for its channels: the ideal one, then the true one."""
+    rows = [[cell.strip(' "') for cell in line.split("\t")] for line in text.splitlines()]
+    return {row[0]: number_in(row[5], None) for row in rows if len(row) >= 6 and is_value(row[5], None) and row[5]}
+
+
+def diadem(data: bytes, file: str, read: Callable[[bytes, str], Table]) -> Table | None:
+    """DIAdem: a header of channels, each with its number of an entry (200 name, 202 unit, 211 file, 241 step), and their
+    values behind it or in the file that it names."""
+    if b"#BEGINCHANNELHEADER" not in data[: 1 << 16]:
+        return None
+    *heads, rest = re.split(rb"#ENDCHANNELHEADER[^\n]*\n?", data)
+    texts = [head.partition(b"#BEGINCHANNELHEADER")[2].decode("cp1252", errors="replace") for head in heads]
+    channels = [dict(line.split(",", 1) for line in text.splitlines() if "," in line) for text in texts]
+    channels = [{key.strip(): value.strip() for key, value in channel.items()} for channel in channels]
+    steps = [c for c in channels if c.get("210", "").startswith("IMPLI")]
+    rate = next((1 / (number_in(c["241"], None) * (seconds(c.get("202")) or 1.0)) for c in steps), None)
+    held = [channel for channel in channels if channel not in steps]
+    sources = {Path(file).parent / channel["211"] for channel in held if channel.get("211")}
+    if len(sources) == 1 and held[0].get("214", "ASCII") in _TYPES:
+        found = [_binary(channel, len(held), next(iter(sources)), file) for channel in held]
+        place, columns = "sample {}".format, [functools.partial(np.asarray, column) for column in found]
+    else:
+        text = _bytes(next(iter(sources)), file) if len(sources) == 1 else rest
+        table = read(text, str(next(iter(sources))) if sources else file)
+        place, columns = table.place, list(table.columns.values())
+    if len(columns) != len(held):
+        raise ValueError(f"{file}: its header has {len(held)} channels with values, but there are {len(columns)} columns")
+    names = [channel.get("200", str(i)) for i, channel in enumerate(held)]
+    units = {name: unit for name, channel in zip(names, held, strict=True) if (unit := channel.get("202", "").strip("[] "))}
+    rates = {} if rate is None else dict.fromkeys(names, rate)
+    return Table(file, dict(zip(names, columns, strict=True)), True, rates, units, place=place)
+
+
+def _bytes(source: Path, file: str) -> bytes:
+    try:
+        return source.read_bytes()
+    except OSError:
+        raise ValueError(f"{file}: its values are in {source.name}, which is not beside it") from None
+
+
+def _binary(channel: dict[str, str], count: int, source: Path, file: str) -> np.ndarray:
+    """The values of a channel: one of several in every row (BLOCK), or all behind one another (CHANNEL)."""
+    raw = np.frombuffer(_bytes(source, file), _TYPES[channel["214"]])
+    first, size = int(channel.get("221", "1")) - 1, int(channel.get("220", "0"))
+    values = raw[first::count] if channel.get("213") == "BLOCK" else raw[first : first + size]
+    return values * float(channel.get("241", "1") or 1) + float(channel.get("240", "0") or 0)

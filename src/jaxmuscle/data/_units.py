@@ -1,0 +1,36 @@
+"""Units as files write them: of a signal, and of its times."""
+
+import re
+
+from ._target_fields import Quantity
+
+UNITS: dict[str, Quantity | None] = {
+    "N": "force", "mN": "force", "kN": "force", "% MVC": "force", "N m": "torque", "N cm": "torque", "N mm": "torque",
+    "m": "displacement", "cm": "displacement", "mm": "displacement", "um": "displacement", "m/s^2": "acceleration",
+    "mm/s^2": "acceleration", "g": "acceleration", "mg": "acceleration", "V": None, "mV": None, "a.u.": None,
+}  # fmt: skip
+_SPELLINGS = {"nm": "N m", "ncm": "N cm", "nmm": "N mm", "%mvc": "% MVC", "pctmvc": "% MVC", "%": "% MVC", "µm": "um",
+              "au": "a.u.", "newton": "N", "newtons": "N", "volt": "V", "volts": "V"}  # fmt: skip
+_SECONDS = {1.0: "s sec secs sek seg second seconds sekunden secondes segundos", 60.0: "min minutes", 3600.0: "h hr hours",
+            1e-3: "ms msec msecs millisec milliseconds", 1e-6: "us µs usec"}  # fmt: skip
+SECONDS = {name: scale for scale, names in _SECONDS.items() for name in names.split()}
+_BRACKETS = re.compile(r"(.*?)\s*[\[(]([^\[\]()]+)[\])]\s*")
+_SUFFIX = re.compile(r"(.+?)(?:_|\s*/\s*)(N|mN|kN|pctMVC|Nm|Ncm|Nmm|m|cm|mm|um|µm|V|mV|s|ms|us)\s*")
+
+
+def known_unit(unit: str) -> str | None:
+    """The unit as `UNITS` writes it (`Nm`, `N·m`, `N*m` are `N m`; `m/s²`, `m/s2` are `m/s^2`), or `None` if not there."""
+    bare = "".join(unit.replace("μ", "µ").replace("²", "2").translate(str.maketrans("", "", "·*.^()[]")).split())
+    exact = {"".join(name.replace(".", "").replace("^", "").split()): name for name in UNITS}
+    return exact.get(bare) or _SPELLINGS.get(bare.casefold())
+
+
+def seconds(unit: str | None) -> float | None:
+    """How many seconds a unit of time has, or `None` for another unit."""
+    return None if unit is None else SECONDS.get(unit.replace("μ", "µ").strip(" []().").casefold())
+
+
+def name_and_unit(name: str) -> tuple[str, str | None]:
+    """A column's name in small letters, and the unit it holds: `Force [N]`, `Kraft / N`, `force_N`, `torque_Nm`."""
+    found = _BRACKETS.fullmatch(name) or _SUFFIX.fullmatch(name)
+    return (found[1].strip().casefold(), found[2].strip()) if found else (name.strip().casefold(), None)
