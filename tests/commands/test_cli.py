@@ -17,8 +17,11 @@ from test_result import assert_equal, failed_result, made_result
 from typer.testing import CliRunner
 
 import jaxmuscle as jm
+from jaxmuscle import paper
 from jaxmuscle._common.environment import keep_compiled_programs
 from jaxmuscle.commands.main import app
+from jaxmuscle.paper._claims import claims_json
+from jaxmuscle.paper._verdicts import Row
 
 GRID = 0.390625 * np.arange(1, 31)
 POWER = 1 / (1 + (GRID / 1.2) ** 2) + 0.01
@@ -432,6 +435,15 @@ def test_a_cohort_as_json(tmp_path, monkeypatch):
     assert [row["value"] for row in found["table"] if row["quantity"] == "mean"] == [2.5, None]
     assert jm.load_result(found["fits"]["a"]).success
     assert len(found["table"]) == len((tmp_path / "out" / "cohort.csv").read_text().splitlines()) - 1
+
+
+def test_the_paper_as_json(tmp_path, monkeypatch):
+    row = Row("key", "fitted", "[30]", "says", "ours", (1.0, np.nan), "how", "does not agree", "why")
+    monkeypatch.setattr(jm, "reproduce", lambda *_, **__: None)
+    monkeypatch.setattr(paper, "check", lambda found: (row,))
+    found = strict(run("reproduce", "--json", "--out", tmp_path).stdout)
+    assert found["claims"] == strict(claims_json((row,))) and found["claims"][0]["numbers"] == [1.0, None]
+    assert found["summary"] == paper.counted([row])
 
 
 # The long work of a command, its arguments, and what it would overwrite.
