@@ -19,7 +19,7 @@ help:
 	@echo "Another interpreter: make PYTHON=python3.12 fit"
 
 fit: .venv/.stamp-run
-	$(BIN)/jaxmuscle fit vastus-lateralis-26mvc --out out/fit
+	$(BIN)/jaxmuscle fit vastus-lateralis-26mvc --out out/fit --force
 
 test: .venv/.stamp-test
 	@$(BIN)/python tests/wings.py $(WING) >/dev/null

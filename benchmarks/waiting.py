@@ -18,10 +18,10 @@ TARGET = "vastus-lateralis-26mvc"
 COMMANDS: dict[str, tuple[list[str], float]] = {
     "import jaxmuscle": (["-c", "import jaxmuscle"], 0.05),
     "jm.fit in a fresh process": (["-c", FIT], 2.5),
-    "jaxmuscle fit, whole": (["-m", "jaxmuscle", "fit", TARGET], 2.5),
-    "jaxmuscle fit --quick (to the printed table)": (["-m", "jaxmuscle", "fit", TARGET, "--quick"], 1.7),
-    "jaxmuscle posterior": (["-m", "jaxmuscle", "posterior", TARGET], 10.0),
-    "jaxmuscle compare": (["-m", "jaxmuscle", "compare", TARGET], 10.0),
+    "jaxmuscle fit, whole": (["-m", "jaxmuscle", "fit", TARGET, "--force"], 2.5),
+    "jaxmuscle fit --quick (to the printed table)": (["-m", "jaxmuscle", "fit", TARGET, "--quick", "--force"], 1.7),
+    "jaxmuscle posterior": (["-m", "jaxmuscle", "posterior", TARGET, "--force"], 10.0),
+    "jaxmuscle compare": (["-m", "jaxmuscle", "compare", TARGET, "--force"], 10.0),
 }
 
 

@@ -200,6 +200,8 @@ def test_key_decides_and_figures_are_drawn():
     np.testing.assert_array_equal(a.residuals, b.residuals)
     assert not np.array_equal(a.residuals, c.residuals)
     assert a.observed["chi2_per_bin"] == pytest.approx(result.chi2_per_bin)
+    table = a.to_dataframe().set_index("check")
+    assert dict(table["observed"]) == a.observed and dict(table["p_value"]).items() < a.p_values.items()
     assert max(map(len, str(a).splitlines())) <= 80
     figure = a.plot()
     assert len(figure.axes) == 4
@@ -269,7 +271,7 @@ def test_bootstrap_is_told_saved_and_drawn(tmp_path):
     assert found.success == (all(q.verdict == "holds" for q in found.quantities.values()))
     found.save(tmp_path / "b.json")
     table = json.loads((tmp_path / "b.json").read_text())
-    assert [row["quantity"] for row in table["table"]] == list(found.quantities)
+    assert [row["quantity"] for row in table["table"]] == list(found.quantities) == list(found.to_dataframe()["quantity"])
     np.testing.assert_array_equal(table["refits"]["c_w"]["values"], found.quantities["c_w"].values)
     figure = found.plot()
     assert len(figure.axes) == len(found.quantities)

@@ -17,8 +17,11 @@ from test_result import assert_equal, failed_result, made_result
 from typer.testing import CliRunner
 
 import jaxmuscle as jm
+from jaxmuscle import paper
 from jaxmuscle._common.environment import keep_compiled_programs
 from jaxmuscle.commands.main import app
+from jaxmuscle.paper._claims import claims_json
+from jaxmuscle.paper._verdicts import Row
 
 GRID = 0.390625 * np.arange(1, 31)
 POWER = 1 / (1 + (GRID / 1.2) ** 2) + 0.01
@@ -190,7 +193,7 @@ def test_listings_and_help_do_not_wait_for_jax():
 import sys
 from typer.testing import CliRunner
 from jaxmuscle.commands.main import app
-for arguments in (["targets"], ["presets"], ["--help"], ["fit", "--help"], ["simulate", "--help"]):
+for arguments in (["targets"], ["presets"], ["--help"], ["fit", "--help"], ["simulate", "--help"], ["targets", "--json"]):
     result = CliRunner().invoke(app, arguments)
     assert result.exit_code == 0, (arguments, result.output)
     slow = {"jax", "numpy", "scipy", "matplotlib", "xarray"} & set(sys.modules)
@@ -279,7 +282,7 @@ def test_what_was_fitted_can_be_simulated(fitted, tmp_path):
     import xarray
 
     _, folder = fitted
-    outcome = run("simulate", folder / "fit.json", "--seeds", 8, "--seed", 2, "--out", tmp_path)
+    outcome = run("simulate", folder / "fit.json", "--seeds", 8, "--seed", 2, "--json", "--out", tmp_path)
     assert outcome.exit_code == 0
     assert sorted(p.name for p in tmp_path.iterdir()) == ["simulate.png", "spectrum.csv", "trajectories.nc"]
     task = jm.load_result(folder / "fit.json").task
@@ -292,6 +295,10 @@ def test_what_was_fitted_can_be_simulated(fitted, tmp_path):
     np.testing.assert_allclose(columns["power"], estimate.power, rtol=1e-5)
     np.testing.assert_allclose(columns["power_stderr"], estimate.stderr, rtol=1e-5)
     assert np.all(columns["quantile_05"] < columns["quantile_95"])
+    found = strict(outcome.stdout)
+    assert found["seeds"] == 8 and found["unit"] == "N" and found["mean"] == pytest.approx(float(runs.filtered().mean()))
+    assert found["spectrum"].keys() == columns.keys() and all(Path(file).exists() for file in found["files"])
+    np.testing.assert_allclose(found["spectrum"]["power"], columns["power"], rtol=1e-7)
 
 
 @pytest.mark.slow
@@ -358,6 +365,147 @@ def test_a_failing_simulation_is_not_a_users_mistake(tmp_path, monkeypatch):
     made_result().save(tmp_path / "fit.json")
     outcome = run("simulate", tmp_path / "fit.json", "--out", tmp_path / "out")
     assert outcome.exit_code == 1 and "failed: 3 seed(s) did not stay finite [0, 1, 2]" in outcome.stderr
+
+
+# --- for scripts: exit codes, JSON, what is there already
+
+
+def raising(error):
+    def instead(*_, **__):
+        raise error
+
+    return instead
+
+
+REACHED = raising(jm.errors.SimulationError("the long work was reached"))
+STOPPED = jm.fits.FitInterrupted(made_result(success=False, message="interrupted after 3 steps"))
+# What a fit does: exit code, whether there is a result.
+ENDS = {
+    "converged": (lambda *_, **__: made_result(), 0, True),
+    "not converged": (lambda *_, **__: failed_result(), 1, True),
+    "exploded": (REACHED, 1, False),
+    "bad argument": (raising(ValueError("c_w = -1 N s^2/m^2 is outside [0, inf]")), 2, False),
+    "no file": (raising(FileNotFoundError(2, "No such file or directory", "spectrum.csv")), 2, False),
+    "interrupted": (raising(KeyboardInterrupt), 130, False),
+    "interrupted with a result": (raising(STOPPED), 130, True),
+}
+
+
+def strict(text):
+    """JSON without NaN and Infinity, which its standard does not know."""
+    return json.loads(text, parse_constant=lambda word: pytest.fail(f"{word} is not JSON"))
+
+
+@pytest.mark.parametrize("case", ENDS)
+def test_exit_codes_and_json(case, tmp_path, monkeypatch):
+    fake, code, there = ENDS[case]
+    monkeypatch.setattr(jm, "fit", fake)
+    path = csv_file(tmp_path)
+    plain = run("fit", path, "--out", tmp_path / "text")
+    outcome = run("fit", path, "--json", "--out", tmp_path / "json")
+    assert plain.exit_code == outcome.exit_code == code
+    assert outcome.stderr == plain.stderr.replace(str(tmp_path / "text"), str(tmp_path / "json"))
+    assert "rescaled to 1" in outcome.stderr  # notices are for people
+    if there:
+        assert strict(outcome.stdout) == strict((tmp_path / "json" / "fit.json").read_text())
+        assert outcome.stdout.count("\n") == 1
+    else:
+        assert outcome.stdout == "" and len(outcome.stderr.splitlines()) == 2
+    assert "{" not in plain.stdout
+
+
+@pytest.mark.parametrize(
+    "arguments", [["fits"], ["fit"], ["targets", "--jason"], ["speed", "--seeds", "many"]], ids=" ".join
+)
+def test_what_cannot_be_read_ends_with_2(arguments):
+    outcome = run(*arguments)
+    assert outcome.exit_code == 2 and outcome.stdout == "" and outcome.stderr.startswith("Usage: ")
+
+
+def test_listings_as_json():
+    found = strict(run("targets", "--json").stdout)["targets"]
+    assert [entry["name"] for entry in found] == list(jm.list_targets())
+    assert {entry["quantity"] for entry in found} <= {"force", "torque", "displacement"}
+    assert [entry["name"] for entry in strict(run("presets", "--json").stdout)["presets"]] == list(jm.list_presets())
+    assert run("targets").stdout.startswith("Bundled targets")  # nothing of --json is left
+
+
+GROUPS = {"a": "old", "b": "young"}
+
+
+def test_a_cohort_as_json(tmp_path, monkeypatch):
+    results = {"a": made_result(), "b": failed_result()}
+    monkeypatch.setattr(jm, "fit_cohort", lambda *_, **__: jm.fits.CohortResult(results, GROUPS, {"c": "no file"}))
+    outcome = run("fit", *[csv_file(tmp_path, name=f"{name}.csv") for name in "ab"], "--json", "--out", tmp_path / "out")
+    assert outcome.exit_code == 2  # c could not be read
+    found = strict(outcome.stdout)
+    assert found["success"] is False and found["failed"] == {"c": "no file"}
+    assert [(row["quantity"], row["a"], row["b"]) for row in found["differences"]] == [("c_w", "old", "young")]
+    assert [row["value"] for row in found["table"] if row["quantity"] == "mean"] == [2.5, None]
+    assert jm.load_result(found["fits"]["a"]).success
+    assert len(found["table"]) == len((tmp_path / "out" / "cohort.csv").read_text().splitlines()) - 1
+
+
+def test_the_paper_as_json(tmp_path, monkeypatch):
+    row = Row("key", "fitted", "[30]", "says", "ours", (1.0, np.nan), "how", "does not agree", "why")
+    monkeypatch.setattr(jm, "reproduce", lambda *_, **__: None)
+    monkeypatch.setattr(paper, "check", lambda found: (row,))
+    found = strict(run("reproduce", "--json", "--out", tmp_path).stdout)
+    assert found["claims"] == strict(claims_json((row,))) and found["claims"][0]["numbers"] == [1.0, None]
+    assert found["summary"] == paper.counted([row])
+
+
+# The long work of a command, its arguments, and what it would overwrite.
+OVERWRITES = {
+    "fit": ("fit", ["fit", "{csv}"], ["fit.json"]),
+    "several": ("fit_cohort", ["fit", "{csv}", "vastus-lateralis-26mvc"],
+                ["cohort.csv", "spectrum/fit.json", "vastus-lateralis-26mvc/fit.json"]),
+    "simulate": ("ensemble", ["simulate", "zagrodny-slifkin"], ["trajectories.nc"]),
+    "analyse": ("load_recording", ["analyse", "{csv}", "--save-target", "{out}/held.toml"], ["analysis.json", "held.toml"]),
+    "posterior": ("fit", ["posterior", "{csv}", "--segments", "9"], ["fit.json", "posterior.nc", "posterior.json"]),
+    "compare": ("compare_noise", ["compare", "{csv}"], ["compare.json"]),
+    "reproduce": ("reproduce", ["reproduce"], ["claims.json"]),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("case", "file"), [(case, file) for case, (*_, files) in OVERWRITES.items() for file in files])
+def test_an_earlier_result_is_overwritten_by_force_only(case, file, tmp_path, monkeypatch):
+    work, arguments, _ = OVERWRITES[case]
+    monkeypatch.setattr(jm, work, REACHED)
+    out, path = tmp_path / "out", csv_file(tmp_path)
+    arguments = [*(a.format(csv=path, out=out) for a in arguments), "--out", out]
+    reached = run(*arguments)
+    assert reached.exit_code == 1 and "the long work was reached" in reached.stderr
+    (out / file).parent.mkdir(exist_ok=True)
+    (out / file).write_text("a result")
+    (out / "spectrum.csv").write_text("of any command")  # its numbers are in the result, too
+    refused = run(*arguments)
+    assert refused.exit_code == 2 and refused.stdout == ""
+    assert f"{out / file}: is there already; overwrite it with --force" in refused.stderr
+    assert (out / file).read_text() == "a result"
+    assert run(*arguments, "--force").exit_code == 1
+    assert (out / file).read_text() == "a result"  # until there is a new one
+
+
+def test_a_fit_that_is_taken_up_is_no_obstacle(tmp_path, monkeypatch):
+    made_result().save(tmp_path / "fit.json")
+    monkeypatch.setattr(jm, "posterior", REACHED)
+    assert "was reached" in run("posterior", tmp_path / "fit.json", "--out", tmp_path).stderr
+    (tmp_path / "posterior.json").write_text("a result")
+    assert "posterior.json: is there already" in run("posterior", tmp_path / "fit.json", "--out", tmp_path).stderr
+
+
+def test_a_fit_is_replaced(tmp_path, monkeypatch):
+    for seed, force in ((1, ()), (2, ("--force",))):
+        monkeypatch.setattr(jm, "fit", lambda *_, seed=seed, **__: made_result(seed=seed))
+        assert run("fit", csv_file(tmp_path), "--out", tmp_path, *force).exit_code == 0
+        assert jm.load_result(tmp_path / "fit.json").seed == seed
+
+
+@pytest.mark.parametrize("name", sorted(typer.main.get_group(app).commands))
+def test_every_command_speaks_json_and_asks_before_it_overwrites(name):
+    options = {text for option in typer.main.get_group(app).commands[name].params for text in option.opts}
+    assert "--json" in options and ("--force" in options) == ("--out" in options)
 
 
 # --- interruption

@@ -260,6 +260,13 @@ def test_differences_and_weights():
     assert by["pink", True].score_difference == 0.0 == by["pink", True].score_stderr
 
 
+@pytest.mark.parametrize("sigma", [False, True])
+def test_the_table_as_a_frame(sigma):
+    table = made(sigma=sigma).to_dataframe()
+    assert list(table.columns) == list(COLUMNS) and list(table["noise"]) == [row.noise for row in made().rows]
+    assert table["score"].dtype == float and bool(table["score"].isna().all()) == sigma
+
+
 def test_six_and_the_same_sign_are_needed():
     up, down = np.full(5, 0.1), np.zeros(5)
     assert decided(("a", "b"), Evidence(0.0, up), Evidence(6.0, down)).winner == "a"
@@ -401,7 +408,8 @@ def test_the_command_writes_its_files(success, tmp_path, monkeypatch, keep_cache
         return made(success=success)
 
     monkeypatch.setattr(jm, "compare_noise", compare_noise)
-    result = command(FORCE, "--free", "c_w, noise_K_z", "--fix", "k_w=4e5", "--seed", 3, "--segments", 9, "--out", tmp_path)
+    asking = ["--free", "c_w, noise_K_z", "--fix", "k_w=4e5", "--seed", 3, "--segments", 9, "--out", tmp_path]
+    result = command(FORCE, *asking)
     assert result.exit_code == (0 if success else 1)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["compare.csv", "compare.json", "compare.png"]
     rows = list(csv.DictReader((tmp_path / "compare.csv").read_text().splitlines()))
@@ -409,6 +417,9 @@ def test_the_command_writes_its_files(success, tmp_path, monkeypatch, keep_cache
     assert "pink and ornstein-uhlenbeck cannot be told apart" in result.stdout and "left out: white" in result.stdout
     assert isinstance(asked["task"], jm.Isometric) and asked["target"].segments == (9,)
     assert (asked["free"], asked["fix"], asked["key"]) == (["c_w", "noise_K_z"], {"k_w": 4e5}, 3)
+    as_json = command(FORCE, *asking, "--json", "--force")
+    assert as_json.exit_code == result.exit_code
+    assert json.loads(as_json.stdout) == json.loads((tmp_path / "compare.json").read_text())
 
 
 @pytest.mark.parametrize(

@@ -146,6 +146,9 @@ def test_summary_against_its_sources():
     assert summary.peaks == peaks(part.spectrum())
     assert summary.segments == part.segments() == (1600 - 256) // 128 + 1
     assert any(abs(peak.interpolated - 8) < 0.1 for peak in summary.peaks.local_maxima)
+    table = summary.to_dataframe().set_index("quantity")
+    assert list(table["value"].loc[["segments", "mean", "sample_entropy"]]) == [11, summary.mean, summary.sample_entropy]
+    assert table["value"]["maximum"] == summary.peaks.maximum.interpolated and table["unit"]["maximum"] == "Hz"
     assert "coefficient of variation" in str(summary) and summary.to_dict()["peaks"]["maximum"]["bin"] >= 1
 
 

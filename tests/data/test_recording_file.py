@@ -401,8 +401,9 @@ def test_command(tmp_path):
     assert record["recording"]["window"] == [4.0, 16.0] and record["summary"] == held.summary().to_dict()
     assert (saved.name, saved.provenance) == ("held", "measured")
     assert matplotlib.image.imread(out / "analysis.png").shape[:2] == (840, 1350)
-    found = run(path, "--out", out)
-    assert found.exit_code == 0 and "found by itself" in found.output
+    found = run(path, "--out", out, "--force", "--json")
+    assert found.exit_code == 0 and "found by itself" in found.stderr
+    assert json.loads(found.stdout) == json.loads((out / "analysis.json").read_text()) != record
 
 
 @pytest.mark.parametrize(

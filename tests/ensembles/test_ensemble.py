@@ -189,6 +189,10 @@ def test_a_reduced_sweep_has_the_moments_of_every_point(seeds, chunk):
         output = np.asarray(jm.ensemble(sweep[point], KEY, seeds=seeds, duration=1.0).output, float)
         close(found.mean[point], output.mean(axis=0))
     np.testing.assert_array_equal(found.to_xarray()["k_w"], sweep.labels["k_w"])
+    table = found.to_dataframe()
+    one = table[(table["k_w"] == 8e5) & (table["time"] == 0.5)]
+    assert len(table) == 5 * 101 and one["mean"].item() == found.mean[4, 50]
+    assert one["quantile_0.5"].item() == found.quantile[4, found.levels.index(0.5), 50]
 
 
 @pytest.mark.slow
@@ -322,6 +326,23 @@ def test_an_interrupted_store_is_resumed(tmp_path, monkeypatch, reduce):
     assert len(left) == 3, "a complete store is not run again"
     assert type(again) is type(found)
     assert not list(path.glob("*.npz")) + list(path.glob("*.txt"))
+
+
+@pytest.mark.slow
+def test_a_store_is_overwritten_once_nothing_else_is_wrong(tmp_path):
+    path, kept = tmp_path / "a.zarr", tmp_path / "mine"
+    given: Any = {"seeds": 8, **SHORT}
+    jm.ensemble(TASK, KEY, store=path, **given)
+    with pytest.raises(ValueError, match="seeds = 0"):
+        jm.ensemble(TASK, KEY, store=path, overwrite=True, **given | {"seeds": 0})
+    assert xarray.open_zarr(path).attrs["complete"] is True
+    other = jm.ensemble(TASK, jax.random.key(6), store=path, overwrite=True, **given)
+    np.testing.assert_array_equal(other["F_ext"], jm.ensemble(TASK, jax.random.key(6), **given).output)
+    kept.mkdir()
+    (kept / "notes.txt").write_text("not an ensemble")
+    with pytest.raises(ValueError, match="is not a store that jaxmuscle wrote"):
+        jm.ensemble(TASK, KEY, store=kept, overwrite=True, **given)
+    assert (kept / "notes.txt").exists()
 
 
 @pytest.mark.parametrize(
@@ -655,8 +676,12 @@ def test_the_command_writes_resumes_and_refuses(tmp_path):
     assert again.exit_code == 2 and "exists already" in again.stderr
     resumed = RUNNER.invoke(app, [*arguments, "--task", "prescribed-force", "--resume"])
     assert resumed.exit_code == 0 and "was complete, nothing to do" in resumed.stdout
+    either = RUNNER.invoke(app, [*arguments, "--resume", "--force"])
+    assert either.exit_code == 2 and "give one of the two" in either.stderr
     other = RUNNER.invoke(app, [*arguments, "--resume"])
     assert other.exit_code == 2 and '"PrescribedForce" there, "PrescribedMotion" here' in "".join(other.stderr.splitlines())
+    replaced = RUNNER.invoke(app, [*arguments, "--force"])
+    assert replaced.exit_code == 0 and xarray.open_zarr(path).attrs["task"] == "PrescribedMotion"
 
 
 def test_the_command_speaks_json(tmp_path):
@@ -664,9 +689,7 @@ def test_the_command_speaks_json(tmp_path):
     done = RUNNER.invoke(app, ["ensemble", "zagrodny-slifkin", "--vary", "c_w=2,3", "--vary", "k_w=1e6,2e6", *arguments])
     assert done.exit_code == 0, done.output
     lines = [json.loads(line) for line in done.stdout.splitlines()]
-    assert lines[-1]["event"] == "done" and lines[-1]["failed"] == []
-    assert {"done", "total", "seeds_per_second", "real_time_factor", "left"} < set(lines[0])
-    assert lines[-2]["done"] == lines[-2]["total"] == 80
+    assert len(lines) == 1 and lines[0]["event"] == "done" and lines[0]["failed"] == [] and lines[0]["seeds"] == 20
     assert dict(xarray.open_zarr(tmp_path / "a").sizes) == {"point": 4, "time": 101, "quantile": 5}
 
 

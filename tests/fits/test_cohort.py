@@ -139,6 +139,8 @@ def test_tables_hold_every_quantity_of_every_target():
         here = data.sel(target=row["target"], quantity=row["quantity"])
         assert float(here["value"]) == row["value"] and str(here["unit"].item()) == row["unit"]
         assert np.isnan(here["stderr"]) if row["stderr"] is None else float(here["stderr"]) == row["stderr"]
+    table = found.to_dataframe()
+    assert list(table["value"]) == [row["value"] for row in rows] and list(table.columns) == list(rows[0])
 
 
 def test_single_members_are_compared_by_their_standard_errors():

@@ -110,6 +110,46 @@ def assert_equal(a, b):
         assert a == b or (a != a and b != b)
 
 
+# --- by name, and as a table
+
+
+def test_every_number_by_its_name():
+    result = made_result()
+    corner = result["corner_frequency"]
+    assert (corner.value, corner.stderr, corner.unit, corner.interval) == (1 / 3, 0.01, "Hz", (0.31, None))
+    assert result["c_w"].value == result.task["c_w"] and result["m_w"].stderr is None
+    with pytest.raises(ValueError, match="unknown quantity 'corner_frequenzy' of the fit of made: did you mean 'corner_f"):
+        result["corner_frequenzy"]
+
+
+def test_the_numbers_of_several_targets_by_name():
+    mean, other = Estimate(2.5, "N", 0.1), Estimate(3.5, "N", 0.2)
+    result = made_result(derived={"mean@a": mean, "mean@b": other})
+    assert result["mean@b"].value == 3.5
+    with pytest.raises(ValueError, match="quantity 'mean' of the fit of made: did you mean 'mean@"):
+        result["mean"]
+
+
+def test_a_result_as_a_table():
+    result = made_result()
+    table = result.to_dataframe().set_index("quantity")
+    assert list(table.columns) == ["kind", "value", "stderr", "low", "high", "unit", "free", "determined"]
+    assert set(table.index) == set(result.parameters) | set(result.derived) and table.index.is_unique
+    assert list(table.loc["corner_frequency", ["kind", "value", "stderr", "low"]]) == ["derived", 1 / 3, 0.01, 0.31]
+    assert np.isnan(table["high"]["corner_frequency"]) and np.isnan(table["stderr"]["k_w"])
+    assert list(table.loc["k_w", ["kind", "free", "determined"]]) == ["parameter", True, False]
+    assert set(table.index[table["determined"]]) == {"c_w", "corner_frequency"}
+    bins = result.only.to_dataframe()
+    np.testing.assert_array_equal(bins["fitted"], result.fitted)
+    np.testing.assert_array_equal(bins["frequency_hz"], TARGET.frequency)
+
+
+def test_the_table_of_a_failed_fit_has_numbers_in_its_columns_of_numbers():
+    table = failed_result().to_dataframe()
+    assert list(table.dtypes[["value", "stderr", "low", "high"]]) == [float] * 4
+    assert np.isnan(table.set_index("quantity")["value"]["mean"])
+
+
 # --- fit.json
 
 

@@ -370,6 +370,9 @@ def test_the_report_as_json(tmp_path):
     known = table["designs"][1]["quantities"]["K_z0"]
     assert known["left"] == pytest.approx(known["stderr"] / known["prior_sd"])
     assert table["designs"][0]["data"] == "mean to 2 %"
+    rows = report().to_dataframe().set_index(["design", "quantity"])
+    assert rows["stderr"][report().designs[1].name, "K_z0"] == known["stderr"]
+    assert rows["left"]["", "K_z0"] == table["present"]["quantities"]["K_z0"]["left"]
 
 
 def test_the_figure():

@@ -127,6 +127,8 @@ def test_curvature_profile_and_posterior_agree_where_the_data_determine_all():
         assert (told.high - told.low) / 3.92 == pytest.approx(row["sd"], rel=0.15), name
         assert abs(told.value - row["mean"]) < 0.3 * row["sd"], name
         assert abs(row["mean"] - float(truth[name])) < 3.5 * row["sd"], name
+        points = told.to_dataframe()
+        np.testing.assert_array_equal(points[["value", "rise"]], np.stack([told.values, told.rise], axis=1))
 
 
 @pytest.mark.slow
@@ -141,6 +143,11 @@ def test_posterior_as_files_and_figures(tmp_path):
     found.save(tmp_path / "p.json")
     table = json.loads((tmp_path / "p.json").read_text())
     assert table["success"] and table["summary"]["c_w"]["r_hat"] == found.diagnostics["c_w"][0]
+    draws, rows = found.to_dataframe(), found.summary().to_dataframe()
+    assert list(draws.columns) == ["chain", "draw", *found.quantities] and list(rows["quantity"]) == list(found.quantities)
+    last = draws[(draws["chain"] == 3) & (draws["draw"] == 7)]
+    assert last["c_w"].item() == found.samples["c_w"][3, 7]
+    assert rows.set_index("quantity")["r_hat"]["c_w"] == found.diagnostics["c_w"][0]
     for figure in (found.plot(), found.plot_chains(), found.plot_predictive().figure):
         figure.canvas.draw()
         plt.close(figure)
@@ -286,6 +293,10 @@ def test_command(tmp_path):
     assert run.exit_code == 1 and "did not mix" in run.output
     assert {p.name for p in (tmp_path / "b").iterdir()} == {"fit.json", "posterior.nc", "posterior.json", "chains.png"}
     assert json.loads((tmp_path / "b" / "posterior.json").read_text())["summary"] is None
+    again = CliRunner().invoke(app, ["posterior", str(tmp_path / "b" / "fit.json"), *few, "--force", "--json",
+                                     "--out", str(tmp_path / "b")])  # fmt: skip
+    assert again.exit_code == 1 and "did not mix" in again.stderr
+    assert json.loads(again.stdout) == json.loads((tmp_path / "b" / "posterior.json").read_text())
 
 
 def benchmark():

@@ -2,6 +2,7 @@
 
 import contextlib
 import json
+import math
 import os
 import tempfile
 from collections.abc import Iterator
@@ -44,6 +45,15 @@ def write_text(path: str | Path, text: str) -> None:
     """Write a text file atomically."""
     with replacing(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
+
+
+def nulled(value: Any) -> Any:
+    """Nested tables and lists with None for every number that is not finite: JSON has no word for it."""
+    if isinstance(value, dict):
+        return {key: nulled(entry) for key, entry in value.items()}
+    if isinstance(value, list | tuple):
+        return [nulled(entry) for entry in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def write_json(path: str | Path, value: Any) -> None:

@@ -11,6 +11,7 @@ from jaxtyping import Float
 from jaxmuscle import plot
 from jaxmuscle._common.environment import versions
 from jaxmuscle._common.parts import of_only, only
+from jaxmuscle._common.tables import frame
 from jaxmuscle._common.text import folded, probability
 from jaxmuscle.data._target import Target
 from jaxmuscle.fits._reopened import reopened
@@ -25,6 +26,7 @@ from jaxmuscle.response._expected import Moments
 from jaxmuscle.spectra._bin_law import bin_statistics
 
 if TYPE_CHECKING:
+    import pandas
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure, SubFigure
 
@@ -150,6 +152,12 @@ class Goodness(eqx.Module):
     def foretold(self) -> bool:
         """Whether the spectrum is another than the one fitted."""
         return next(iter(self.parts.values())).foretold
+
+    def to_dataframe(self) -> "pandas.DataFrame":
+        """A row for each target and check: `target`, `check`, `observed`, `usual` (mean of the replicates), `p_value`."""
+        return frame([{"target": name, "check": check, "observed": value, "usual": float(np.mean(part.reference[check])),
+                       "p_value": part.p_values[check]}
+                      for name, part in self.parts.items() for check, value in part.observed.items()])  # fmt: skip
 
     def __str__(self) -> str:
         lines = [str(part) for part in self.parts.values()]

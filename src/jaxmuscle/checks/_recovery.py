@@ -14,9 +14,11 @@ from jaxmuscle import plot
 from jaxmuscle._common.arrays import with_nulls
 from jaxmuscle._common.environment import versions
 from jaxmuscle._common.files import write_text
+from jaxmuscle._common.tables import frame
 from jaxmuscle._common.text import folded
 
 if TYPE_CHECKING:
+    import pandas
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure, SubFigure
 
@@ -127,6 +129,10 @@ class Bootstrap(eqx.Module):
              "coverage": q.coverage, "intervals": q.inside[1], "refits": len(q.values), "verdict": q.verdict}
             for q in self.quantities.values()
         ]  # fmt: skip
+
+    def to_dataframe(self) -> "pandas.DataFrame":
+        """The rows of `table`."""
+        return frame(self.table())
 
     @property
     def sentences(self) -> tuple[str, ...]:

@@ -10,7 +10,7 @@ from rich.table import Table
 import jaxmuscle as jm
 from jaxmuscle._common.progress import told
 
-from .console import BAD_INPUT, CONVERGED, NOT_CONVERGED, csv_text, err, out, plain, save_figure, writable, write_fit
+from .console import BAD_INPUT, CONVERGED, NOT_CONVERGED, csv_text, err, out, plain, record, save_figure, writable, write_fit
 from .options import TaskName
 
 if TYPE_CHECKING:
@@ -32,10 +32,11 @@ def fit_together(
     groups: Path | None,
     folder: Path,
     options: dict[str, Any],
+    *,
+    force: bool,
 ) -> int:
     """Fit and write all targets that can be read; the exit code says whether some could not be, or did not converge."""
     grouped = {} if groups is None else _groups(groups)
-    writable(folder)
     targets, failed = [], {}
     for name in names:
         try:
@@ -46,6 +47,7 @@ def fit_together(
     options = {name: value for name, value in options.items() if name != "starts"} | starts
     if not targets:
         raise ValueError(f"none of the targets can be read: {_reasons(failed)}")
+    writable(folder, "cohort.csv", *(f"{target.name}/fit.json" for target in targets), force=force)
     with told(True, f"fitting {len(targets)} targets") as tell:
         found = jm.fit_cohort(
             targets, groups=grouped, task=None if task is None else jm.model.TASKS[task], progress=tell, **options
@@ -91,6 +93,9 @@ def _write(cohort: "CohortResult", folder: Path) -> None:
         write_text(folder / "differences.csv", csv_text(_columns(differences)))
     if any(row["stderr"] is not None for row in cohort.table()):
         save_figure(cohort.plot("group" if len(set(cohort.groups.values())) > 1 else "person"), folder / "cohort.png")
+    fits = {name: str(folder / name / "fit.json") for name in cohort.results}
+    record({"success": cohort.success, "verdict": cohort.verdict, "table": cohort.table(), "differences": differences,
+            "failed": cohort.failed, "fits": fits})  # fmt: skip
 
 
 def _row(difference: Any) -> dict[str, Any]:

@@ -8,8 +8,8 @@ import typer
 import jaxmuscle as jm
 from jaxmuscle._common.progress import told
 
-from .console import CONVERGED, NOT_CONVERGED, aim_of, csv_text, out, plain, reporting, save_figure, writable
-from .options import Fix, Free, Output, Quantity, Seed, Segments, TargetTask, fixed_values, names_in
+from .console import CONVERGED, NOT_CONVERGED, aim_of, csv_text, out, plain, record, reporting, save_figure, writable
+from .options import Fix, Force, Free, Json, Output, Quantity, Seed, Segments, TargetTask, fixed_values, names_in
 
 if TYPE_CHECKING:
     from jaxmuscle.comparison import Comparison
@@ -26,6 +26,8 @@ def compare(
     segments: Segments = None,
     quantity: Quantity = None,
     output: Output = Path("out"),
+    force: Force = False,
+    as_json: Json = False,
 ) -> None:
     """Compare the colours of noise, each with and without a harmonic, on one target.
 
@@ -40,17 +42,18 @@ def compare(
 
         jaxmuscle compare my-displacement.csv --quantity displacement --segments 12
     """
-    with reporting():
+    with reporting(as_json):
         from jaxmuscle._common.environment import keep_compiled_programs
 
         keep_compiled_programs()
         fixed = fixed_values(fix)
         names = names_in(free)
         aim, model = aim_of(target, task, {"quantity": quantity, "segments": segments})
-        writable(output)
+        writable(output, "compare.json", force=force)
         with told(True, f"comparing noises on {aim.name}") as tell:
             found = jm.compare_noise(model, aim, free=names, fix=fixed, key=seed, progress=tell)
         _write(found, output)
+        record(output / "compare.json")
         _show(found, output)
     raise typer.Exit(CONVERGED if found.success else NOT_CONVERGED)
 

@@ -3,6 +3,7 @@
 import contextlib
 import csv
 import io
+import json
 import os
 import re
 import sys
@@ -48,10 +49,14 @@ def aim_of(name: str, task: TaskName | None, read: dict[str, Any]) -> tuple[Any,
 
 
 @contextlib.contextmanager
-def reporting() -> Iterator[None]:
-    """Turn a user's mistake into one line and exit code 2, a numerical failure into 1, an interruption into 130."""
+def reporting(as_json: bool = False) -> Iterator[None]:
+    """Turn a user's mistake into one line and exit code 2, a numerical failure into 1, an interruption into 130.
+
+    With `as_json` the text for people stays away from stdout, which is for `record` alone.
+    """
     from jaxmuscle._common.errors import SimulationError
 
+    out.quiet = as_json
     try:
         yield
     except (ValueError, OSError) as error:
@@ -63,6 +68,17 @@ def reporting() -> Iterator[None]:
     except KeyboardInterrupt:
         err.print("interrupted")
         raise typer.Exit(INTERRUPTED) from None
+    finally:
+        out.quiet = False
+
+
+def record(found: Any) -> None:
+    """With --json print what a command found as one JSON object, on one line; a path stands for what was written there."""
+    if out.quiet:
+        from jaxmuscle._common.files import nulled
+
+        table = json.loads(found.read_text(encoding="utf-8")) if isinstance(found, Path) else nulled(found)
+        print(json.dumps(table, allow_nan=False), flush=True)
 
 
 def _words(error: Exception) -> str:
@@ -89,13 +105,21 @@ def show(result: object, *, success: bool) -> None:
     out.print(plain("\n".join(rest)), highlight=False, soft_wrap=True)
 
 
-def writable(folder: Path) -> None:
-    """Fail before the long work, not after it."""
+def writable(folder: Path, *results: str, force: bool = False) -> None:
+    """Fail before the long work, not after it: also where one of the results is there already, unless it may go."""
     if folder.exists() and not folder.is_dir():
         raise ValueError(f"--out {folder}: is a file, give a folder")
+    absent(*(folder / name for name in results), force=force)
     folder.mkdir(parents=True, exist_ok=True)
     if not os.access(folder, os.W_OK | os.X_OK):
         raise ValueError(f"--out {folder}: cannot be written to")
+
+
+def absent(*results: Path, force: bool) -> None:
+    """Raise a `ValueError` for a result that is there already, unless it may be overwritten."""
+    for path in results:
+        if path.exists() and not force:
+            raise ValueError(f"{path}: is there already; overwrite it with --force, or write somewhere else")
 
 
 def csv_text(columns: dict[str, Any]) -> str:
@@ -128,8 +152,6 @@ def write_fit(result: "FitResult", folder: Path, *, figure: bool = True) -> None
     from jaxmuscle._common.files import write_text
 
     result.save(folder / "fit.json")
-    columns = {"frequency_hz": result.frequency_hz, "target": result.target.proportional_power, "fitted": result.fitted,
-               "harmonic_share": result.harmonic_share, "residual_sd": result.residual}  # fmt: skip
-    write_text(folder / "spectrum.csv", csv_text(columns))
+    write_text(folder / "spectrum.csv", csv_text(result.only.columns()))
     if figure:
         save_figure(result.plot(), folder / "fit.png")

@@ -14,8 +14,8 @@ import typer
 import jaxmuscle as jm
 from jaxmuscle._common.progress import told
 
-from .console import NOT_CONVERGED, err, out, reporting, task_of
-from .options import Observe, OtherTask, Preset, Seed
+from .console import NOT_CONVERGED, err, out, record, reporting, task_of
+from .options import Force, Json, Observe, OtherTask, Preset, Seed
 
 if TYPE_CHECKING:
     from jaxmuscle.ensembles import Pace
@@ -23,7 +23,6 @@ if TYPE_CHECKING:
 
 
 Devices = Annotated[int | None, typer.Option(min=1, help="Cores of a CPU to use, each as a device; all by default.")]
-Json = Annotated[bool, typer.Option("--json", help="One JSON object per line instead of text.")]
 
 
 class Precision(StrEnum):
@@ -52,6 +51,7 @@ def ensemble(
     coordinator: Annotated[str | None, typer.Option(metavar="HOST:PORT", help="Process 0 of several.")] = None,
     processes: Annotated[int | None, typer.Option(min=1, help="How many processes.")] = None,
     process_id: Annotated[int | None, typer.Option(help="Which of them this is, from 0.")] = None,
+    force: Force = False,
     as_json: Json = False,
 ) -> None:
     """Simulate any number of seeds into a zarr store, in chunks, on all cores, resumable.
@@ -65,7 +65,7 @@ def ensemble(
 
         jaxmuscle ensemble out/fit/fit.json --seeds 1000000 --reduce --resume --out out/moments.zarr
     """
-    with alone_or_together(coordinator, processes):
+    with alone_or_together(coordinator, processes, as_json):
         from jaxmuscle._common.environment import keep_compiled_programs
 
         if states and reduce:
@@ -75,14 +75,13 @@ def ensemble(
             jm.ensembles.join(coordinator, processes, process_id)
         keep_compiled_programs()
         model = task_of(preset, task, observe)
-        settings = {"duration": duration, "dt": dt, "chunk": chunk, "resume": resume, "states": states}
-        if not run(model, swept(model, vary or []), seeds, seed, output, settings, reduce=reduce, as_json=as_json):
+        settings = {"duration": duration, "dt": dt, "chunk": chunk, "resume": resume, "overwrite": force,
+                    "states": states}  # fmt: skip
+        if not run(model, swept(model, vary or []), seeds, seed, output, settings, reduce=reduce):
             raise typer.Exit(NOT_CONVERGED)
 
 
-def run(
-    model: "AbstractTask", sweep: Any, seeds: int, seed: int, output: Path, settings: dict, *, reduce: bool, as_json: bool
-) -> bool:
+def run(model: "AbstractTask", sweep: Any, seeds: int, seed: int, output: Path, settings: dict, *, reduce: bool) -> bool:
     """Simulate and say how it went; whether every seed stayed finite."""
     import jax
 
@@ -90,20 +89,17 @@ def run(
 
     first = jax.process_index() == 0
     before = jm.ensembles.attributes_of(output).get("complete") if settings["resume"] and output.exists() else None
-    if settings["resume"] and first and not before and not as_json:
+    if settings["resume"] and first and not before:
         err.print(f"{output}: {'there is no store yet, starting one' if before is None else 'resuming'}", highlight=False)
     begun = time.monotonic()
-    with watching(f"{seeds} seeds", first=first, as_json=as_json) as tell:
+    with watching(f"{seeds} seeds", first=first) as tell:
         kept: Any = {"reduce": True} if reduce else {}
         found: Any = jm.ensemble(model if sweep is None else sweep, jax.random.key(seed), seeds=seeds, store=output,
                                   progress=jm.ensembles.Watch(tell), **kept, **settings)  # fmt: skip
     failed, elapsed = json.loads(jm.ensembles.attributes_of(output)["failed"]), time.monotonic() - begun
     if not first:
         return not failed
-    if as_json:
-        print(json.dumps({"event": "done", "out": str(output), "seeds": seeds, "elapsed_s": round(elapsed, 3),
-                          "failed": failed}), flush=True)  # fmt: skip
-        return not failed
+    record({"event": "done", "out": str(output), "seeds": seeds, "elapsed_s": round(elapsed, 3), "failed": failed})
     if reduce:
         out.print(str(found), highlight=False)
     else:
@@ -118,34 +114,22 @@ def run(
 
 
 @contextmanager
-def watching(title: str, *, first: bool, as_json: bool) -> Iterator[Callable[["Pace"], None]]:
-    """A bar on a terminal, or a JSON line a second; nothing from the second process on."""
+def watching(title: str, *, first: bool) -> Iterator[Callable[["Pace"], None]]:
+    """As `told`; nothing from the second process on."""
     if not first:
         yield lambda pace: None
-    elif as_json:
-        said = 0.0
-
-        def line(pace: "Pace") -> None:
-            nonlocal said
-            now = time.monotonic()
-            if now - said >= 1.0 or pace.done == pace.total:
-                said = now
-                numbers = {name: round(value, 3) for name, value in pace._asdict().items()}
-                print(json.dumps({"event": "progress"} | numbers), flush=True)
-
-        yield line
     else:
         with told(True, title) as tell:
             yield lambda pace: tell(str(pace), pace.done / pace.total)
 
 
 @contextmanager
-def alone_or_together(coordinator: str | None, processes: int | None) -> Iterator[None]:
+def alone_or_together(coordinator: str | None, processes: int | None, as_json: bool) -> Iterator[None]:
     """As `reporting`; one of several processes that fails ends at once, so that the others notice."""
     from jaxmuscle._common.errors import ProcessLostError
 
     try:
-        with reporting():
+        with reporting(as_json):
             try:
                 yield
             except ProcessLostError as error:

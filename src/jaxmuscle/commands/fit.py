@@ -8,11 +8,26 @@ import typer
 import jaxmuscle as jm
 from jaxmuscle._common.progress import told
 
-from .console import CONVERGED, INTERRUPTED, NOT_CONVERGED, aim_of, err, out, plain, reporting, show, writable, write_fit
+from .console import (
+    CONVERGED,
+    INTERRUPTED,
+    NOT_CONVERGED,
+    aim_of,
+    err,
+    out,
+    plain,
+    record,
+    reporting,
+    show,
+    writable,
+    write_fit,
+)
 from .options import (
     AxisName,
     Fix,
+    Force,
     Free,
+    Json,
     MethodName,
     Noise,
     Output,
@@ -66,6 +81,8 @@ def fit(
         bool, typer.Option("--quick", help="Leave out simulated check, profile of the harmonic, p-value and figure.")
     ] = False,
     output: Output = Path("out"),
+    force: Force = False,
+    as_json: Json = False,
 ) -> None:
     """Fit the muscle to a target spectrum, or to those of many people together.
 
@@ -85,7 +102,7 @@ def fit(
 
         jaxmuscle fit figure.tar --dataset "95 MVC" --segments 6
     """
-    with reporting():
+    with reporting(as_json):
         from jaxmuscle._common.environment import keep_compiled_programs
 
         keep_compiled_programs()
@@ -106,18 +123,19 @@ def fit(
             if method != MethodName.linear or seeds is not None or quick:
                 raise ValueError("several targets are fitted together in linear response, without checks: leave out "
                                  "--method, --seeds and --quick, or fit them one at a time")  # fmt: skip
-            raise typer.Exit(fit_together(target, read, task, groups, output, options | {"rung": rungs or 0}))
+            options |= {"rung": rungs or 0}
+            raise typer.Exit(fit_together(target, read, task, groups, output, options, force=force))
         if groups is not None:
             raise ValueError("--groups needs several targets")
         options |= {"method": str(method), "seeds": seeds, "rungs": rungs}
         options |= {"check_seeds": 0} if quick else {}
-        converged = _fit_one(*aim_of(target[0], task, read), output, options, quick=quick)
+        converged = _fit_one(*aim_of(target[0], task, read), output, options, quick=quick, force=force)
     raise typer.Exit(CONVERGED if converged else NOT_CONVERGED)
 
 
-def _fit_one(target: Any, model: Any, folder: Path, options: dict[str, Any], *, quick: bool) -> bool:
+def _fit_one(target: Any, model: Any, folder: Path, options: dict[str, Any], *, quick: bool, force: bool) -> bool:
     """The table as soon as the search has ended, then what the checks add; Ctrl-C in these keeps the fit."""
-    writable(folder)
+    writable(folder, "fit.json", force=force)
     printed = []
 
     def answer(result: Any) -> None:
@@ -131,8 +149,10 @@ def _fit_one(target: Any, model: Any, folder: Path, options: dict[str, Any], *, 
             write_fit(result, folder, figure=not quick)
     except jm.fits.FitInterrupted as stop:
         write_fit(stop.result, folder, figure=False)
+        record(folder / "fit.json")
         err.print(f"interrupted: what had been reached is in {folder}")
         raise typer.Exit(INTERRUPTED) from None
+    record(folder / "fit.json")
     if not printed:
         answer(result)
     told_before = {*printed[0].remarks, *printed[0].notices}

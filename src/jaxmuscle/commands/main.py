@@ -14,9 +14,10 @@ from jaxmuscle._common.bundled import describe_presets, describe_targets
 
 from .analyse import analyse
 from .compare import compare
-from .console import out, plain
+from .console import out, plain, record, reporting
 from .ensemble import ensemble
 from .fit import fit
+from .options import Json
 from .posterior import posterior
 from .reproduce import reproduce
 from .simulate import simulate
@@ -56,26 +57,32 @@ def common(
 
 
 @app.command()
-def targets() -> None:
+def targets(as_json: Json = False) -> None:
     """List the bundled targets."""
+    found = describe_targets()
     table = Table(title="Bundled targets", title_justify="left")
     for column in ("name", "provenance", "quantity", "source"):
         table.add_column(column, overflow="fold", no_wrap=column == "name")
-    for entry in describe_targets():
+    for entry in found:
         first = entry.source.replace("Fig. ", "Fig.\N{NO-BREAK SPACE}").partition(". ")[0]
         table.add_row(entry.name, entry.provenance, entry.quantity, plain(first))
-    out.print(table)
+    with reporting(as_json):
+        record({"targets": [entry._asdict() for entry in found]})
+        out.print(table)
 
 
 @app.command()
-def presets() -> None:
+def presets(as_json: Json = False) -> None:
     """List the bundled presets (saved tasks)."""
+    found = describe_presets()
     table = Table(title="Bundled presets", title_justify="left")
     for column in ("name", "task", "description"):
         table.add_column(column, overflow="fold", no_wrap=column != "description")
-    for entry in describe_presets():
+    for entry in found:
         table.add_row(entry.name, entry.task, plain(entry.description))
-    out.print(table)
+    with reporting(as_json):
+        record({"presets": [entry._asdict() for entry in found]})
+        out.print(table)
 
 
 def main() -> None:

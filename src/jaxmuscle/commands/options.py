@@ -42,6 +42,8 @@ class Observed(StrEnum):
 
 
 Output = Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for the results.")]
+Force = Annotated[bool, typer.Option("--force", help="Overwrite an earlier result.")]
+Json = Annotated[bool, typer.Option("--json", help="Print the result as one JSON object instead of text.")]
 Seed = Annotated[int, typer.Option(help="Seed of all random numbers.")]
 Preset = Annotated[str, typer.Argument(help="Bundled preset (see `jaxmuscle presets`), preset file or fit.json.")]
 OtherTask = Annotated[TaskName | None, typer.Option(help="Put the same muscle into another task.")]

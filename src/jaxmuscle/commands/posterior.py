@@ -9,10 +9,12 @@ import typer
 import jaxmuscle as jm
 from jaxmuscle._common.progress import told
 
-from .console import CONVERGED, NOT_CONVERGED, aim_of, err, out, plain, reporting, save_figure, show, writable
+from .console import CONVERGED, NOT_CONVERGED, aim_of, err, out, plain, record, reporting, save_figure, show, writable
 from .options import (
     Fix,
+    Force,
     Free,
+    Json,
     Noise,
     Output,
     Quantity,
@@ -41,6 +43,8 @@ def posterior(
     warmup: Annotated[int, typer.Option(min=1, help="Steps of each chain before its draws.")] = 500,
     seed: Seed = 0,
     output: Output = Path("out"),
+    force: Force = False,
+    as_json: Json = False,
 ) -> None:
     """Draw from the posterior of the muscle's parameters: how sure is the fit.
 
@@ -56,11 +60,12 @@ def posterior(
 
         jaxmuscle posterior my-spectrum.csv --segments 12 --noise ornstein-uhlenbeck
     """
-    with reporting():
+    with reporting(as_json):
         from jaxmuscle._common.environment import keep_compiled_programs
 
         keep_compiled_programs()
-        writable(output)
+        taken_up = Path(target).resolve() == (output / "fit.json").resolve()
+        writable(output, *["fit.json"] * (not taken_up), "posterior.nc", "posterior.json", force=force)
         asked = {"task": task, "noise": None if noise is None else str(noise), "free": free, "fix": fix}
         result = _fitted(target, {"segments": segments, "quantity": quantity}, asked, seed)
         if not result.success:
@@ -73,6 +78,7 @@ def posterior(
         except ImportError as error:
             raise ValueError(str(error)) from None
         _write(found, output)
+        record(output / "posterior.json")
         _show(found, output)
     raise typer.Exit(CONVERGED if found.success else NOT_CONVERGED)
 

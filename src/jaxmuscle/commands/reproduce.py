@@ -8,8 +8,8 @@ import typer
 import jaxmuscle as jm
 from jaxmuscle import paper
 
-from .console import out, reporting, writable
-from .options import Output
+from .console import out, record, reporting, writable
+from .options import Force, Json, Output
 
 
 def reproduce(
@@ -18,6 +18,8 @@ def reproduce(
         list[Path] | None,
         typer.Option(metavar="FILE", help="One of three people's recordings, for Figures 7 and 8; three times."),
     ] = None,
+    force: Force = False,
+    as_json: Json = False,
 ) -> None:
     """Draw the figures of the paper and check what its text states.
 
@@ -29,17 +31,18 @@ def reproduce(
 
         jaxmuscle reproduce --recording anna.csv --recording ben.csv --recording chris.csv
     """
-    with reporting():
+    with reporting(as_json):
         from jaxmuscle._common.environment import keep_compiled_programs
 
         keep_compiled_programs()
-        writable(output)
+        writable(output, "claims.json", force=force)
         given = paper.given_recordings(recording) if recording else None
         _reproduce(output, given)
 
 
 def _reproduce(folder: Path, given) -> None:
     rows = paper.check(jm.reproduce(folder, given, progress=True))
+    record({"summary": paper.counted(rows), "claims": [row._asdict() for row in rows]})
     out.print(paper.counted(rows), highlight=False)
     for row in rows:
         if row.verdict == "does not agree":

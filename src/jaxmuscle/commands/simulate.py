@@ -7,8 +7,8 @@ import typer
 
 import jaxmuscle as jm
 
-from .console import csv_text, out, reporting, save_figure, task_of, writable
-from .options import Observe, OtherTask, Output, Preset, Seed
+from .console import csv_text, out, record, reporting, save_figure, task_of, writable
+from .options import Force, Json, Observe, OtherTask, Output, Preset, Seed
 
 if TYPE_CHECKING:
     from jaxmuscle.model import AbstractTask
@@ -21,6 +21,8 @@ def simulate(
     seeds: Annotated[int, typer.Option(min=1, help="Noise paths.")] = 50,
     seed: Seed = 0,
     output: Output = Path("out"),
+    force: Force = False,
+    as_json: Json = False,
 ) -> None:
     """Simulate a saved task.
 
@@ -32,12 +34,12 @@ def simulate(
 
         jaxmuscle simulate out/fit/fit.json --task prescribed-force --observe acceleration
     """
-    with reporting():
+    with reporting(as_json):
         from jaxmuscle._common.environment import keep_compiled_programs
 
         keep_compiled_programs()
         model = task_of(preset, task, observe)
-        writable(output)
+        writable(output, "trajectories.nc", force=force)
         _simulate(model, seeds, seed, output)
 
 
@@ -61,12 +63,20 @@ def _simulate(model: "AbstractTask", seeds: int, seed: int, folder: Path) -> Non
     save_figure(jm.plot.simulation(runs), folder / "simulate.png")
     held = runs.filtered()
     found = jm.spectra.peaks(mean)
-    spread = f"coefficient of variation {100 * np.mean(jm.spectra.coefficient_of_variation(held)):.3g} %"
-    if model.quantity == "acceleration":  # about a mean of zero
-        spread = f"standard deviation {held.std():.3g} {model.output_unit}"
+    still = model.quantity == "acceleration"  # about a mean of zero
+    variation = None if still else float(np.mean(jm.spectra.coefficient_of_variation(held)))
+    spread = "" if variation is None else f", coefficient of variation {100 * variation:.3g} %"
+    record({"task": type(model).__name__, "seeds": seeds, "seed": seed, "duration_s": float(runs.time[-1]),
+            "quantity": model.output_name, "unit": model.output_unit, "mean": float(held.mean()),
+             "standard_deviation": float(held.std()),
+            "coefficient_of_variation": variation, "maximum_hz": float(found.maximum.frequency),
+            "local_maxima_hz": [float(p.frequency) for p in found.local_maxima],
+            "spectrum": {name: np.asarray(column).tolist() for name, column in columns.items()},
+            "files": [str(folder / name) for name in ("trajectories.nc", "spectrum.csv", "simulate.png")]})  # fmt: skip
     out.print(f"{type(model).__name__}, {seeds} seeds of {runs.time[-1]:g} s", highlight=False)
     level = f"{held.mean():.4g} {model.output_unit}"
-    out.print(f"{model.output_name}: mean {level}, {spread}", highlight=False)
+    spread = spread or f", standard deviation {held.std():.3g} {model.output_unit}"
+    out.print(f"{model.output_name}: mean {level}{spread}", highlight=False)
     locals_ = ", ".join(f"{p.frequency:.3f}" for p in found.local_maxima) or "none"
     out.print(f"Spectrum: maximum at {found.maximum.frequency:.3f} Hz, local maxima at {locals_} Hz", highlight=False)
     out.print(f"Written: {folder}/trajectories.nc, spectrum.csv, simulate.png", highlight=False)

@@ -1,6 +1,5 @@
 """`jaxmuscle speed`."""
 
-import json
 import os
 from typing import Annotated
 
@@ -8,9 +7,9 @@ import typer
 
 import jaxmuscle as jm
 
-from .console import out, reporting, task_of
-from .ensemble import Devices, Json, Precision, cores, use
-from .options import OtherTask
+from .console import out, record, reporting, task_of
+from .ensemble import Devices, Precision, cores, use
+from .options import Json, OtherTask
 
 
 def speed(
@@ -26,14 +25,12 @@ def speed(
 
     Reduces an ensemble as `jaxmuscle ensemble --reduce` does, without control variate; medians of three calls.
     """
-    with reporting():
+    with reporting(as_json):
         os.environ["JAXMUSCLE_CACHE"] = "off"  # compile time is what it takes, not what loading takes
         use(precision, devices, cores(None, None))
         model = task_of(preset, task) if preset else jm.Isometric() if task is None else jm.model.TASKS[task]()
         found = jm.ensembles.measure(model, seeds, duration)
-        if as_json:
-            print(json.dumps(found))
-            return
+        record(found)
         for name, value in found.items():
             shown = f"{value:.4g}" if isinstance(value, float) else str(value)
             out.print(f"{name.replace('_', ' '):<28}{shown}", highlight=False)

@@ -13,6 +13,7 @@ from jaxmuscle import plot
 from jaxmuscle._common.arrays import with_nulls
 from jaxmuscle._common.environment import versions
 from jaxmuscle._common.files import write_text
+from jaxmuscle._common.tables import frame
 from jaxmuscle._common.text import folded, probability
 from jaxmuscle.data._target import Target
 from jaxmuscle.fits._adequacy import ADEQUATE
@@ -20,6 +21,7 @@ from jaxmuscle.model._presets import task_to_table
 from jaxmuscle.model._tasks import AbstractTask
 
 if TYPE_CHECKING:
+    import pandas
     import xarray
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure, SubFigure
@@ -226,6 +228,10 @@ class Comparison(eqx.Module):
     def table(self) -> list[dict[str, Any]]:
         """Tidy rows with the keys of `COLUMNS`."""
         return [{name: getattr(row, name) for name in COLUMNS} for row in self.rows]
+
+    def to_dataframe(self) -> "pandas.DataFrame":
+        """The rows of `table`."""
+        return frame(self.table())
 
     def to_xarray(self) -> "xarray.Dataset":
         """The numbers over (noise, harmonic), `fitted` and `scores` over frequency as well; NaN for what there is not."""

@@ -1,16 +1,20 @@
 """The numbers of a recording: level, variability, regularity, spectral peaks."""
 
 import dataclasses
-import math
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import numpy as np
 import scipy
 from jaxtyping import Bool, Float, Int
 
+from jaxmuscle._common.files import nulled
+from jaxmuscle._common.tables import frame
 from jaxmuscle.spectra._measures import Peaks
 from jaxmuscle.spectra._settings import require
+
+if TYPE_CHECKING:
+    import pandas
 
 
 class RecordingSummary(eqx.Module):
@@ -51,17 +55,16 @@ class RecordingSummary(eqx.Module):
     def __str__(self) -> str:
         return "\n".join(f"{name:<26}{value}" for name, value in self.rows())
 
+    def to_dataframe(self) -> "pandas.DataFrame":
+        """A row for each number: `quantity`, `value`, `unit`; the maximum of the spectrum is called `maximum`."""
+        units = {"duration": "s", "mean": self.unit, "standard_deviation": self.unit, "maximum": "Hz"}
+        numbers = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)[1:-1]}
+        numbers["maximum"] = self.peaks.maximum.interpolated
+        return frame([{"quantity": n, "value": float(v), "unit": units.get(n, "1")} for n, v in numbers.items()])
+
     def to_dict(self) -> dict[str, Any]:
         """The same for JSON, with `None` for what is not finite."""
-        return _plain(dataclasses.asdict(self))
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _plain(entry) for key, entry in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(entry) for entry in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+        return nulled(dataclasses.asdict(self))
 
 
 # A flat run at an extreme counts as clipped from this long on [s], and from this many samples on.

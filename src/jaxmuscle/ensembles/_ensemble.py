@@ -67,6 +67,7 @@ def ensemble(  # pyright: ignore[reportInconsistentOverload]
     reduce: bool | tuple[float, ...] = False,
     store: str | Path | None = None,
     resume: bool = False,
+    overwrite: bool = False,
     states: bool = False,
 ) -> Any:
     """Simulate many seeds (0 to seeds - 1, or those given) of one task, or of every point of a sweep.
@@ -84,8 +85,8 @@ def ensemble(  # pyright: ignore[reportInconsistentOverload]
 
     `reduce`, True or the levels of the quantiles, keeps moments, quantiles and the mean spectrum only: memory does not
     depend on the number of seeds. `store`, the path of a zarr store, streams every chunk to disk (`states` with it), or
-    what is reduced from time to time; with `resume` an interrupted one is continued. Under `jax.distributed` all processes
-    make the same call and share its chunks; all must see the store's folder.
+    what is reduced from time to time; with `resume` an interrupted one is continued, with `overwrite` an older ensemble is
+    replaced. Under `jax.distributed` all processes make the same call and share its chunks; all must see the store's folder.
 
     **Returns:** a `Trajectory`, of a sweep a `Population`; with `reduce` an `EnsembleSummary`; with `store` alone the opened
     `xarray.Dataset` (dimensions (point,) seed, time, frequency).
@@ -101,6 +102,8 @@ def ensemble(  # pyright: ignore[reportInconsistentOverload]
         raise ValueError(f"seeds = {seeds}: an ensemble needs at least one seed")
     if chunk is not None and chunk < 1:
         raise ValueError(f"chunk = {chunk} must be at least 1")
+    if resume and overwrite:
+        raise ValueError("resume continues a store, overwrite replaces it: give one of the two")
     if (resume or states) and store is None:
         raise ValueError(f"{'resume' if resume else 'states'} = True belongs to a store: give store=")
     levels = _levels(reduce)
@@ -119,11 +122,12 @@ def ensemble(  # pyright: ignore[reportInconsistentOverload]
     cut = begun_with(Path(store)) if store is not None and resume and chunk is None else None
     cut = cut_of(task, len(numbers), plan, chunk, shared=store is not None) if cut is None else cut
     layout = laid_out(task, key, numbers, plan, linear, cut=cut, states=whole, spectrum=spectrum)
+    begin = "resume" if resume else "overwrite" if overwrite else "new"
     with telling(progress, layout) as tell:
         if levels is not None:
-            return reduced(layout, levels, None if store is None else Path(store), tell, resume=resume)
+            return reduced(layout, levels, None if store is None else Path(store), tell, begin=begin)
         if store is not None:
-            return stored(layout, Path(store), tell, resume=resume, states=states)
+            return stored(layout, Path(store), tell, begin=begin, states=states)
         return _in_memory(layout, tell)
 
 

@@ -24,6 +24,7 @@ from ._processes import agreed, meet, rank_and_count
 from ._running_moments import CELLS, add, count_cells, empty, set_cells
 from ._store import (
     SETTINGS,
+    Begin,
     Reduced,
     Variable,
     attributes_of,
@@ -51,7 +52,7 @@ KEEP_SHARE = 20  # and at least this many times what writing one took
 Tell = Callable[[Pace], None]
 
 
-def reduced(layout: Layout, levels: tuple[float, ...], path: Path | None, tell: Tell, *, resume: bool) -> EnsembleSummary:
+def reduced(layout: Layout, levels: tuple[float, ...], path: Path | None, tell: Tell, *, begin: Begin) -> EnsembleSummary:
     """Moments, quantiles and the mean spectrum of all chunks; kept in a store from time to time if there is one."""
     settings = settings_of(layout) | {"kind": "reduced", "quantiles": list(levels)}
     values = _time(layout).size + (2 * _bins(layout) + 1 if _bins(layout) else 0)
@@ -67,7 +68,7 @@ def reduced(layout: Layout, levels: tuple[float, ...], path: Path | None, tell: 
     variables = {name: Variable(dims, array.shape, array.shape, array.dtype, units,
                                 array if name in blank.coordinates() else None)
                  for name, (dims, array, units) in blank.arrays().items()}  # fmt: skip
-    if _opened(path, variables, blank.coordinates(), blank.attributes(), settings, resume=resume):
+    if _opened(path, variables, blank.coordinates(), blank.attributes(), settings, begin=begin):
         _share_tallies(layout, levels, path, tell, nothing)
         if rank_and_count()[0] == 0:
             whole = _summary(layout, levels, read_tallies(path, nothing()))
@@ -159,13 +160,13 @@ def _keeper(path: Path, name: str) -> Callable[[Reduced], None]:
     return keep
 
 
-def stored(layout: Layout, path: Path, tell: Tell, *, resume: bool, states: bool) -> "xarray.Dataset":
+def stored(layout: Layout, path: Path, tell: Tell, *, begin: Begin, states: bool) -> "xarray.Dataset":
     """Every trajectory, and its Welch power, to a store; opened when it is complete."""
     import xarray
 
     settings = settings_of(layout) | {"kind": "trajectories", "states": states}
     variables, coordinates = _variables(layout, states=states)
-    if _opened(path, variables, coordinates, _about(layout), settings, resume=resume):
+    if _opened(path, variables, coordinates, _about(layout), settings, begin=begin):
         rank, count = rank_and_count()
         done = logged(path)
         meet()
@@ -197,13 +198,13 @@ def begun_with(path: Path) -> Cut | None:
 
 
 def _opened(
-    path: Path, variables: dict[str, Variable], coordinates: list[str], attributes: dict, settings: dict, *, resume: bool
+    path: Path, variables: dict[str, Variable], coordinates: list[str], attributes: dict, settings: dict, *, begin: Begin
 ) -> bool:
     """Make or find the store, as process 0 sees it; whether there is work left. All processes raise the same error."""
     said, failure = "", None
     if rank_and_count()[0] == 0:
         try:
-            said = state_of(path, settings, resume=resume)
+            said = state_of(path, settings, begin=begin)
             if said == "absent":
                 create(path, variables, coordinates, attributes | {SETTINGS: json.dumps(settings)})
         except (ValueError, OSError) as error:

@@ -8,7 +8,7 @@ import tempfile
 import warnings
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -17,6 +17,7 @@ from jaxmuscle._common.files import replacing, write_json
 
 from ._running_moments import RunningMoments, merged
 
+Begin = Literal["new", "resume", "overwrite"]
 SETTINGS = "settings"
 DONE, TALLY = "progress-", "tally-"
 
@@ -84,18 +85,23 @@ def attributes_of(path: Path) -> dict[str, Any]:
         raise StoreError(f"{path}: is not a store that jaxmuscle wrote ({error}); give another name") from None
 
 
-def state_of(path: Path, settings: dict[str, Any], *, resume: bool) -> str:
-    """Whether a store is "absent", "begun" or "complete".
+def state_of(path: Path, settings: dict[str, Any], *, begin: Begin) -> str:
+    """Whether a store is "absent", "begun" or "complete"; one that is to be overwritten is removed.
 
     **Raises:** `StoreError` if it is there and not to be resumed, or was made with other settings (named).
     """
     if not (path.exists() or path.is_symlink()):
         return "absent"
-    if not resume:
-        raise StoreError(f"{path}: exists already; resume it (--resume, resume=True), or give another name")
+    if begin == "new":
+        raise StoreError(f"{path}: exists already; resume it (--resume, resume=True), overwrite it (--force, "
+                         "overwrite=True), or give another name")  # fmt: skip
     attributes = attributes_of(path)
     if SETTINGS not in attributes or "complete" not in attributes:
         raise StoreError(f"{path}: is not an ensemble that can be resumed (no settings in it); give another name")
+    if begin == "overwrite":
+        with writing(path):
+            shutil.rmtree(path)
+        return "absent"
     different = differences(json.loads(attributes[SETTINGS]), settings)
     if different:
         raise StoreError(f"{path}: was made with other settings: {'; '.join(different)}. Repeat them, or give another name")

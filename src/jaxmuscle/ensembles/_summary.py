@@ -18,6 +18,7 @@ from ._running_moments import RunningMoments, quantiles
 from ._sweep import Sweep
 
 if TYPE_CHECKING:
+    import pandas
     import xarray
     from matplotlib.axes import Axes
 
@@ -87,6 +88,12 @@ class EnsembleSummary(eqx.Module):
         data = {name: (dims, values, {"units": units} if units else {})
                 for name, (dims, values, units) in self.arrays().items()}  # fmt: skip
         return xarray.Dataset(data, attrs=self.attributes()).set_coords(self.coordinates())
+
+    def to_dataframe(self) -> "pandas.DataFrame":
+        """A row for each (point and) time: `time`, `mean`, `variance`, and a column for each quantile, as `quantile_0.5`."""
+        data = self.to_xarray()
+        levels = {f"quantile_{level:g}": data["quantiles"].sel(quantile=level, drop=True) for level in self.levels}
+        return data[["mean", "variance"]].assign(levels).to_dataframe().reset_index()
 
     def coordinates(self) -> list[str]:
         """Names of what labels the dimensions."""

@@ -13,6 +13,7 @@ from jaxtyping import PRNGKeyArray
 from jaxmuscle import plot
 from jaxmuscle._common.environment import versions
 from jaxmuscle._common.progress import told
+from jaxmuscle._common.tables import frame
 from jaxmuscle.data._as_target import as_target
 from jaxmuscle.data._target import Target
 from jaxmuscle.model._noise import AbstractNoise
@@ -26,6 +27,7 @@ from ._result import FitResult
 from ._search import search_together
 
 if TYPE_CHECKING:
+    import pandas
     import xarray
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure, SubFigure
@@ -84,6 +86,10 @@ class CohortResult(eqx.Module):
             for name, result in self.results.items()
             for quantity, e in _quantities(result).items()
         ]  # fmt: skip
+
+    def to_dataframe(self) -> "pandas.DataFrame":
+        """The rows of `table`."""
+        return frame(self.table())
 
     def to_xarray(self) -> "xarray.Dataset":
         """`value`, `stderr` (NaN where not determined) and `determined` over (target, quantity); units as coordinate."""

@@ -1,16 +1,20 @@
 """What a fit found of one target, and numbers with their errors: as objects and as tables."""
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
 from jaxmuscle._common.arrays import from_nulls, with_nulls
+from jaxmuscle._common.tables import frame
 from jaxmuscle._common.text import rounded
 from jaxmuscle.data._target import Target
 from jaxmuscle.model._presets import task_from_table, task_to_table
 from jaxmuscle.model._tasks import TASKS, AbstractTask
+
+if TYPE_CHECKING:
+    import pandas
 
 SPECTRUM = ("fitted", "harmonic_share", "residual", "deviation")
 
@@ -28,6 +32,12 @@ class Estimate(eqx.Module):
     free: bool = True
     identifiable: bool | None = True
     interval: tuple[float | None, float | None] | None = None
+
+    def row(self) -> dict[str, Any]:
+        """As columns of a table."""
+        low, high = (None, None) if self.interval is None else self.interval
+        return {"value": self.value, "stderr": self.stderr, "low": low, "high": high, "unit": self.unit, "free": self.free,
+                "determined": self.stderr is not None}  # fmt: skip
 
     def in_words(self) -> str:
         """The value, rounded to its error where it has one."""
@@ -88,6 +98,15 @@ class FittedPart(eqx.Module):
     def frequency_hz(self) -> Float[np.ndarray, " bins"]:
         """Frequencies of the bins [Hz]."""
         return np.asarray(self.target.frequency)
+
+    def columns(self) -> dict[str, Any]:
+        """What `spectrum.csv` holds, by column."""
+        return {"frequency_hz": self.frequency_hz, "target": self.target.proportional_power, "fitted": self.fitted,
+                "harmonic_share": self.harmonic_share, "residual_sd": self.residual}  # fmt: skip
+
+    def to_dataframe(self) -> "pandas.DataFrame":
+        """A row for each bin: `frequency_hz`, `target` and `fitted` proportional power, `harmonic_share`, `residual_sd`."""
+        return frame(self.columns())
 
     @property
     def model(self) -> str:

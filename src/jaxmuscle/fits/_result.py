@@ -13,6 +13,7 @@ from jaxmuscle._common.arrays import from_nulls, with_nulls
 from jaxmuscle._common.errors import ResultError
 from jaxmuscle._common.files import write_json
 from jaxmuscle._common.parts import of_only, only
+from jaxmuscle._common.tables import frame
 from jaxmuscle._common.text import choices, folded, probability
 from jaxmuscle.data._target import Target
 from jaxmuscle.model._tasks import AbstractTask
@@ -23,6 +24,7 @@ from ._ladder import HEAD, Rung
 from ._part import Estimate, FittedPart, Start, estimates_to_table, part_to_table, read_estimates, read_part
 
 if TYPE_CHECKING:
+    import pandas
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure, SubFigure
 
@@ -73,6 +75,26 @@ class FitResult(eqx.Module):
     seed: int | None
     settings: dict[str, Any]
     versions: dict[str, str]
+
+    def __getitem__(self, name: str) -> Estimate:
+        """The parameter or derived quantity of that name, with its `value`, `stderr`, `interval` and `unit`.
+
+        Raises `ValueError` for an unknown name.
+        """
+        known = self.parameters | self.derived
+        if name not in known:
+            raise ValueError(f"unknown quantity {name!r} of the fit of {self.title}: {choices(name, known)}")
+        return known[name]
+
+    def to_dataframe(self) -> "pandas.DataFrame":
+        """A row for each parameter and derived quantity.
+
+        Columns: `quantity`; `kind`, "parameter" or "derived"; `value`; `stderr`, NaN where the data do not determine it;
+        `low` and `high`, ends of the 95 % interval, NaN where one is open or was not computed; `unit`; `free`, whether it
+        was fitted; `determined`, whether it has a standard error.
+        """
+        return frame([{"quantity": name, "kind": "parameter" if name in self.parameters else "derived", **p.row()}
+                      for name, p in (self.parameters | self.derived).items()])  # fmt: skip
 
     @property
     def only(self) -> FittedPart:

@@ -5,6 +5,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from jaxmuscle._common.files import nulled
 from jaxmuscle.response._scaling import relative_variation
 from jaxmuscle.spectra._measures import peaks
 from jaxmuscle.spectra._settings import WINDOW, SpectrumSettings
@@ -43,7 +44,7 @@ def check(found: Reproduction) -> tuple[Row, ...]:
 
 def claims_json(rows: tuple[Row, ...]) -> str:
     """The table for programs."""
-    return json.dumps([row._asdict() for row in rows], indent=1, ensure_ascii=False) + "\n"
+    return json.dumps(nulled([row._asdict() for row in rows]), indent=1, ensure_ascii=False, allow_nan=False) + "\n"
 
 
 def _local(spectrum, stated: float) -> tuple[float, float]:

@@ -10,10 +10,12 @@ from jaxtyping import Float
 
 from jaxmuscle import plot
 from jaxmuscle._common.files import write_json
+from jaxmuscle._common.tables import frame
 from jaxmuscle._common.text import WIDTH
 from jaxmuscle.objective._covariance import DETERMINED
 
 if TYPE_CHECKING:
+    import pandas
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure, SubFigure
 
@@ -41,6 +43,11 @@ class Known(eqx.Module):
     def left(self) -> float:
         """Share of the prior's standard deviation that is left."""
         return self.stderr / self.prior_sd
+
+    def row(self) -> dict[str, Any]:
+        """As columns of a table."""
+        return {"value": self.value, "unit": self.unit, "stderr": self.stderr, "prior_sd": self.prior_sd, "left": self.left,
+                "determined": self.determined}  # fmt: skip
 
     @property
     def percent(self) -> str:
@@ -88,8 +95,7 @@ class Outlook(eqx.Module):
             "name": self.name, "task": self.task, "data": self.data, "separate": list(self.separate),
             "failed": self.failed, "singular_values": self.singular_values.tolist(), "determined": self.determined,
             "undetermined": list(self.undetermined), "products": self.products, "gained": list(self.gained),
-            "quantities": {n: {"value": k.value, "unit": k.unit, "stderr": k.stderr, "prior_sd": k.prior_sd,
-                               "left": k.left, "determined": k.determined} for n, k in self.quantities.items()},
+            "quantities": {n: k.row() for n, k in self.quantities.items()},
         }  # fmt: skip
 
 
@@ -132,6 +138,15 @@ class IdentifiabilityReport(eqx.Module):
             "present": self.present.to_dict(), "designs": [d.to_dict() for d in self.designs],
             "pairs": [d.to_dict() for d in self.pairs], "notices": list(self.notices),
         }  # fmt: skip
+
+    def to_dataframe(self) -> "pandas.DataFrame":
+        """A row for each design ("" is the present data) and quantity.
+
+        Columns: `design`, `quantity`, `value`, `unit`, `stderr`, `prior_sd`, the share `left` of it, `determined`.
+        """
+        known = {"": self.present, **{o.name: o for o in (*self.designs, *self.pairs)}}
+        return frame([{"design": design, "quantity": name, **quantity.row()}
+                      for design, outlook in known.items() for name, quantity in outlook.quantities.items()])  # fmt: skip
 
     def save(self, path: str | Path) -> None:
         """Write `to_dict` as JSON, atomically."""

@@ -11,6 +11,7 @@ from jaxmuscle import plot
 from jaxmuscle._common.errors import NotMixedError
 from jaxmuscle._common.files import replacing, write_json
 from jaxmuscle._common.parts import of_only, only
+from jaxmuscle._common.tables import frame
 from jaxmuscle._common.text import folded
 from jaxmuscle.data._target import Target
 from jaxmuscle.model._tasks import AbstractTask
@@ -20,6 +21,7 @@ from ._chains import Chains
 from ._posterior_checks import Replicates
 
 if TYPE_CHECKING:
+    import pandas
     import xarray
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure, SubFigure
@@ -129,6 +131,11 @@ class Posterior(eqx.Module):
             values[name] = value if middle == own else value * own / middle
         return part.task.replace(**values)
 
+    def to_dataframe(self) -> "pandas.DataFrame":
+        """A row for each draw: `chain`, `draw`, then every parameter and derived quantity; `summary()` has a table, too."""
+        chain, draw = np.indices(self.chains.log_density.shape)
+        return frame({name: np.ravel(x) for name, x in ({"chain": chain, "draw": draw} | self.quantities).items()})
+
     def to_datatree(self) -> "xarray.DataTree":
         """ArviZ's groups posterior, posterior_predictive, sample_stats, observed_data, over chain, draw, frequency."""
         return datatree(self)
@@ -179,6 +186,11 @@ class Summary(eqx.Module):
     def __getitem__(self, name: str) -> dict[str, float]:
         keys = ("mean", "sd", "median", "low", "high", "r_hat", "ess_bulk", "ess_tail")
         return dict(zip(keys, (*self.rows[name], *self.diagnostics[name]), strict=True))
+
+    def to_dataframe(self) -> "pandas.DataFrame":
+        """A row for each quantity: `quantity`, what `summary[name]` has (`mean` to `ess_tail`), `unit`, `determined`."""
+        return frame([{"quantity": n, **self[n], "unit": self.units[n], "determined": n in self.determined}
+                      for n in self.rows])  # fmt: skip
 
     def __str__(self) -> str:
         lines = [self.title, f"  {'':<24}{'median':>10}{'2.5 %':>10}{'97.5 %':>10}{'R-hat':>7}{'ESS':>6}  unit"]

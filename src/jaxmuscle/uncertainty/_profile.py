@@ -10,6 +10,7 @@ import scipy
 from jaxtyping import Float
 
 from jaxmuscle import plot
+from jaxmuscle._common.tables import frame
 from jaxmuscle._common.text import choices, folded
 from jaxmuscle.data._target import Target
 from jaxmuscle.fits._reopened import reopened
@@ -21,6 +22,7 @@ from jaxmuscle.objective._scoring import Maximum, Pin, highest, maximise
 from jaxmuscle.objective._starts import distinct, frequency_names
 
 if TYPE_CHECKING:
+    import pandas
     from matplotlib.axes import Axes
 
 
@@ -66,6 +68,10 @@ class Profile(eqx.Module):
     def high(self) -> float | None:
         """Upper end of the (highest) interval, None if open."""
         return self.intervals[-1][1]
+
+    def to_dataframe(self) -> "pandas.DataFrame":
+        """A row for each point: `value` of the quantity and the `rise` there."""
+        return frame({"value": self.values, "rise": self.rise})
 
     def plot(self, ax: "Axes | None" = None) -> "Axes":
         """The profile with its interval and the parabola of the curvature. Returns the axes."""
