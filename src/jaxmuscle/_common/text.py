@@ -34,6 +34,11 @@ def rounded(value: float, error: float) -> tuple[str, str]:
     return shown[0], shown[1]
 
 
+def squared(unit: str) -> str:
+    """The square of a unit: N², (% MVC)²."""
+    return f"{unit}²" if unit.isalpha() else f"({unit})²"
+
+
 def probability(p: float) -> str:
     """In words, as in "p = 0.23"; "p <= 0.001" for what is the least that 999 replicates can show."""
     return "p <= 0.001" if p <= 0.001 else f"p = {p:.2g}"
