@@ -5,11 +5,10 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure, SubFigure
-from matplotlib.ticker import NullFormatter
 
 from jaxmuscle._common.text import squared
 
-from ._style import BLUE, SKY, canvas, styled
+from ._style import BLUE, SKY, canvas, log_axis, styled
 
 VARIATION = "coefficient_of_variation"
 VARIATIONS = {"all": VARIATION, "without\ndrift": f"{VARIATION}_without_drift", "above\n0.5 Hz": f"{VARIATION}_above_0.5"}
@@ -31,8 +30,7 @@ def steadiness(steadiness: Any, ax: Axes | None = None) -> Figure | SubFigure:
     power, variation, regularity = fig.subplots(1, 3, width_ratios=(1.5, 1, 1))
     bands = {_range(name): name for name in steadiness.measures if name.startswith("power_")}
     _dots(power, steadiness, bands)
-    power.set_yscale("log")
-    power.yaxis.set_minor_formatter(NullFormatter())
+    log_axis(power, "y")
     power.set_xlabel("Frequency (Hz)")
     power.set_ylabel(f"Power ({squared(steadiness.unit)})", parse_math=False)
     power.set_title("Power by band")
