@@ -35,8 +35,8 @@ def rounded(value: float, error: float) -> tuple[str, str]:
 
 
 def squared(unit: str) -> str:
-    """The square of a unit: N², (% MVC)²."""
-    return f"{unit}²" if unit.isalpha() else f"({unit})²"
+    """The square of a unit, as "N^2" and "(m/s^2)^2"."""
+    return f"{unit}^2" if unit.isalpha() else f"({unit})^2"
 
 
 def probability(p: float) -> str:

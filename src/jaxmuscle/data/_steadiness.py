@@ -138,7 +138,7 @@ def _said(name: str, m: Measure) -> str:
     if math.isnan(m.value):
         return "none"
     percent = name.startswith((VARIATION, "share"))
-    scale, unit = (100.0, " %") if percent else (1.0, f" {m.unit}" * (m.unit != "1"))
+    scale, unit = (100.0, " %") if percent else (1.0, f" {m.unit.replace('^2', '²')}" * (m.unit != "1"))
     if m.stderr is None:
         return f"{scale * m.value:.3g}{unit}"
     value, error = rounded(scale * m.value, scale * m.stderr)

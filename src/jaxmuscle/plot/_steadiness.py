@@ -32,7 +32,7 @@ def steadiness(steadiness: Any, ax: Axes | None = None) -> Figure | SubFigure:
     _dots(power, steadiness, bands)
     log_axis(power, "y")
     power.set_xlabel("Frequency (Hz)")
-    power.set_ylabel(f"Power ({squared(steadiness.unit)})", parse_math=False)
+    power.set_ylabel(f"Power ({squared(steadiness.unit).replace('^2', '²')})", parse_math=False)
     power.set_title("Power by band")
     _dots(variation, steadiness, VARIATIONS, 100.0)
     variation.set_ylabel("Standard deviation (% of the mean)")

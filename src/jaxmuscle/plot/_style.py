@@ -10,8 +10,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure, SubFigure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
-from jaxmuscle._common.text import squared
-
 # Okabe & Ito 2008, Color Universal Design: told apart with any common form of colour vision.
 BLUE, VERMILLION, GREEN, PURPLE = "#0072B2", "#D55E00", "#009E73", "#CC79A7"
 ORANGE, SKY, BLACK, GREY = "#E69F00", "#56B4E9", "#000000", "#767676"
@@ -83,7 +81,7 @@ def output_label(name: str, unit: str) -> str:
 
 
 def density_unit(unit: str) -> str:
-    return f"{squared(unit)}/Hz"
+    return f"{unit}²/Hz" if unit.isalpha() else f"({unit})²/Hz"
 
 
 def axes_or_new(ax: Axes | None) -> Axes:
