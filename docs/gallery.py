@@ -82,6 +82,8 @@ held = jm.simulate(jm.settled(result.task), key, duration=40.0, rate=1000.0).out
 ramp = np.linspace(0.0, float(held[0]), 3000)
 np.savetxt("trial.csv", np.concatenate([ramp, held, ramp[::-1]]), header="force", comments="")
 recording = jm.load_recording("trial.csv", column="force", rate=1000, units="N")
+seeds = jm.ensemble(jm.settled(result.task), key, seeds=5, duration=20.0)
+trials = [jm.Recording(force, seeds.rate, name=f"trial {i}") for i, force in enumerate(np.asarray(seeds.output))]
 
 people = {}
 for i, name in enumerate(["ann", "ben", "eve", "jim", "kim", "tom"]):
@@ -121,6 +123,8 @@ SECTIONS = (
     )),
     Section("Recordings, people, several measurements", PEOPLE, (
         Shown("gallery/recording.png", "recording.steady().plot()", "A recording and its steady window", "recordings.md"),
+        Shown("gallery/steadiness.png", "jm.steadiness(trials).plot()", "How steady five trials are",
+              "recordings.md#steadiness"),
         Shown("gallery/cohort.png", "cohort.plot()", "What six people's spectra determine", "fitting.md#many-targets"),
         Shown("gallery/groups.png", 'cohort.plot(by="group")', "The same by group", "fitting.md#many-targets"),
         Shown("gallery/levels.png", 'cohort.plot(by="level")', "The same by level", "fitting.md#many-targets"),

@@ -20,6 +20,7 @@ from .checks._goodness import goodness as goodness
 from .comparison._compare import compare_noise as compare_noise
 from .data._recording import Recording as Recording
 from .data._recording_files import load_recording as load_recording
+from .data._steadiness import steadiness as steadiness
 from .data._target import Target as Target
 from .data._target import load_target as load_target
 from .data._trials import Trials as Trials

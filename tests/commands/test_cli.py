@@ -606,6 +606,36 @@ def test_the_console_script_is_the_command():
     assert wrong.returncode == 2 and "tragets" in wrong.stderr
 
 
+def test_steadiness_of_trials(tmp_path):
+    """The last one is too short."""
+    rng, files = np.random.default_rng(0), []
+    for i, seconds in enumerate([8, 8, 8, 3]):
+        held = 10 + np.convolve(rng.standard_normal(100 * seconds + 99), np.ones(100) / 100, "valid")
+        rows = "".join(f"{k / 100:.2f},{x:.6f}\n" for k, x in enumerate(held))
+        files.append(tmp_path / f"trial{i}.csv")
+        files[-1].write_text(f"time (s),force (N)\n{rows}")
+    result = run("steadiness", *files[:3], "--window", "0:8", "--out", tmp_path / "out")
+    assert result.exit_code == 0 and "Steadiness of 3 trials: force [N], 8 s" in result.stdout
+    found = jm.steadiness([jm.load_recording(str(file)).steady((0, 8)) for file in files[:3]])
+    with open(tmp_path / "out" / "steadiness.csv", newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [row["trial"] for row in rows[:: len(found.measures)]] == ["trial0", "trial1", "trial2", "all"]
+    for row in rows[-len(found.measures) :]:
+        measure = found[row["quantity"]]
+        assert row["unit"] == measure.unit and row["error_from"] == "trials"
+        assert (row["value"] == "" and np.isnan(measure.value)) or float(row["value"]) == pytest.approx(measure.value)
+    read = json.loads((tmp_path / "out" / "steadiness.json").read_text())
+    assert read["measures"]["mean"]["stderr"] == pytest.approx(found["mean"].stderr)
+    assert (tmp_path / "out" / "steadiness.png").stat().st_size > 10_000
+    for arguments, message in (
+        ((files[0], "--window", "0-8"), "--window 0-8: give start and end in s"),
+        ((files[0], files[3], "--window", "all"), "trial3 lasts 3 s; give at least 3.84 s"),
+        ((files[0], tmp_path / "none.csv"), "none.csv"),
+    ):
+        wrong = run("steadiness", *arguments, "--out", tmp_path / "wrong")
+        assert wrong.exit_code == 2 and message in wrong.stderr
+
+
 COMMANDS = sorted(typer.main.get_group(app).commands)
 
 

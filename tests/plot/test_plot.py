@@ -15,6 +15,7 @@ from jaxmuscle import plot
 from jaxmuscle.data._target import Target, load_target
 from jaxmuscle.model._tasks import Isometric, PrescribedForce
 from jaxmuscle.plot import _fit as _plot_fit
+from jaxmuscle.plot import _steadiness as _plot_steadiness
 from jaxmuscle.simulation._trajectory import Trajectory
 from jaxmuscle.spectra._bin_law import welch_law
 from jaxmuscle.spectra._settings import SpectrumSettings
@@ -438,3 +439,28 @@ def test_everything_written_lies_in_the_figure_and_cells_do_not_touch():
 )
 def test_numbers_are_printed_to_two_digits_of_their_error(shown, expected):
     assert _plot_fit.quantity(shown) == expected
+
+
+def steady(count, unit="N"):
+    """A report of trials whose numbers are known."""
+    names = ("power_0_0.5", "power_above_12", *_plot_steadiness.VARIATIONS.values(), *_plot_steadiness.REGULARITY.values())
+
+    def measures(i):
+        return {name: types.SimpleNamespace(value=0.1 * (k + 1) + 0.01 * i, stderr=0.02) for k, name in enumerate(names)}
+
+    trials = {f"trial {i}": measures(i) for i in range(count)}
+    return types.SimpleNamespace(unit=unit, trials=trials, measures=measures(1))
+
+
+@pytest.mark.parametrize(("count", "unit", "label"), [(3, "N", "Power (N²)"), (1, "% MVC", "Power ((% MVC)²)")])
+def test_steadiness_shows_every_trial_and_the_value_of_all(count, unit, label):
+    figure = plot.steadiness(steady(count, unit))
+    figure.canvas.draw()
+    power, variation, regularity = figure.axes
+    assert power.get_ylabel() == label and power.get_yscale() == "log"
+    assert [tick.get_text() for tick in power.get_xticklabels()] == ["0 to\n0.5", "above\n12"]
+    dots = [line for ax in figure.axes for line in ax.lines if line.get_label() == "trials"]
+    assert [line.get_ydata().size for line in dots] == ([6, 9, 9] if count > 1 else [])
+    np.testing.assert_allclose(variation.containers[0].lines[0].get_ydata(), [31, 41, 51])
+    np.testing.assert_allclose(regularity.containers[0].lines[0].get_ydata(), [0.61, 0.71, 0.81])
+    assert f"{count} trials" in figure.get_suptitle() or count == 1

@@ -22,6 +22,7 @@ from .posterior import posterior
 from .reproduce import reproduce
 from .simulate import simulate
 from .speed import speed
+from .steadiness import steadiness
 
 app = typer.Typer(add_completion=False, no_args_is_help=True, rich_markup_mode="markdown", pretty_exceptions_enable=False)
 
@@ -30,6 +31,7 @@ app.command()(fit)
 app.command()(simulate)
 app.command()(ensemble)
 app.command()(analyse)
+app.command()(steadiness)
 app.command()(posterior)
 app.command()(compare)
 app.command()(reproduce)

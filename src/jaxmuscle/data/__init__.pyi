@@ -3,6 +3,9 @@
 from ._recording import Recording as Recording
 from ._recording_files import load_recording as load_recording
 from ._recording_quality import RecordingSummary as RecordingSummary
+from ._steadiness import Measure as Measure
+from ._steadiness import Steadiness as Steadiness
+from ._steadiness import steadiness as steadiness
 from ._target import Target as Target
 from ._target import load_target as load_target
 from ._trials import Trials as Trials

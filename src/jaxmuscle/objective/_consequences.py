@@ -1,6 +1,5 @@
 """What follows from a point θ: moments, their slopes, derived quantities."""
 
-import itertools
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -14,13 +13,12 @@ from jaxmuscle.model._noise import ResonantNoise
 from jaxmuscle.model._parameters import PARAMETERS, USUALLY_FREE
 from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.response._expected import Moments
+from jaxmuscle.spectra._fluctuations import BANDS
 
 from ._coordinates import Coordinates, task_at
 from ._moment_models import Linear
 from ._residuals import PartResiduals, Residuals
 
-EDGES = (0.0, 0.5, 1.0, 2.0, 4.0, 8.0, 12.0)
-BANDS = {f"band_{low:g}_{high:g}": (low, high) for low, high in itertools.pairwise(EDGES)}
 DERIVED = ("corner_frequency", "half_power_frequency", "contraction_time", "tremor_frequency", "tremor_width",
            "tremor_share", "resonance_2_share", "harmonic_share", "harmonic_frequency", "high_frequency_floor",
            "K_w0", "K_z0", "C_w0", "C_z0", "coefficient_of_variation", "mean", *BANDS)  # fmt: skip

@@ -7,7 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure, SubFigure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
-from ._style import BLACK, BLUE, GREY, ORANGE, SKY, canvas, legend, styled
+from ._style import BLACK, BLUE, GREY, ORANGE, SKY, canvas, density_unit, legend, styled
 
 
 @styled
@@ -56,8 +56,7 @@ def _spectra(ax: Axes, welch: Any, fft: Any, band: list[Any], log: bool) -> None
     if band:
         ax.fill_between(f[shown], band[0][shown], band[1][shown], color=BLUE, alpha=0.2, lw=0, label="± 1 SD", zorder=3)
     ax.plot(f[shown], power[shown], color=BLACK, lw=1.0, marker="o", ms=2.8, label="Welch", zorder=4)
-    unit = welch.unit if welch.unit.isalpha() else f"({welch.unit})"
-    _label(ax, "Frequency (Hz)", f"Power ({unit}²/Hz)")
+    _label(ax, "Frequency (Hz)", f"Power ({density_unit(welch.unit)})")
     ax.set_title("Spectrum, logarithmic" if log else "Spectrum, linear")
     if log:
         ax.set(xscale="log", yscale="log")

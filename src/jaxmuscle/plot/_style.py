@@ -110,10 +110,10 @@ def frequency_axis(ax: Axes, log: bool) -> None:
     log_axis(ax)
 
 
-def log_axis(ax: Axes) -> None:
-    """A logarithmic abscissa with plain numbers, as many as have room."""
-    ax.set_xscale("log")
-    low, high = ax.get_xlim()
-    ax.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if high < 1e3 * low else (1.0,)))
-    ax.xaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:g}"))
-    ax.xaxis.set_minor_formatter(NullFormatter())
+def log_axis(ax: Axes, which: Literal["x", "y"] = "x") -> None:
+    """A logarithmic abscissa or ordinate with plain numbers, as many as have room."""
+    ax.set(**{f"{which}scale": "log"})
+    (low, high), axis = (ax.get_xlim(), ax.xaxis) if which == "x" else (ax.get_ylim(), ax.yaxis)
+    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if high < 1e3 * low else (1.0,)))
+    axis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:g}"))
+    axis.set_minor_formatter(NullFormatter())

@@ -1,5 +1,7 @@
 """Public names of this wing."""
 
+from ._fluctuations import dfa as dfa
+from ._fluctuations import variance_spectrum as variance_spectrum
 from ._mean import SpectrumEstimate as SpectrumEstimate
 from ._measures import approximate_entropy as approximate_entropy
 from ._measures import coefficient_of_variation as coefficient_of_variation

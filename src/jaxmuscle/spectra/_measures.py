@@ -9,6 +9,7 @@ import numpy as np
 import scipy
 from jaxtyping import Array, Float, Real
 
+from ._fluctuations import one_record
 from ._neighbours import neighbours
 from ._settings import require
 from ._welch import Spectrum, floating
@@ -53,13 +54,9 @@ def signal_to_noise(signal: Real[Array | np.ndarray, "*batch times"]) -> Float[A
 
 def _record(signal: Real[Array | np.ndarray, "..."], m: int, tolerance: float) -> tuple[np.ndarray, float]:
     """One checked record, and the radius within which its templates match."""
-    x = np.asarray(signal, dtype=float)
     require(m >= 1, "m", m, "give the template length, at least 1")
     require(0 < tolerance < np.inf, "tolerance", tolerance, "give a positive fraction of the deviation")
-    remedy = f"give one record of at least m + 2 = {m + 2} samples"
-    require(x.ndim == 1 and x.size >= m + 2, "signal shape", x.shape, remedy)
-    require(np.all(np.isfinite(x)), "signal", x, "remove or interpolate what is not finite")
-    require(np.ptp(x) > 0, "signal", x, "entropy needs a signal that is not constant")
+    x = one_record(signal, m + 2, "m + 2 = ")
     return x, tolerance * float(np.std(x))
 
 

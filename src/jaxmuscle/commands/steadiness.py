@@ -1,0 +1,44 @@
+"""`jaxmuscle steadiness`."""
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+import jaxmuscle as jm
+
+from .console import out, plain, record, reporting, save_figure, writable
+from .options import Force, Json, Output, Window
+from .recordings import read, reads_recordings
+
+
+@reads_recordings
+def steadiness(
+    paths: Annotated[list[str], typer.Argument(metavar="RECORDING...", help="Trials of one condition of one person.")],
+    *,
+    window: Window = None,
+    output: Output = Path("out"),
+    force: Force = False,
+    as_json: Json = False,
+    reading: dict[str, Any],
+) -> None:
+    """How steady is a force? Variability, power by band, regularity of one or several trials, without a model.
+
+    Writes DIR/steadiness.json, DIR/steadiness.csv (a row per trial and quantity) and DIR/steadiness.png.
+
+    Example:
+
+        jaxmuscle steadiness trial1.csv trial2.csv trial3.csv --column force --rate 2048 --window 8:25
+    """
+    with reporting(as_json):
+        from jaxmuscle._common.files import write_text
+
+        writable(output, "steadiness.json", force=force)
+        found = jm.steadiness([read(path, reading, window) for path in paths])
+        found.save(output / "steadiness.json")
+        table = found.to_dataframe().to_csv(index=False, float_format="%.8g", lineterminator="\n")
+        write_text(output / "steadiness.csv", table)
+        save_figure(found.plot(), output / "steadiness.png")
+        record(output / "steadiness.json")
+        out.print(plain(found), highlight=False, soft_wrap=True)
+        out.print(f"Written: {output}/steadiness.json, steadiness.csv, steadiness.png", highlight=False)

@@ -1,0 +1,316 @@
+"""How steady a held force is: a report of one recording or of several trials, without any model."""
+
+import math
+from collections.abc import Iterable
+from os import PathLike
+from typing import TYPE_CHECKING, Any
+
+import equinox as eqx
+import numpy as np
+import scipy
+from jaxtyping import Float
+
+from jaxmuscle import plot
+from jaxmuscle._common.environment import versions
+from jaxmuscle._common.files import nulled, write_json
+from jaxmuscle._common.tables import frame
+from jaxmuscle._common.text import choices, folded, rounded, squared
+from jaxmuscle.spectra._fluctuations import BANDS, dfa, variance_spectrum
+from jaxmuscle.spectra._measures import regularity
+from jaxmuscle.spectra._settings import require
+
+from ._recording import RECORDED, SEGMENTS, Recording
+
+if TYPE_CHECKING:
+    import pandas
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure, SubFigure
+
+
+ALL = "all"
+ENOUGH = 3  # trials, for the scatter between them to give the errors
+PARTS, SLOWEST = 4, 4  # parts of a recording; ordinates that say how sure its mean is
+ALIKE = 1.2  # longest trial over shortest
+TREMOR, RISE, HALF = 6.0, 4.0, 3  # Hz; standard deviations of a bin; bins on either side
+RANGES = {name.removeprefix("band"): edges for name, edges in BANDS.items()} | {"_above_12": (12.0, math.inf)}
+FAST = 0.5  # Hz
+VARIATION = "coefficient_of_variation"
+REGULARITY = ("approximate_entropy", "sample_entropy", "dfa_exponent")
+WORDS = {
+    "mean": "mean",
+    "standard_deviation": "standard deviation",
+    VARIATION: "coefficient of variation",
+    f"{VARIATION}_without_drift": "  without a straight drift",
+    f"{VARIATION}_above_{FAST:g}": f"  of what is above {FAST:g} Hz",
+    "approximate_entropy": "approximate entropy",
+    "sample_entropy": "sample entropy",
+    "dfa_exponent": "DFA exponent",
+    "peak_frequency": "peak between 6 and 12 Hz",
+}
+
+
+class Measure(eqx.Module):
+    """A `value` with its standard error `stderr` (`None` if there is none), both in `unit` ("1" for pure numbers).
+
+    `error_from` says what the error stands on: "trials", the scatter between three or more trials; or, of fewer trials,
+    what is within them: "spectrum", "parts" or "segments", see `steadiness`. A value that does not exist is NaN.
+    """
+
+    value: float
+    stderr: float | None
+    unit: str
+    error_from: str
+
+
+class Steadiness(eqx.Module):
+    """What `steadiness` found; `print` shows it as a table, `found["sample_entropy"]` is one `Measure`.
+
+    `measures` of all trials together, by name; `trials`, the measures of each by its name, and their `durations` [s];
+    the `unit` and `quantity` of the signal; `notices`, sentences on what was done and what to mind.
+    """
+
+    measures: dict[str, Measure]
+    trials: dict[str, dict[str, Measure]]
+    durations: dict[str, float]
+    unit: str
+    quantity: str | None
+    notices: tuple[str, ...]
+
+    def __getitem__(self, name: str) -> Measure:
+        require(name in self.measures, "name", name, choices(name, self.measures))
+        return self.measures[name]
+
+    def to_dict(self) -> dict[str, Any]:
+        """The same for JSON, with `None` for what does not exist."""
+        each = {name: {"duration_s": self.durations[name], "measures": _plain(own)} for name, own in self.trials.items()}
+        return {"unit": self.unit, "quantity": self.quantity, "measures": _plain(self.measures), "trials": each,
+                "notices": list(self.notices), "versions": versions()}  # fmt: skip
+
+    def save(self, path: str | PathLike[str]) -> None:
+        """Write `to_dict()` as JSON."""
+        write_json(str(path), self.to_dict())
+
+    def to_dataframe(self) -> "pandas.DataFrame":
+        """A row per trial and quantity, then those of all trials together, whose `trial` is "all".
+
+        Columns `trial`, `duration_s`, `quantity`, `value`, `stderr`, `unit`, `error_from`.
+        """
+        together = {ALL: self.measures}
+        rows = [
+            {"trial": name, "duration_s": self.durations.get(name, sum(self.durations.values())), "quantity": quantity,
+             **vars(m), "stderr": math.nan if m.stderr is None else m.stderr}
+            for name, own in (self.trials | together).items()
+            for quantity, m in own.items()
+        ]  # fmt: skip
+        return frame(rows)
+
+    def plot(self, ax: "Axes | None" = None) -> "Figure | SubFigure":
+        """Draw power by band, coefficients of variation and regularity, every trial as a dot; returns the figure."""
+        return plot.steadiness(self, ax)
+
+    def __str__(self) -> str:
+        count, seconds = len(self.trials), sorted(self.durations.values())
+        long = f"{seconds[0]:.3g} s" + (f" to {seconds[-1]:.3g} s each" if seconds[-1] > 1.01 * seconds[0] else "")
+        what = f"{count} trials" if count > 1 else next(iter(self.trials))
+        said = {name: _said(name, measure) for name, measure in self.measures.items()}
+        lines = [f"{words:<28}{said[name]}" for name, words in WORDS.items()]
+        lines[5:5] = ["power by band, and its share of the variance"]
+        lines[6:6] = [f"  {_range(*edges):<26}{said[f'power{name}']:<25} {said[f'share{name}']}"
+                      for name, edges in RANGES.items()]  # fmt: skip
+        errors = (f"± is the standard error, from the scatter between the {count} trials." if count >= ENOUGH else
+                  "± is the standard error, from within the recording: of entropies and DFA from its four parts, of the "
+                  "peak from its Welch segments, of all else from its spectrum.")  # fmt: skip
+        head = f"Steadiness of {what}: {self.quantity or 'signal'} [{self.unit}], {long}"
+        return folded([head, *lines, errors, *(f"notice: {notice}" for notice in self.notices)])
+
+
+def _plain(measures: dict[str, Measure]) -> dict[str, Any]:
+    return {name: nulled(vars(m)) for name, m in measures.items()}
+
+
+def _range(low: float, high: float) -> str:
+    return f"{low:g} to {high:g} Hz" if math.isfinite(high) else f"above {low:g} Hz"
+
+
+def _said(name: str, m: Measure) -> str:
+    if math.isnan(m.value):
+        return "none"
+    percent = name.startswith((VARIATION, "share"))
+    scale, unit = (100.0, " %") if percent else (1.0, f" {m.unit.replace('^2', '²')}" * (m.unit != "1"))
+    if m.stderr is None:
+        return f"{scale * m.value:.3g}{unit}"
+    value, error = rounded(scale * m.value, scale * m.stderr)
+    return f"{value} ± {error}{unit}"
+
+
+def steadiness(recordings: Recording | Iterable[Recording]) -> Steadiness:
+    """How steady a force, torque or displacement is held: variability, power by band, regularity. No model is fitted.
+
+    Everything is computed of the window of each recording (`steady()` finds it), as `Recording.filtered` gives it:
+    resampled to 100 Hz and low-passed at 30 Hz.
+
+    | name | what it is |
+    |---|---|
+    | `mean`, `standard_deviation` | μ and σ [unit]; σ² divides by the number of samples |
+    | `coefficient_of_variation` | σ / abs(μ), a fraction; NaN where σ exceeds abs(μ) |
+    | `..._without_drift` | the same about the least-squares line, over abs(μ) |
+    | `..._above_0.5` | the same without what is slower than 0.5 Hz: √(Σ of the powers above) / abs(μ) |
+    | `power_0_0.5` ... `power_8_12`, `power_above_12` | power in the bands of the fits' `band_...` [unit²] |
+    | `share_0_0.5` ... | the same over σ², a fraction |
+    | `approximate_entropy`, `sample_entropy` | of templates of 2 samples, within 0.2 σ |
+    | `dfa_exponent` | slope of detrended fluctuations, windows from 0.04 s to a tenth of the recording, order 1 |
+    | `peak_frequency` | of the highest hill from 6 to 12 Hz [Hz]; NaN if there is none |
+
+    **Power by band** is the sum of `jaxmuscle.spectra.variance_spectrum` over low ≤ f < high. It takes the whole window at
+    once, resolves 1/(2T), and loses nothing: the seven powers add up to σ². A drift is in the lowest band. The shares
+    of a fit (`band_0_0.5`) are of the 30 bins from 0.39 to 11.72 Hz only, and so are larger above 0.5 Hz.
+
+    **The peak** is a local maximum of the Welch spectrum (2.56 s, bins of 0.39 Hz), the vertex of the parabola through the
+    log power of its seven nearest bins. It counts if its log power stands 4/√segments above the higher of the valleys beside
+    it; of simulated recordings without a peak up to 4 % show one then. Of several trials, it is that of their mean spectrum.
+
+    **Several trials** count alike: a value is the mean of the trials' values.
+
+    **Standard errors**, by the number of trials:
+
+    - Three or more, "trials": the standard deviation between the trials over √n; of the peak, the jackknife over trials. For
+      a 95 % interval use Student's t with n - 1 degrees of freedom.
+    - One or two, "spectrum": the ordinates of the spectrum are independent, with variance 2/3 of their square, as in a
+      stationary Gaussian signal; of the mean, from the four slowest. What is slower than the recording is not in it: where
+      the level wanders, the mean of the next trial differs by more.
+    - One or two, "parts" (entropies, DFA exponent): the standard deviation of the values of the four quarters over 2;
+      "segments" (peak): the jackknife over Welch segments.
+
+    In how many of simulated recordings these errors held the expected value: `docs/recordings.md`.
+
+    **Arguments:** `recordings`, one or several trials of one condition of one person, in one unit.
+
+    **Returns:** a `Steadiness`; it prints, plots and saves itself.
+
+    **Raises:** `ValueError` for no recordings, different units, a window that is constant or shorter than 3.84 s.
+    """
+    each = [recordings] if isinstance(recordings, Recording) else list(recordings)
+    require(len(each) > 0, "recordings", each, "give at least one Recording")
+    for recording in each:
+        require(isinstance(recording, Recording), "recordings", recording, "load_recording(...) reads a file")
+        recording._require_change()
+        shortest = (RECORDED.length + (SEGMENTS - 1) * RECORDED.step) / RECORDED.rate
+        remedy = f"{recording.name} lasts {recording.duration:.3g} s; give at least {shortest:g} s"
+        require(recording.segments() >= SEGMENTS, "window", recording.window, remedy)
+    _same_unit(each)
+    names = [recording.name for recording in each]
+    names = [name if [*names, ALL].count(name) == 1 else f"{name} {i}" for i, name in enumerate(names, start=1)]
+    durations = {name: recording.duration for name, recording in zip(names, each, strict=True)}
+    signals = [recording.filtered() for recording in each]
+    segments = [_segments(x) for x in signals]
+    own = [_own(x, each[0].unit) for x in signals]
+    trials = {name: m | {"peak_frequency": _peak([*s[:, None]], "segments")}
+              for name, m, s in zip(names, own, segments, strict=True)}  # fmt: skip
+    many = len(each) >= ENOUGH
+    peak = _peak(segments if many else [*np.concatenate(segments)[:, None]], "trials" if many else "segments")
+    together = {name: _together([m[name] for m in own]) for name in own[0]} | {"peak_frequency": peak}
+    said = [f"{name}: {notice}" for name, recording in zip(names, each, strict=True) for notice in recording.notices]
+    return Steadiness(together, trials, durations, each[0].unit, each[0].quantity, (*said, *_mind(durations, together)))
+
+
+def _same_unit(each: list[Recording]) -> None:
+    units = {recording.unit: recording.name for recording in reversed(each)}
+    told = ", ".join(f"{name} in {unit}" for unit, name in units.items())
+    remedy = "convert them to one unit (Recording(1e-3 * samples, rate, unit=...)), or report on each unit by itself"
+    if len(units) > 1:
+        raise ValueError(f"recordings: units differ ({told}); {remedy}")
+
+
+def _mind(durations: dict[str, float], together: dict[str, Measure]) -> Iterable[str]:
+    short, long = min(durations.values()), max(durations.values())
+    if long > ALIKE * short:
+        yield (f"the trials last {short:.3g} s to {long:.3g} s: what is slow (variation, power below 0.5 Hz, DFA exponent) "
+               "grows with the length, so choose windows of one length")  # fmt: skip
+    if math.isnan(together[VARIATION].value):
+        yield "the mean is near zero: there is no coefficient of variation"
+
+
+def _own(x: Float[np.ndarray, " times"], unit: str) -> dict[str, Measure]:
+    """The measures of one recording but the peak."""
+    rate = float(RECORDED.rate)
+    f, power = variance_spectrum(x, rate)
+    _, level = variance_spectrum(scipy.signal.detrend(x), rate)
+    mean, variance = float(np.mean(x)), float(np.sum(power))
+    sure = float(np.sqrt(np.mean(power[:SLOWEST])))
+    found = {
+        "mean": _measure(mean, sure, unit),
+        "standard_deviation": _measure(math.sqrt(variance), _error(power) / (2 * math.sqrt(variance)), unit),
+        VARIATION: _variation(power, mean, sure),
+        f"{VARIATION}_without_drift": _variation(level, mean, sure),
+        f"{VARIATION}_above_{FAST:g}": _variation(power[f >= FAST], mean, sure),
+    }
+    shares = {}
+    for name, (low, high) in RANGES.items():
+        inside = (f >= low) & (f < high)
+        share = float(np.sum(power[inside])) / variance
+        found[f"power{name}"] = _measure(share * variance, _error(power * inside), squared(unit))
+        shares[f"share{name}"] = _measure(share, _error(power * (inside - share)) / variance, "1")
+    regular = {}
+    whole, *parts = [(*regularity(part), dfa(part)) for part in (x, *np.array_split(x, PARTS))]
+    for name, value, each in zip(REGULARITY, whole, zip(*parts, strict=True), strict=True):
+        error = float(np.std(each, ddof=1)) / math.sqrt(PARTS) if np.all(np.isfinite(each)) else math.nan
+        regular[name] = _measure(value, error, "1", "parts")
+    return found | shares | regular
+
+
+def _measure(value: float, error: float, unit: str, error_from: str = "spectrum") -> Measure:
+    known = math.isfinite(value) and math.isfinite(error)
+    return Measure(float(value), float(error) if known else None, unit, error_from)
+
+
+def _error(power: Float[np.ndarray, " frequencies"]) -> float:
+    """Standard error of a sum: an ordinate is s χ²(1), its variance 2 s², and the mean of its square 3 s²."""
+    return math.sqrt(2 / 3 * float(np.sum(power**2)))
+
+
+def _variation(power: Float[np.ndarray, " frequencies"], mean: float, sure: float) -> Measure:
+    deviation = math.sqrt(float(np.sum(power)))
+    if not deviation <= abs(mean):
+        return _measure(math.nan, math.nan, "1")
+    error = math.hypot(_error(power) / (2 * deviation * mean), deviation * sure / mean**2)
+    return _measure(deviation / abs(mean), error, "1")
+
+
+def _together(each: list[Measure]) -> Measure:
+    """The mean over the trials; its error from their scatter, or of few trials from their own errors."""
+    values, first, count = [m.value for m in each], each[0], len(each)
+    if not np.all(np.isfinite(values)):
+        return _measure(math.nan, math.nan, first.unit, first.error_from)
+    if count >= ENOUGH:
+        error = float(np.std(values, ddof=1)) / math.sqrt(count)
+        return _measure(float(np.mean(values)), error, first.unit, "trials")
+    error = math.hypot(*(math.nan if m.stderr is None else m.stderr for m in each)) / count
+    return _measure(float(np.mean(values)), error, first.unit, first.error_from)
+
+
+def _segments(x: Float[np.ndarray, " times"]) -> Float[np.ndarray, "segments bins"]:
+    """The spectrum of every Welch segment."""
+    length, bins = RECORDED.length, slice(RECORDED.first_bin, RECORDED.last_bin + 1)
+    return scipy.signal.spectrogram(x, RECORDED.rate, "hann", length, length - RECORDED.step)[2].T[:, bins]
+
+
+def _peak(groups: list[np.ndarray], error_from: str) -> Measure:
+    """The hill of the mean of all segments; its error by leaving out one group of them after another."""
+    whole, count = np.concatenate(groups), len(groups)
+    value = _hill(np.mean(whole, axis=0), RISE / math.sqrt(len(whole)))
+    left_out = [_hill(np.mean(np.concatenate(groups[:i] + groups[i + 1 :]), axis=0), 0.0) for i in range(count)]
+    return _measure(value, math.sqrt((count - 1) * float(np.var(left_out))), "Hz", error_from)
+
+
+def _hill(power: Float[np.ndarray, " bins"], rise: float) -> float:
+    """Frequency of the most prominent maximum of log power above 6 Hz; NaN if none rises so much."""
+    f, logged = RECORDED.frequency, np.log(power)
+    tops, seen = scipy.signal.find_peaks(logged, prominence=rise)
+    fast = f[tops] >= TREMOR
+    if not np.any(fast):
+        return math.nan
+    top = tops[fast][np.argmax(seen["prominences"][fast])]
+    near = slice(max(top - HALF, 0), top + HALF + 1)
+    bend, slope, _ = np.polyfit(f[near] - f[top], logged[near], 2)
+    reach = HALF * RECORDED.resolution
+    return float(f[top] + (np.clip(-slope / (2 * bend), -reach, reach) if bend < 0 else 0.0))

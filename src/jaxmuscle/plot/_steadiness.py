@@ -1,0 +1,70 @@
+"""The figure of a steadiness report: power by band, coefficients of variation, regularity; every trial as a dot."""
+
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure, SubFigure
+
+from jaxmuscle._common.text import squared
+
+from ._style import BLUE, SKY, canvas, log_axis, styled
+
+VARIATION = "coefficient_of_variation"
+VARIATIONS = {"all": VARIATION, "without\ndrift": f"{VARIATION}_without_drift", "above\n0.5 Hz": f"{VARIATION}_above_0.5"}
+REGULARITY = {
+    "approximate\nentropy": "approximate_entropy",
+    "sample\nentropy": "sample_entropy",
+    "DFA\nexponent": "dfa_exponent",
+}
+SPREAD = 0.28
+
+
+@styled
+def steadiness(steadiness: Any, ax: Axes | None = None) -> Figure | SubFigure:
+    """Draws the steadiness of trials: power by band, coefficients of variation, entropies and DFA exponent.
+
+    Dots are trials, large ones the value of all with its standard error.
+    """
+    fig = canvas(ax, (9.0, 3.1))
+    power, variation, regularity = fig.subplots(1, 3, width_ratios=(1.5, 1, 1))
+    bands = {_range(name): name for name in steadiness.measures if name.startswith("power_")}
+    _dots(power, steadiness, bands)
+    log_axis(power, "y")
+    power.set_xlabel("Frequency (Hz)")
+    power.set_ylabel(f"Power ({squared(steadiness.unit).replace('^2', '²')})", parse_math=False)
+    power.set_title("Power by band")
+    _dots(variation, steadiness, VARIATIONS, 100.0)
+    variation.set_ylabel("Standard deviation (% of the mean)")
+    variation.set_title("Coefficient of variation")
+    _dots(regularity, steadiness, REGULARITY)
+    regularity.set_ylabel("Value (no unit)")
+    regularity.set_title("Regularity")
+    for panel in (variation, regularity):
+        panel.set_ylim(bottom=0, auto=None)
+    fig.legend(*power.get_legend_handles_labels(), loc="outside upper right", ncols=2, frameon=False)
+    count = len(steadiness.trials)
+    words = f"{count} trials" if count > 1 else next(iter(steadiness.trials))
+    fig.suptitle(f"Steadiness of {words}", x=0.01, ha="left", fontsize=8.0, parse_math=False)
+    return fig
+
+
+def _range(name: str) -> str:
+    low, high = name.split("_")[1:]
+    return f"above\n{high}" if low == "above" else f"{low} to\n{high}"
+
+
+def _dots(ax: Axes, steadiness: Any, names: dict[str, str], scale: float = 1.0) -> None:
+    trials = list(steadiness.trials.values())
+    beside = np.linspace(-SPREAD, SPREAD, len(trials)) if len(trials) > 1 else np.zeros(1)
+    each = scale * np.array([[trial[name].value for trial in trials] for name in names.values()])
+    at = np.arange(len(names))
+    if len(trials) > 1:
+        ax.plot((at[:, None] + beside).ravel(), each.ravel(), "o", ms=2.8, color=SKY, zorder=3, label="trials")
+    found = [steadiness.measures[name] for name in names.values()]
+    value = scale * np.array([m.value for m in found])
+    error = scale * np.array([np.nan if m.stderr is None else m.stderr for m in found])
+    label = "mean ± standard error" if len(trials) > 1 else "± standard error"
+    ax.errorbar(at, value, error, fmt="o", ms=4.5, capsize=3, lw=1.2, color=BLUE, label=label)
+    ax.set_xticks(at, list(names))
+    ax.set_xlim(-0.6, len(names) - 0.4)
