@@ -8,7 +8,7 @@ import typer
 import jaxmuscle as jm
 
 from .console import csv_text, err, out, plain, reporting, save_figure, writable
-from .options import Output
+from .options import Output, SpectrumName
 
 if TYPE_CHECKING:
     from jaxmuscle import Recording
@@ -24,6 +24,10 @@ def analyse(
     window: Annotated[
         str | None, typer.Option(metavar="A:B", help="Steady part in s, or `all`; found by itself if left out.")
     ] = None,
+    spectrum: Annotated[
+        SpectrumName,
+        typer.Option(help="slow: bins of 0.1 Hz, for what is below 1 Hz; multitaper: the same for short recordings."),
+    ] = SpectrumName.standard,
     output: Output = Path("out"),
     save_target: Annotated[Path | None, typer.Option(metavar="FILE", help="Save the target for `jaxmuscle fit`.")] = None,
 ) -> None:
@@ -34,6 +38,8 @@ def analyse(
     Examples:
 
         jaxmuscle analyse trial.csv --column force --rate 2048 --window 8:25 --save-target trial.toml
+
+        jaxmuscle analyse trial.csv --column force --spectrum slow --save-target slow.toml
 
         jaxmuscle analyse trial.c3d --column finger --axis principal --reference stand --window all
     """
@@ -50,7 +56,7 @@ def analyse(
             raise ValueError(str(error)) from None
         if edges != "all":
             recording = recording.steady(edges)
-        _write(recording, output, save_target)
+        _write(recording, str(spectrum), output, save_target)
 
 
 def _edges(window: str | None) -> Any:
@@ -65,23 +71,23 @@ def _edges(window: str | None) -> Any:
     raise ValueError(f"--window {window}: give start and end in s, as 8:25, or all")
 
 
-def _write(recording: "Recording", folder: Path, save_target: Path | None) -> None:
+def _write(recording: "Recording", settings: str, folder: Path, save_target: Path | None) -> None:
     from rich.table import Table
 
     from jaxmuscle._common.files import write_json, write_text
 
-    spectrum, summary = recording.spectrum(), recording.summary()
+    spectrum, summary = recording.spectrum(settings), recording.summary(settings)
     proportional = spectrum.power / spectrum.power.sum()
     columns = {"frequency_hz": spectrum.frequency, "power": spectrum.power, "proportional_power": proportional}
     facts = {key: getattr(recording, key) for key in ("name", "source", "unit", "rate", "window", "notices")}
     record = {"recording": facts, "summary": summary.to_dict(), "settings": spectrum.settings.to_dict(),
               "spectrum": {key: values.tolist() for key, values in columns.items()}}  # fmt: skip
     if save_target is not None:
-        target = recording.target(save_target.stem)
+        target = recording.target(save_target.stem, settings=settings)
         save_target.parent.mkdir(parents=True, exist_ok=True)
     else:
         target = None
-    save_figure(recording.plot(), folder / "analysis.png")
+    save_figure(recording.plot(settings), folder / "analysis.png")
     write_text(folder / "spectrum.csv", csv_text(columns))
     write_json(folder / "analysis.json", record)
     for notice in recording.notices if target is None else target.notices:

@@ -30,6 +30,13 @@ class ResidualName(StrEnum):
     cumulative = "cumulative"
 
 
+class SpectrumName(StrEnum):
+    standard = "standard"
+    slow = "slow"
+    multitaper = "multitaper"
+    pwelch = "pwelch"
+
+
 class TaskName(StrEnum):
     isometric = "isometric"
     motion = "prescribed-motion"

@@ -20,6 +20,7 @@ from jaxmuscle.model._parameters import PARAMETERS, USUALLY_FREE
 from jaxmuscle.model._tasks import AbstractTask, Isometric, PrescribedForce, with_noise
 from jaxmuscle.response._expected import check_line
 from jaxmuscle.response._linearised import has_response
+from jaxmuscle.spectra._settings import WINDOW, require, samples_in
 
 from ._coordinates import Coordinates
 from ._problem import FitProblem, Part, target_variation
@@ -125,6 +126,8 @@ def planned(task: AbstractTask, target: Target, options: FitOptions) -> Plan:
     _check_names("priors", priors, names)
     _check_names("bounds", bounds, names)
     check_line(task, target.settings)
+    require(target.settings.segments(samples_in(WINDOW, target.settings)) > 0, "length", target.settings.length,
+            "a fit simulates 10 s, which is shorter than a segment; analyse the data with shorter ones")  # fmt: skip
     if not (np.any(np.asarray(task.noise.amplitude) > 0) or float(task.harmonic.amplitude) > 0):
         raise ValueError("the task has neither noise nor a harmonic, so its spectrum is zero: set noise_K_w, say")
     _check_mean(task, names, options.mean_force)

@@ -22,7 +22,7 @@ def recording(recording: Any, settings: Any = None, ax: Axes | None = None) -> F
     band = [edge * np.sum(welch.power) for edge in target.sampling_band() or ()]
     for panel, log in ((axes[1, 0], False), (axes[1, 1], True)):
         _spectra(panel, welch, fft, band, log)
-    words = f"{recording.segments(settings)} Welch segments"
+    words = f"{target.settings.name or 'own'} spectrum, {recording.segments(settings)} Welch segments"
     fig.suptitle(f"{recording.source}; {words}", x=0.01, ha="left", fontsize=8.0, parse_math=False)
     return fig
 
