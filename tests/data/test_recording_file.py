@@ -403,6 +403,10 @@ def test_command(tmp_path):
     assert matplotlib.image.imread(out / "analysis.png").shape[:2] == (840, 1350)
     found = run(path, "--out", out)
     assert found.exit_code == 0 and "found by itself" in found.output
+    slow = run(path, "--window", "4:16", "--spectrum", "slow", "--out", out, "--save-target", tmp_path / "slow.toml")
+    assert slow.exit_code == 0 and "12.00 s, 1 Welch segments" in slow.output
+    assert load_target(tmp_path / "slow.toml") == held.target("slow", settings="slow")
+    assert json.loads((out / "analysis.json").read_text())["settings"]["length"] == 1000
 
 
 @pytest.mark.parametrize(

@@ -107,7 +107,7 @@ def test_statistics_are_those_of_measured_log_powers(corner):
 
 @pytest.mark.parametrize(("name", "tapers"), [("slow", ["hann"]), ("multitaper", scipy.signal.windows.dpss(1000, 2, 3))])
 def test_the_law_of_long_segments_is_that_of_coloured_noise(name, tapers):
-    """Noise that falls from 0.9 Hz on, stationary from the first sample: spread of the bins, correlation with the next three."""
+    """Noise that falls from 0.9 Hz on, stationary from its first sample: spread of the bins, correlation of neighbours."""
     settings, segments, a = jm.SpectrumSettings.named(name), 3, np.exp(-2 * np.pi * 0.9 / 100)
     white = np.random.default_rng(7).standard_normal((1500, 2000)) * np.r_[1, np.full(1999, np.sqrt(1 - a**2))]
     signals = scipy.signal.lfilter([1], [1, -a], white)
