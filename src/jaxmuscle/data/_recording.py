@@ -199,11 +199,9 @@ class Recording(eqx.Module):
     def spectrum(self, settings: SpectrumSettings | str | None = None) -> Spectrum:
         """Welch spectrum of the window, in float64: resampled and low-passed before it is cut.
 
-        **Arguments:** `settings`, by default `SpectrumSettings(filter_direction="both")`; or a name, as `"slow"`
-        (`SpectrumSettings.named`), filtered the same way.
+        **Arguments:** `settings`, by default the standard ones filtered both ways; or a name (`SpectrumSettings.named`).
 
-        **Raises:** `ValueError` if the window is constant or shorter than one segment, or the bins reach beyond half the
-        recorded rate.
+        **Raises:** `ValueError` if the window is constant or below one segment, or bins lie above half the recorded rate.
         """
         settings = _settings(settings)
         highest = float(settings.frequency[-1])
@@ -323,9 +321,8 @@ def _drift(x: Float[np.ndarray, " times"]) -> tuple[str, ...]:
 
 def _settings(settings: SpectrumSettings | str | None) -> SpectrumSettings:
     """As given, or those of a name, by default the standard; named ones filter as recordings are filtered."""
-    if isinstance(settings, SpectrumSettings):
-        return settings
-    return SpectrumSettings.named("standard" if settings is None else settings).replace(filter_direction="both")
+    given = isinstance(settings, SpectrumSettings)
+    return settings if given else SpectrumSettings.named(settings or "standard").replace(filter_direction="both")
 
 
 def _rate(rate: Any) -> float:
