@@ -224,6 +224,21 @@ def test_own_settings():
     assert recording.target(settings=settings).settings == settings
 
 
+def test_spectra_by_name():
+    recording = Recording(noisy(rate=200), 200)
+    for name in ("standard", "slow", "multitaper"):
+        target = recording.target(settings=name)
+        assert target.settings == SpectrumSettings.named(name).replace(filter_direction="both")
+        assert f"  spectrum  {name}\n" in str(target)
+        power = recording.spectrum(target.settings).power
+        np.testing.assert_allclose(target.proportional_power, power / np.sum(power), rtol=EXACT)
+        assert target.segments == (target.settings.segments(2000),)
+    assert recording.target().settings.name == "standard"
+    assert "  spectrum  settings of its own\n" in str(recording.target(settings=target.settings.replace(last_bin=50)))
+    with pytest.raises(ValueError, match=r"settings='slwo'.*'slow'"):
+        recording.spectrum("slwo")
+
+
 def test_float64_whatever_the_flag():
     recording = Recording(noisy(rate=200), 200)
     with jax.enable_x64(False):

@@ -404,6 +404,12 @@ def test_command(tmp_path):
     found = run(path, "--out", out, "--force", "--json")
     assert found.exit_code == 0 and "found by itself" in found.stderr
     assert json.loads(found.stdout) == json.loads((out / "analysis.json").read_text()) != record
+    slow = run(
+        path, "--window", "4:16", "--spectrum", "slow", "--out", out, "--force", "--save-target", tmp_path / "slow.toml"
+    )
+    assert slow.exit_code == 0 and "12.00 s, 1 Welch segments" in slow.output
+    assert load_target(tmp_path / "slow.toml") == held.target("slow", settings="slow")
+    assert json.loads((out / "analysis.json").read_text())["settings"]["length"] == 1000
 
 
 @pytest.mark.parametrize(

@@ -76,6 +76,7 @@ def part_of(problem, seeds=8):
         {"detrend": "linear", "overlap": 0.25},
         {"filter_cutoff": None, "first_bin": 0, "last_bin": 128},
         {"rate": 50.0, "length": 100, "filter_cutoff": 20.0, "filter_order": 4, "window": "boxcar", "overlap": 0.29},
+        {"window": "dpss", "tapers": 3, "detrend": "linear"},
     ],
 )
 def test_welch_operator_is_the_spectrum(x64, changes):

@@ -131,7 +131,7 @@ def _scores():
     bins = jax.tree.map(jnp.asarray, measured_bins(jm.Target("white", np.ones(30), segments=SEGMENTS)))
     powers = white_powers()[:4000]
     shares = jnp.log(jnp.asarray(powers / powers.sum(axis=1, keepdims=True)))
-    truth = jnp.log(jnp.asarray(np.sum(np.abs(bin_rows(jm.SpectrumSettings())) ** 2, axis=1)))
+    truth = jnp.log(jnp.asarray(np.sum(np.abs(bin_rows(jm.SpectrumSettings())) ** 2, axis=(1, 2))))
 
     def slope(log_power):
         return jax.grad(lambda e: log_marginal(bins._replace(log_power=log_power), jnp.exp(e), jnp.zeros(30)))(truth)

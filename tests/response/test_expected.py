@@ -156,11 +156,17 @@ def low_pass(settings, f):
     return np.abs(gain) ** 2 if settings.filter_direction == "both" else gain
 
 
+def tapers_by_scipy(settings):
+    if settings.window == "dpss":
+        return scipy.signal.windows.dpss(settings.length, (settings.tapers + 1) / 2, settings.tapers)
+    return [scipy.signal.get_window(settings.window, settings.length)]
+
+
 def welch_by_scipy(x, settings):
     """Along the first axis."""
-    cut = {"nperseg": settings.length, "noverlap": settings.length - settings.step}
-    detrend = False if settings.detrend == "none" else settings.detrend
-    power = scipy.signal.welch(x, settings.rate, settings.window, **cut, detrend=detrend, axis=0)[1]
+    cut = {"noverlap": settings.length - settings.step, "detrend": False if settings.detrend == "none" else settings.detrend}
+    tapers = tapers_by_scipy(settings)
+    power = np.mean([scipy.signal.welch(x, settings.rate, taper, **cut, axis=0)[1] for taper in tapers], axis=0)
     return power[settings.first_bin : settings.last_bin + 1]
 
 
@@ -187,10 +193,10 @@ def by_quadrature(task, settings, window, points=4096):
     f = (np.arange(points) / points - 0.5) * settings.rate
     S = sampled(functools.partial(density, task, p, settings), settings.rate, f) * np.abs(low_pass(settings, np.abs(f))) ** 2
     bins, m = np.arange(settings.first_bin, settings.last_bin + 1), np.arange(settings.length)
-    taper = scipy.signal.get_window(settings.window, settings.length)
-    waves = detrended(np.exp(2j * np.pi * np.outer(m, f) / settings.rate), settings) * taper[:, None]
-    kernel = np.abs(np.exp(-2j * np.pi * np.outer(bins, m) / settings.length) @ waves) ** 2
-    sides = np.where((bins == 0) | (2 * bins == settings.length), 1.0, 2.0) / (settings.rate * np.sum(taper**2))
+    tapers, turns = tapers_by_scipy(settings), np.exp(-2j * np.pi * np.outer(bins, m) / settings.length)
+    waves = detrended(np.exp(2j * np.pi * np.outer(m, f) / settings.rate), settings)
+    kernel = np.mean([np.abs((turns * taper) @ waves) ** 2 / np.sum(taper**2) for taper in tapers], axis=0)
+    sides = np.where((bins == 0) | (2 * bins == settings.length), 1.0, 2.0) / settings.rate
     noise = sides * (kernel @ S) * settings.rate / points
     line, swing = line_by_scipy(task, settings, window)
     samples = round((window[1] - window[0]) * settings.rate)
@@ -200,12 +206,15 @@ def by_quadrature(task, settings, window, points=4096):
     return noise, line, RESPONSES[task.output_name](p, np.zeros(1))[-1], variance + swing
 
 
+SLOW, MULTITAPER = (Settings.named(name).to_dict() for name in ("slow", "multitaper"))
 BOTH = {"K_w": 0.15, "K_z": 0.05}
 ALONE = {"K_w": 0.15}
 RHYTHM = jm.Harmonic(0.003, 4.25, 0.7)
 CASES = {
     "isometric, band-limited": (jm.Isometric, jm.BandLimitedNoise(BOTH), {}),
     "isometric, OU": (jm.Isometric, jm.OrnsteinUhlenbeckNoise(BOTH, 0.05), {"filter_direction": "both", "first_bin": 0}),
+    "isometric, slow": (jm.Isometric, jm.OrnsteinUhlenbeckNoise(BOTH, 0.3), SLOW),
+    "isometric, multitaper": (jm.Isometric, jm.OrnsteinUhlenbeckNoise(BOTH, 0.3), MULTITAPER),
     "isometric, white": (jm.Isometric, jm.WhiteNoise(ALONE), {"detrend": "none", "filter_cutoff": None, "last_bin": 128}),
     "force, band-limited": (jm.PrescribedForce, jm.BandLimitedNoise(BOTH), {}),
     "force, shared OU": (
@@ -351,6 +360,8 @@ RINGING = np.exp(-np.arange(2000) / 20) * np.cos(np.arange(2000) / 3)
         {"detrend": "none", "first_bin": 0, "filter_cutoff": None},
         {"window": "boxcar", "filter_order": 4, "filter_cutoff": 10.0, "length": 100, "last_bin": 50},
         {"window": "hamming", "filter_order": 2, "filter_direction": "both", "rate": 250.0, "length": 75, "first_bin": 0},
+        SLOW,
+        MULTITAPER,
     ],
     ids=str,
 )

@@ -15,7 +15,7 @@ import scipy.signal
 import scipy.stats
 from hypothesis import given, settings
 
-from jaxmuscle.spectra._settings import SpectrumSettings, taper_of
+from jaxmuscle.spectra._settings import NAMED, SpectrumSettings, taper_of
 from jaxmuscle.spectra._welch import Spectrum, lowpass, periodogram, spectrum_of, welch
 
 ROUNDING = 1e-10  # float64: what the design promises; the transforms themselves are within 1e-13
@@ -256,6 +256,7 @@ WRONG = {
     "filter_cutoff": [0.0, 50.0, float("nan"), "30"],
     "filter_direction": ["backward"],
     "sampling": ["mean"],
+    "tapers": [0, 3, 2.0],
 }
 
 
@@ -266,10 +267,50 @@ def test_wrong_settings_are_named(user_view, name, value):
     assert str(value) in str(error.value)
 
 
+def test_tapers_that_do_not_fit():
+    for count in (1, 9):
+        with pytest.raises(ValueError, match=f"^tapers={count}: give at least 2, at most length / 8 = 8"):
+            SpectrumSettings(length=64, window="dpss", tapers=count)
+
+
+def test_names():
+    for name in NAMED:
+        chosen = SpectrumSettings.named(name)
+        assert chosen.name == name
+        assert chosen.replace(filter_direction="both", filter_cutoff=None, sampling="average").name == name
+        assert chosen.replace(length=512, last_bin=20).name is None
+    assert SpectrumSettings.named("standard") == SpectrumSettings()
+    with pytest.raises(ValueError, match=r"settings='slwo'.*'slow'"):
+        SpectrumSettings.named("slwo")
+
+
+@pytest.mark.parametrize("name, window", [("slow", ["hann"]), ("multitaper", scipy.signal.windows.dpss(1000, 2, 3))])
+def test_spectra_of_long_segments_are_scipys(x64, name, window):
+    """Segments of 10 s, their straight line removed; NW = 2 and K = 3 for Slepian tapers, each as a window of its own."""
+    signal = np.cumsum(np.random.default_rng(4).standard_normal((2, 3700)), axis=1)
+    each = [scipy.signal.welch(signal, 100, taper, 1000, 500, detrend="linear")[1] for taper in window]
+    chosen = SpectrumSettings.named(name)
+    expected = np.mean(each, axis=0)[:, chosen.first_bin : chosen.last_bin + 1]
+    np.testing.assert_allclose(welch(signal, chosen), expected, rtol=1e-10)
+    np.testing.assert_allclose(chosen.frequency, np.arange(chosen.first_bin, 118) / 10)
+
+
+def test_a_drift_leaves_slow_spectra_alone(x64):
+    """A straight line of any steepness: nothing of it is in a bin, where removing the mean alone leaves a lot."""
+    noise = np.random.default_rng(5).standard_normal(3000)
+    for name in ("slow", "multitaper"):
+        chosen = SpectrumSettings.named(name)
+        still, drifting = (np.asarray(welch(noise + slope * np.arange(3000), chosen)) for slope in (0.0, 0.01))
+        np.testing.assert_allclose(drifting, still, rtol=1e-9)
+        level = chosen.replace(detrend="constant")
+        assert welch(noise + 0.01 * np.arange(3000), level)[0] > 20 * welch(noise, level)[0]
+
+
 @pytest.mark.parametrize(
     "chosen",
     [
         SpectrumSettings(),
+        SpectrumSettings.named("multitaper"),
         SpectrumSettings.pwelch(),
         SpectrumSettings(rate=np.float32(120), length=np.int64(128), first_bin=0, filter_cutoff=None),
     ],
@@ -277,6 +318,7 @@ def test_wrong_settings_are_named(user_view, name, value):
 def test_settings_survive_a_file(chosen):
     table = json.loads(json.dumps(chosen.to_dict()))
     assert None not in table.values()  # TOML could not hold it
+    assert ("tapers" in table) == (chosen.name == "multitaper")  # files of single tapers stay as they were
     assert SpectrumSettings.from_dict(table) == chosen
     assert hash(SpectrumSettings.from_dict(table)) == hash(chosen)
 

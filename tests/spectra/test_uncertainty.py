@@ -105,6 +105,33 @@ def test_statistics_are_those_of_measured_log_powers(corner):
     assert statistics.known
 
 
+@pytest.mark.parametrize(("name", "tapers"), [("slow", ["hann"]), ("multitaper", scipy.signal.windows.dpss(1000, 2, 3))])
+def test_the_law_of_long_segments_is_that_of_coloured_noise(name, tapers):
+    """Noise that falls from 0.9 Hz on, stationary from its first sample: spread of the bins, correlation of neighbours."""
+    settings, segments, a = jm.SpectrumSettings.named(name), 3, np.exp(-2 * np.pi * 0.9 / 100)
+    white = np.random.default_rng(7).standard_normal((1500, 2000)) * np.r_[1, np.full(1999, np.sqrt(1 - a**2))]
+    signals = scipy.signal.lfilter([1], [1, -a], white)
+    power = np.mean([scipy.signal.welch(signals, 100, w, 1000, 500, detrend="linear")[1] for w in tapers], axis=0)
+    power = power[:, settings.first_bin : settings.last_bin + 1]
+    statistics = bin_statistics(jm.Target(name, power[0], segments=segments, settings=settings))
+    log, step = np.log(power), 4 * len(tapers)  # bins so far apart are independent
+    for bins in (slice(0, 1), slice(1, 2), slice(2, None)):
+        found, stated = (np.sqrt(np.mean(x)) for x in (log[:, bins].var(axis=0, ddof=1), statistics.sd[bins] ** 2))
+        independent = 1500 * max(1, len(log[0, bins]) // step)
+        assert abs(found / stated - 1) < 4 * np.sqrt((1 + 3 / statistics.half.min()) / 2 / independent) + 0.03
+    # What the degrees of freedom are without detrending and leakage.
+    np.testing.assert_allclose(2 * statistics.half[20:], settings.degrees_of_freedom(segments), rtol=1e-3)
+    law, x = (
+        welch_law(settings, np.arange(settings.first_bin, 118), (segments,)),
+        power[:, 6:] / power[:, 6:].mean(axis=0) - 1,
+    )
+    variance = np.mean(x[:, :-3] ** 2, axis=1)
+    excess = [
+        np.mean(x[:, :-3] * x[:, d : d - 3 or None], axis=1) - law.correlation[20, 20 + d] * variance for d in (1, 2, 3)
+    ]
+    references.assert_standard_normal([q.mean() / scipy.stats.sem(q) for q in excess])
+
+
 def test_statistics_of_several_trials_add_their_degrees_of_freedom():
     one, three = (bin_statistics(jm.Target("t", FLAT, segments=s)) for s in (6, [6, 6, 6]))
     nu = welch_law(jm.SpectrumSettings(), BINS, (6,)).degrees

@@ -6,31 +6,42 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from .console import absent, csv_text, err, out, plain, record, reporting, save_figure, writable
-from .options import Force, Json, Output, Window
-from .recordings import read, reads_recordings
+from .options import Force, Json, Output, Recordings, SpectrumName, Window
+from .recordings import read_trials, reads_recordings
 
 if TYPE_CHECKING:
-    from jaxmuscle import Recording
+    from jaxmuscle import Trials
 
 
 @reads_recordings
 def analyse(
-    path: Annotated[str, typer.Argument(metavar="RECORDING", help="Text, .xlsx, .mat, .npy, .npz, .c3d, .edf, ... file.")],
+    paths: Recordings,
     *,
     window: Window = None,
+    spectrum: Annotated[
+        SpectrumName,
+        typer.Option(help="slow: bins of 0.1 Hz, for what is below 1 Hz; multitaper: the same for short recordings."),
+    ] = SpectrumName.standard,
+    mvc: Annotated[
+        float | None, typer.Option(metavar="FORCE", help="Maximal voluntary contraction, in the recording's unit.")
+    ] = None,
     output: Output = Path("out"),
     save_target: Annotated[Path | None, typer.Option(metavar="FILE", help="Save the target for `jaxmuscle fit`.")] = None,
     force: Force = False,
     as_json: Json = False,
     reading: dict[str, Any],
 ) -> None:
-    """Analyse a recording: level, variability, regularity, spectrum.
+    """Analyse a recording, or the trials of one condition: level, variability, regularity, spectrum.
 
-    Writes DIR/analysis.json, DIR/spectrum.csv and DIR/analysis.png.
+    Writes DIR/analysis.json, DIR/spectrum.csv and DIR/analysis.png. The spectra of several trials are averaged.
 
     Examples:
 
         jaxmuscle analyse trial.csv --column force --rate 2048 --window 8:25 --save-target trial.toml
+
+        jaxmuscle analyse trial1.csv trial2.csv trial3.csv --save-target anna.toml
+
+        jaxmuscle analyse trial.csv --column force --spectrum slow --save-target slow.toml
 
         jaxmuscle analyse trial.c3d --column finger --axis principal --reference stand --window all
     """
@@ -40,37 +51,46 @@ def analyse(
         if save_target is not None:
             absent(save_target, force=force)
         writable(output, "analysis.json", force=force)
-        recording = read(path, reading, window)
-        _write(recording, output, save_target)
+        _write(read_trials(paths, reading, window), str(spectrum), mvc, output, save_target)
 
 
-def _write(recording: "Recording", folder: Path, save_target: Path | None) -> None:
+def _write(trials: "Trials", settings: str, mvc: float | None, folder: Path, save_target: Path | None) -> None:
     from rich.table import Table
 
     from jaxmuscle._common.files import write_json, write_text
 
-    spectrum, summary = recording.spectrum(), recording.summary()
+    spectrum, summaries = trials.spectrum(settings), [recording.summary(settings) for recording in trials]
     proportional = spectrum.power / spectrum.power.sum()
     columns = {"frequency_hz": spectrum.frequency, "power": spectrum.power, "proportional_power": proportional}
-    facts = {key: getattr(recording, key) for key in ("name", "source", "unit", "rate", "window", "notices")}
-    found = {"recording": facts, "summary": summary.to_dict(), "settings": spectrum.settings.to_dict(),
-             "spectrum": {key: values.tolist() for key, values in columns.items()}}  # fmt: skip
-    if save_target is not None:
-        target = recording.target(save_target.stem)
-        save_target.parent.mkdir(parents=True, exist_ok=True)
-    else:
-        target = None
-    save_figure(recording.plot(), folder / "analysis.png")
+    names = ("name", "source", "unit", "rate", "window", "notices")
+    each = [{"recording": {key: getattr(recording, key) for key in names}, "summary": summary.to_dict()}
+            for recording, summary in zip(trials, summaries, strict=True)]  # fmt: skip
+    several = len(trials) > 1
+    found = ({"trials": each} if several else each[0]) | {
+        "settings": spectrum.settings.to_dict(), "spectrum": {key: values.tolist() for key, values in columns.items()}
+    }  # fmt: skip
+    target = None
+    if save_target is not None or ((several or mvc is not None) and trials[0].quantity is not None):
+        target = trials.target(None if save_target is None else save_target.stem, settings=settings, mvc=mvc)
+    if several and target is not None:
+        found["dispersion"] = target.dispersion
+    save_figure(trials.plot(settings), folder / "analysis.png")
     write_text(folder / "spectrum.csv", csv_text(columns))
     write_json(folder / "analysis.json", found)
-    for notice in recording.notices if target is None else target.notices:
+    notices = target.notices if target is not None else [notice for recording in trials for notice in recording.notices]
+    for notice in dict.fromkeys(notices):
         err.print(f"[yellow]notice:[/] {plain(notice)}", highlight=False)
-    table = Table(title=plain(recording.source), title_justify="left", show_header=False)
-    for name, value in summary.rows():
-        table.add_row(name, plain(value))
+    table = Table(title=plain(trials.name if several else trials[0].source), title_justify="left", show_header=several)
+    for heading in ("", *(recording.name for recording in trials)):
+        table.add_column(plain(heading))
+    for row in zip(*(summary.rows() for summary in summaries), strict=True):
+        table.add_row(row[0][0], *(plain(value) for _, value in row))
     out.print(table)
+    if target is not None and (several or target.mvc_fraction is not None):
+        out.print(plain(target), highlight=False)
     written = [f"{folder}/analysis.json, spectrum.csv, analysis.png"]
     if target is not None and save_target is not None:
+        save_target.parent.mkdir(parents=True, exist_ok=True)
         target.save(save_target)
         written.append(str(save_target))
     record(found)

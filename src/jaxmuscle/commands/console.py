@@ -41,8 +41,15 @@ def task_of(preset: str, task: TaskName | None, observe: Observed | None = None)
 
 
 def aim_of(name: str, task: TaskName | None, read: dict[str, Any]) -> tuple[Any, Any]:
-    """The target of that name or file, its notices said, and the task to fit to it: by default what the target measured."""
-    target = jm.load_target(name, **read)
+    """The target of that name or file, its notices said, and the task to fit to it: by default what the target measured.
+
+    A recording's steady part is found by itself.
+    """
+    return aimed(jm.data.as_target(name, **({} if jm.data.is_recording(name) else read)), task)
+
+
+def aimed(target: Any, task: TaskName | None) -> tuple[Any, Any]:
+    """The target, its notices said, and the task to fit to it."""
     for notice in target.notices:
         err.print(f"[yellow]notice:[/] {plain(notice)}", highlight=False)
     return target, jm.task_for(target, None if task is None else jm.model.TASKS[task])

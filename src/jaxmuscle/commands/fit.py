@@ -13,6 +13,7 @@ from .console import (
     INTERRUPTED,
     NOT_CONVERGED,
     aim_of,
+    aimed,
     err,
     out,
     plain,
@@ -23,7 +24,6 @@ from .console import (
     write_fit,
 )
 from .options import (
-    AxisName,
     Fix,
     Force,
     Free,
@@ -36,15 +36,21 @@ from .options import (
     Seed,
     Segments,
     TargetTask,
+    Window,
     fixed_values,
     names_in,
 )
+from .recordings import read_trials, reads_recordings
 
 
+@reads_recordings
 def fit(
     target: Annotated[
-        list[str], typer.Argument(help="Bundled target (see `jaxmuscle targets`) or path of a .toml, .csv, .json, .tar.")
+        list[str],
+        typer.Argument(help="Bundled target (see `jaxmuscle targets`), spectra (.toml, .csv, .json, .tar), or recordings."),
     ],
+    *,
+    window: Window = None,
     task: TargetTask = None,
     method: Annotated[
         MethodName, typer.Option(help="Spectrum in linear response, then corrected; or simulated.")
@@ -72,8 +78,9 @@ def fit(
     quantity: Quantity = None,
     dataset: Annotated[str | None, typer.Option(metavar="NAME", help="Which dataset of a digitised figure.")] = None,
     axis: Annotated[
-        AxisName, typer.Option(help="log-log: a digitised figure's points are log10 of Hz and of power.")
-    ] = AxisName.linear,
+        str | None,
+        typer.Option(help="log-log: a digitised figure's points are log10 of Hz and power. Of a point: x, y, z, principal."),
+    ] = None,
     groups: Annotated[
         Path | None, typer.Option(metavar="FILE", help="CSV with the columns target, group (several targets).")
     ] = None,
@@ -83,8 +90,12 @@ def fit(
     output: Output = Path("out"),
     force: Force = False,
     as_json: Json = False,
+    reading: dict[str, Any],
 ) -> None:
-    """Fit the muscle to a target spectrum, or to those of many people together.
+    """Fit the muscle to a target spectrum, to recordings, or to the spectra of many people together.
+
+    Recordings are the trials of one person in one condition: their spectra are averaged. Options such as --column say how
+    they are read. Several spectra are those of several people.
 
     Prints a table as soon as the search has ended, then what the checks on simulated seeds add. Writes DIR/fit.json,
     DIR/fit.png and DIR/spectrum.csv. Several targets: DIR/TARGET/... and
@@ -98,7 +109,9 @@ def fit(
 
         jaxmuscle fit fdi-abduction-45mvc --fix m_w=0.1 --free c_w,noise_K_w
 
-        jaxmuscle fit people/*.csv --groups groups.csv --out out/cohort
+        jaxmuscle fit trial1.csv trial2.csv trial3.csv --column force --rate 1000
+
+        jaxmuscle fit people/*.toml --groups groups.csv --out out/cohort
 
         jaxmuscle fit figure.tar --dataset "95 MVC" --segments 6
     """
@@ -108,7 +121,12 @@ def fit(
         keep_compiled_programs()
         fixed = fixed_values(fix)
         names = names_in(free)
-        read = {"quantity": quantity, "segments": segments, "dataset": dataset, "axis": str(axis)}
+        read = {"quantity": quantity, "segments": segments, "dataset": dataset, "axis": axis or "linear"}
+        recorded = [jm.data.is_recording(name) for name in target]
+        if any(recorded) and not all(recorded):
+            raise ValueError(f"{target[recorded.index(True)]} is a recording, {target[recorded.index(False)]} a spectrum: "
+                             "fit them one at a time, or `jaxmuscle analyse ... --save-target` the recordings "
+                             "first")  # fmt: skip
         options = {
             "free": names,
             "fix": fixed,
@@ -117,7 +135,7 @@ def fit(
             "starts": starts,
             "key": seed,
         }
-        if len(target) > 1:
+        if len(target) > 1 and not any(recorded):
             from .cohort import fit_together
 
             if method != MethodName.linear or seeds is not None or quick:
@@ -129,7 +147,14 @@ def fit(
             raise ValueError("--groups needs several targets")
         options |= {"method": str(method), "seeds": seeds, "rungs": rungs}
         options |= {"check_seeds": 0} if quick else {}
-        converged = _fit_one(*aim_of(target[0], task, read), output, options, quick=quick, force=force)
+        if any(recorded):
+            if segments is not None or dataset is not None:
+                raise ValueError("--segments and --dataset belong to spectra; these are recordings")
+            writable(output, "fit.json", force=force)
+            aim = aimed(read_trials(target, reading, window).target(quantity=quantity), task)
+        else:
+            aim = aim_of(target[0], task, read)
+        converged = _fit_one(*aim, output, options, quick=quick, force=force)
     raise typer.Exit(CONVERGED if converged else NOT_CONVERGED)
 
 

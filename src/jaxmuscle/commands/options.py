@@ -14,11 +14,6 @@ class NoiseName(StrEnum):
     pink = "pink"
 
 
-class AxisName(StrEnum):
-    linear = "linear"
-    log_log = "log-log"
-
-
 class MethodName(StrEnum):
     linear = "linear"
     montecarlo = "montecarlo"
@@ -28,6 +23,13 @@ class ResidualName(StrEnum):
     log = "log"
     linear = "linear"
     cumulative = "cumulative"
+
+
+class SpectrumName(StrEnum):
+    standard = "standard"
+    slow = "slow"
+    multitaper = "multitaper"
+    pwelch = "pwelch"
 
 
 class TaskName(StrEnum):
@@ -57,7 +59,10 @@ Fix = Annotated[list[str] | None, typer.Option(metavar="NAME=VALUE", help="Set a
 Segments = Annotated[int | None, typer.Option(min=1, help="Welch segments behind the target.")]
 Quantity = Annotated[str | None, typer.Option(help="force, torque, displacement or acceleration.")]
 Window = Annotated[str | None, typer.Option(metavar="A:B", help="Steady part in s, or `all`; found by itself if left out.")]
-_Name = Annotated[str | None, typer.Option(metavar="NAME", help="Column, point, or Data:74 (counted from 0).")]
+Recordings = Annotated[
+    list[str], typer.Argument(metavar="RECORDING...", help="Text, .xlsx, .mat, .npy, .npz, .c3d, .edf, ... files of trials.")
+]
+_Name = Annotated[str | None, typer.Option(metavar="NAME", help="Column, point, Data:74 (counted from 0), or all: trials.")]
 _Rate = Annotated[float | None, typer.Option(metavar="HZ", help="Sampling rate, if the file does not state it.")]
 _Units = Annotated[str | None, typer.Option(metavar="U", help="N, Nm, mm, m/s^2, % MVC, ...; by default the file's.")]
 _Reference = Annotated[str | None, typer.Option(metavar="NAME", help="Column or point to subtract.")]

@@ -2,7 +2,7 @@
 
 import functools
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import jaxmuscle as jm
@@ -10,26 +10,40 @@ import jaxmuscle as jm
 from .options import READING
 
 if TYPE_CHECKING:
-    from jaxmuscle import Recording
+    from jaxmuscle import Recording, Trials
 
 
 def reads_recordings(command: Callable[..., None]) -> Callable[..., None]:
-    """Give a command the options of `READING`; it gets their values together, as its argument `reading`."""
+    """Give a command the options of `READING`; it gets their values together, as its argument `reading`.
+
+    An option of that name which the command has itself serves both.
+    """
 
     @functools.wraps(command)
     def with_options(**given: Any) -> None:
-        reading = {name: given.pop(name) for name in READING}
-        command(**given, reading=reading)
+        reading = {name: given.get(name) for name in READING}
+        command(**{name: value for name, value in given.items() if name in kept}, reading=reading)
 
     signature = inspect.signature(command)
     own = [parameter for name, parameter in signature.parameters.items() if name != "reading"]
+    kept = {parameter.name for parameter in own}
     keyword = inspect.Parameter.KEYWORD_ONLY
     added = [inspect.Parameter(name, keyword, default=default, annotation=annotation)
-             for name, (annotation, default) in READING.items()]  # fmt: skip
+             for name, (annotation, default) in READING.items() if name not in kept]  # fmt: skip
     parameters = [parameter.replace(kind=keyword) for parameter in own] + added
     setattr(with_options, "__signature__", signature.replace(parameters=parameters))  # noqa: B010
     with_options.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
     return with_options
+
+
+def read_trials(paths: Sequence[str], reading: dict[str, Any], window: str | None = None) -> "Trials":
+    """The recordings of one condition, each with its steady part: several files, or all columns of one (`--column all`)."""
+    if len(paths) > 1 or reading["column"] != "all":
+        return jm.Trials([read(path, reading, window) for path in paths])
+    edges = _edges(window)
+    options = {name: value for name, value in reading.items() if name not in ("column", "reference")}
+    trials = jm.load_recordings(paths[0], **options)
+    return trials if edges == "all" else trials.steady(edges)
 
 
 def read(path: str, reading: dict[str, Any], window: str | None = "all") -> "Recording":

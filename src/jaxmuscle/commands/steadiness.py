@@ -1,20 +1,18 @@
 """`jaxmuscle steadiness`."""
 
 from pathlib import Path
-from typing import Annotated, Any
-
-import typer
+from typing import Any
 
 import jaxmuscle as jm
 
 from .console import out, plain, record, reporting, save_figure, writable
-from .options import Force, Json, Output, Window
-from .recordings import read, reads_recordings
+from .options import Force, Json, Output, Recordings, Window
+from .recordings import read_trials, reads_recordings
 
 
 @reads_recordings
 def steadiness(
-    paths: Annotated[list[str], typer.Argument(metavar="RECORDING...", help="Trials of one condition of one person.")],
+    paths: Recordings,
     *,
     window: Window = None,
     output: Output = Path("out"),
@@ -34,7 +32,7 @@ def steadiness(
         from jaxmuscle._common.files import write_text
 
         writable(output, "steadiness.json", force=force)
-        found = jm.steadiness([read(path, reading, window) for path in paths])
+        found = jm.steadiness(read_trials(paths, reading, window))
         found.save(output / "steadiness.json")
         table = found.to_dataframe().to_csv(index=False, float_format="%.8g", lineterminator="\n")
         write_text(output / "steadiness.csv", table)

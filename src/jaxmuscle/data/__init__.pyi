@@ -1,5 +1,7 @@
 """Public names of this wing."""
 
+from ._as_target import as_target as as_target
+from ._as_target import is_recording as is_recording
 from ._recording import Recording as Recording
 from ._recording_files import load_recording as load_recording
 from ._recording_quality import RecordingSummary as RecordingSummary

@@ -198,29 +198,28 @@ class Recording(eqx.Module):
         require(held >= SEGMENTS, "window", part.window, remedy)
         return part
 
-    def segments(self, settings: SpectrumSettings | None = None) -> int:
+    def segments(self, settings: SpectrumSettings | str | None = None) -> int:
         """Number of whole Welch segments in the window."""
-        settings = RECORDED if settings is None else settings
+        settings = recorded_settings(settings)
         first, stop = self._span(settings.rate)
         return settings.segments(stop - first)
 
-    def filtered(self, settings: SpectrumSettings | None = None) -> Float[np.ndarray, " times"]:
+    def filtered(self, settings: SpectrumSettings | str | None = None) -> Float[np.ndarray, " times"]:
         """What the spectra are made of [`unit`]: resampled to `settings.rate`, low-passed as a whole, cut to the window."""
-        settings = RECORDED if settings is None else settings
+        settings = recorded_settings(settings)
         even = self.resampled(settings.rate)
         with jax.enable_x64(True):
             signal = np.asarray(lowpass(even.whole, settings))
         return signal[slice(*even._span(settings.rate))]
 
-    def spectrum(self, settings: SpectrumSettings | None = None) -> Spectrum:
+    def spectrum(self, settings: SpectrumSettings | str | None = None) -> Spectrum:
         """Welch spectrum of the window, in float64: resampled and low-passed before it is cut.
 
-        **Arguments:** `settings`, by default `SpectrumSettings(filter_direction="both")`.
+        **Arguments:** `settings`, by default the standard ones filtered both ways; or a name (`SpectrumSettings.named`).
 
-        **Raises:** `ValueError` if the window is constant or shorter than one segment, or the bins reach beyond half the
-        recorded rate.
+        **Raises:** `ValueError` if the window is constant or below one segment, or bins lie above half the recorded rate.
         """
-        settings = RECORDED if settings is None else settings
+        settings = recorded_settings(settings)
         highest = float(settings.frequency[-1])
         remedy = f"half of it lies below the last bin, {highest:g} Hz; choose a lower last_bin"
         require(highest < self.rate / 2, "rate", self.rate, remedy)
@@ -232,9 +231,9 @@ class Recording(eqx.Module):
             power = np.asarray(spectrum_of(even.whole, settings, window).power)
         return Spectrum(settings.frequency, power, settings, self.unit)
 
-    def fft_spectrum(self, settings: SpectrumSettings | None = None) -> Spectrum:
+    def fft_spectrum(self, settings: SpectrumSettings | str | None = None) -> Spectrum:
         """The same with the whole window as one segment (periodogram), in the frequency range of the settings."""
-        settings = RECORDED if settings is None else settings
+        settings = recorded_settings(settings)
         first, stop = self._span(settings.rate)
         low, high = (float(settings.frequency[i]) * (stop - first) / settings.rate for i in (0, -1))
         require(stop - first >= 8 and high >= 1, "window", self.window, "is too short for a spectrum; give a longer one")
@@ -245,12 +244,12 @@ class Recording(eqx.Module):
         if np.ptp(self.samples) <= 1e-12 * np.max(np.abs(self.samples)):
             raise ValueError(f"{self.name}: is constant in the window {self.window}; choose another window or column")
 
-    def summary(self, settings: SpectrumSettings | None = None) -> RecordingSummary:
+    def summary(self, settings: SpectrumSettings | str | None = None) -> RecordingSummary:
         """Level, variability, regularity and spectral peaks of the window, after resampling and low-pass.
 
         **Returns:** a `RecordingSummary`; it prints as a table.
         """
-        settings = RECORDED if settings is None else settings
+        settings = recorded_settings(settings)
         self._require_change()
         x = self.filtered(settings)
         mean, deviation = float(np.mean(x)), float(np.std(x))
@@ -275,7 +274,7 @@ class Recording(eqx.Module):
         quantity: str | None = None,
         provenance: str = "measured",
         mvc: float | int | None = None,
-        settings: SpectrumSettings | None = None,
+        settings: SpectrumSettings | str | None = None,
     ) -> Target:
         """The window's proportional power as a `Target` for `jaxmuscle.fit`.
 
@@ -288,7 +287,7 @@ class Recording(eqx.Module):
 
         **Raises:** `ValueError` if the unit (V, a.u.) does not say what was measured, and as `spectrum` does.
         """
-        settings = RECORDED if settings is None else settings
+        settings = recorded_settings(settings)
         return pooled_target((self,), self.name if name is None else name, quantity, provenance, mvc, settings)
 
     @property
@@ -296,7 +295,7 @@ class Recording(eqx.Module):
         """The window, or that there is none."""
         return "all of it" if self.window is None else f"window {self.window[0]:g} s to {self.window[1]:g} s"
 
-    def plot(self, settings: SpectrumSettings | None = None, ax: Any = None) -> Any:
+    def plot(self, settings: SpectrumSettings | str | None = None, ax: Any = None) -> Any:
         """Draw the trace with its window, and the spectra (Welch, FFT), linear and logarithmic; returns the figure."""
         return plot.recording(self, settings, ax)
 
@@ -309,6 +308,12 @@ class Recording(eqx.Module):
             f"  range     {np.min(self.samples):.4g} to {np.max(self.samples):.4g} {self.unit}",
         ]
         return folded(lines + [f"  notice    {notice}" for notice in self.notices])
+
+
+def recorded_settings(settings: SpectrumSettings | str | None) -> SpectrumSettings:
+    """As given, or those of a name, by default the standard; named ones filter as recordings are filtered."""
+    given = isinstance(settings, SpectrumSettings)
+    return settings if given else SpectrumSettings.named(settings or "standard").replace(filter_direction="both")
 
 
 def _rate(rate: Any) -> float:

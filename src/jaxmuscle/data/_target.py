@@ -208,6 +208,7 @@ class Target(eqx.Module):
         lines = [
             f"{self.name}: proportional power of {self.quantity}, {self.provenance}",
             f"  source    {self.source}",
+            f"  spectrum  {settings.name or 'settings of its own'}",
             f"  bins      {f.size} of {settings.frequency.size}, {f[0]:.3f} to {f[-1]:.3f} Hz",
             f"  maximum   {p[peak]:.3f} at {f[peak]:.3f} Hz",
         ]

@@ -7,11 +7,13 @@ from typing import Any, overload
 
 import numpy as np
 
+from jaxmuscle import plot
 from jaxmuscle._common.text import folded
 from jaxmuscle.spectra._settings import SpectrumSettings, require
+from jaxmuscle.spectra._welch import Spectrum
 
 from ._pooled import pooled_target
-from ._recording import RECORDED, Recording
+from ._recording import Recording, recorded_settings
 from ._recording_files import load_columns, load_recording
 from ._target import Target
 
@@ -69,7 +71,7 @@ class Trials(Sequence[Recording]):
         quantity: str | None = None,
         provenance: str = "measured",
         mvc: float | int | None = None,
-        settings: SpectrumSettings | None = None,
+        settings: SpectrumSettings | str | None = None,
     ) -> Target:
         """One target: the trials' absolute spectra averaged, weighted with their Welch segments, which add up.
 
@@ -84,8 +86,18 @@ class Trials(Sequence[Recording]):
 
         **Raises:** `ValueError` if the unit (V, a.u.) does not say what was measured, and as `Recording.spectrum` does.
         """
-        settings = RECORDED if settings is None else settings
-        return pooled_target(self.recordings, self.name if name is None else name, quantity, provenance, mvc, settings)
+        called = self.name if name is None else name
+        return pooled_target(self.recordings, called, quantity, provenance, mvc, recorded_settings(settings))
+
+    def spectrum(self, settings: SpectrumSettings | str | None = None) -> Spectrum:
+        """The mean of the recordings' spectra (`Recording.spectrum`), weighted with their Welch segments."""
+        each, weights = [r.spectrum(settings) for r in self], [r.segments(settings) for r in self]
+        power = np.average([one.power for one in each], axis=0, weights=weights)
+        return Spectrum(each[0].frequency, power, each[0].settings, each[0].unit)
+
+    def plot(self, settings: SpectrumSettings | str | None = None, ax: Any = None) -> Any:
+        """Draw the windows and the spectra of all recordings, that of one as `Recording.plot`; returns the figure."""
+        return plot.trials(self, settings, ax)
 
     def __str__(self) -> str:
         head = f"{self.name}: {len(self)} recordings [{self.recordings[0].unit}]"

@@ -14,7 +14,7 @@ from jaxmuscle.objective._covariance import residual_covariance
 from jaxmuscle.objective._problem import FitProblem
 from jaxmuscle.objective._residuals import PartResiduals, Residuals
 
-from ._refit import LINES, STRENGTHS, Refit, refit_of
+from ._refit import STRENGTHS, Refit, refit_of
 
 ADEQUATE = 0.01
 REPLICATES = 999
@@ -100,9 +100,9 @@ def elsewhere(problem: FitProblem, found: Consequences, refit: Refit, sizes: np.
     cost = (cost - cost[-1]) / dull
     apart = np.abs(refit.frequency - refit.frequency[-1])
     weight = np.where(apart >= problem.parts[0].target.settings.resolution, np.exp(-0.5 * np.clip(cost, -700, 700)), 0.0)
-    grid = refit.frequency[:LINES]
+    grid = refit.frequency[: len(refit.frequency) // len(STRENGTHS)]
     cell = np.gradient(grid) / grid / sd[f] * 0.5 * np.log(STRENGTHS[1] / STRENGTHS[0]) / sd[a]
-    there = float(np.sum(weight[:-1].reshape(-1, LINES) * cell))
+    there = float(np.sum(weight[:-1].reshape(-1, len(grid)) * cell))
     here = 2 * np.pi * np.sqrt(max(np.linalg.det(sizes[np.ix_([a, f], [a, f])]), 1e-300))
     return there / (there + here)
 

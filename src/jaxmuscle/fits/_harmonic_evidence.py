@@ -14,7 +14,7 @@ from jaxmuscle.objective._residuals import Residuals
 
 from ._adequacy import drawn_log_residuals, generator_of
 from ._checks import seen_best
-from ._refit import lines_of, without_fitted
+from ._refit import lines_of, over_band, without_fitted
 
 PROFILE = 64
 STEPS = 40
@@ -62,10 +62,8 @@ def _pinned(objective: Residuals, columns: list[int]) -> Residuals:
 
 def _profile(problem: FitProblem, objective: Residuals, final: Minima) -> tuple[np.ndarray, np.ndarray]:
     coordinates, column = problem.coordinates, problem.coordinates.names.index("harmonic_frequency")
-    frequency = np.linspace(
-        float(problem.parts[0].target.frequency[0]), float(problem.parts[0].target.frequency[-1]), PROFILE
-    )
-    theta = np.tile(np.asarray(coordinates.theta(final.s[final.best])), (PROFILE, 1))
+    frequency = over_band(problem.parts[0].target, PROFILE)
+    theta = np.tile(np.asarray(coordinates.theta(final.s[final.best])), (len(frequency), 1))
     theta[:, column] = coordinates.theta_of("harmonic_frequency", frequency)
     found = least_squares(_pinned(objective, [column]), coordinates.from_theta(theta), STEPS)
     best = least_squares(objective, final.s[[final.best]], STEPS)

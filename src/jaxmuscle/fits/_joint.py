@@ -61,6 +61,7 @@ def fit_joint(
     Minimises `½ Σ_targets Σ_k r_k² + ½ Σ_j θ_j²`, r as in `fit`, in linear response, from many starts; then with the
     nonlinear model's correction to every target's spectrum. A parameter of one name is the same number in all tasks that
     have it; one that only one task has belongs to that. The inputs (`P_w`, `F_ext`, `x_z`) are each task's own.
+    Not for two spectra of one recording ("standard" and "slow"): its data would count twice; a notice says so.
 
     **Arguments:** `targets` {name: target, in any form that `fit` takes} (of one: the fit of that); `tasks` {name: task}
     (`task_for` of each target by default), whose values are the prior's centre and whose spectrum settings the target's

@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxmuscle._common.arrays import as_arrays
+from jaxmuscle.data._target import Target
 from jaxmuscle.model._parameters import HARMONIC
 from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.objective._consequences import Consequences, Expansion
@@ -110,9 +111,15 @@ class Lines(NamedTuple):
     last: Float[np.ndarray, " bins"]
 
 
+def over_band(target: Target, least: int) -> Float[np.ndarray, " frequencies"]:
+    """Frequencies over the band of a target, two to a bin or more: a line is four bins wide."""
+    first, last = float(target.frequency[0]), float(target.frequency[-1])
+    return np.linspace(first, last, max(least, round(2 * (last - first) / target.settings.resolution)))
+
+
 def lines_of(part: Part, task: AbstractTask, noise: Float[np.ndarray, " bins"], last: float) -> Lines:
     """Lines over the band beside noise of these powers, and one more frequency."""
-    frequency = np.linspace(part.target.frequency[0], part.target.frequency[-1], LINES)
+    frequency = over_band(part.target, LINES)
     levels = line_levels(as_arrays(task), part.target.settings, np.append(frequency, last))
     each, gain = jax.tree.map(np.asarray, levels)
     each = each[:, part.chosen]

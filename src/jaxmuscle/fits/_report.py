@@ -1,5 +1,6 @@
 """From where a fit ended to its result: success in words, fresh spectrum, standard errors, what is undetermined."""
 
+import itertools
 from typing import Any, NamedTuple
 
 import jax
@@ -247,14 +248,19 @@ def further_of(part: PartResiduals, moments: Moments) -> dict[str, float]:
 
 
 def of_several(parts: dict[str, FittedPart]) -> tuple[str, ...]:
-    """Tasks that do not differ although their targets' levels do."""
+    """Spectra of one recording; tasks that do not differ although their targets' levels do."""
+    aims = [(name, p.target) for name, p in parts.items()]
+    twice = tuple(f"{a} and {b} state one source and different spectra: if that is one recording, its data count twice and "
+                  "the errors are too small; fit one of them"
+                  for (a, one), (b, two) in itertools.combinations(aims, 2)
+                  if one.source == two.source and one.settings != two.settings)  # fmt: skip
     levels = {name: p.target.mvc_fraction for name, p in parts.items() if p.target.mvc_fraction is not None}
     inputs = {tuple(float(parts[name].task[n]) for n in ("P_w", "F_ext") if n in parts[name].task.parameter_names)
               for name in levels}  # fmt: skip
     if len(set(levels.values())) < 2 or len(inputs) > 1:
-        return ()
+        return twice
     said = ", ".join(f"{name} {100 * level:.3g} % MVC" for name, level in levels.items())
-    return (f"the targets state different levels ({said}), but their tasks have the same forces: give tasks=",)
+    return (*twice, f"the targets state different levels ({said}), but their tasks have the same forces: give tasks=")
 
 
 def unsimulated(plan: Plan, stages: list[Stage]) -> tuple[str, ...]:

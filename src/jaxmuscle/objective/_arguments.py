@@ -21,6 +21,7 @@ from jaxmuscle.model._tasks import AbstractTask, Isometric, Observed, Prescribed
 from jaxmuscle.response._expected import check_line
 from jaxmuscle.response._linearised import has_response
 from jaxmuscle.response._scaling import FORCES, at_force, is_scalable
+from jaxmuscle.spectra._settings import WINDOW, require, samples_in
 
 from ._coordinates import Coordinates
 from ._problem import FitProblem, Part, target_variation
@@ -163,6 +164,8 @@ def planned(task: AbstractTask, target: Target, options: FitOptions) -> Plan:
     _check_names("priors", priors, names)
     _check_names("bounds", bounds, names)
     check_line(task, target.settings)
+    require(target.settings.segments(samples_in(WINDOW, target.settings)) > 0, "length", target.settings.length,
+            "a fit simulates 10 s, which is shorter than a segment; analyse the data with shorter ones")  # fmt: skip
     if not (np.any(np.asarray(task.noise.amplitude) > 0) or float(task.harmonic.amplitude) > 0):
         raise ValueError("the task has neither noise nor a harmonic, so its spectrum is zero: set noise_K_w, say")
     _check_mean(task, names, mean)

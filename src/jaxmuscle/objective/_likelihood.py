@@ -260,6 +260,6 @@ def log_likelihood(task: AbstractTask, data: Target | Recording) -> Scalar:
         variation = target_variation(data, task)
         samples = jnp.asarray(trial_samples(data))
         return _target_likelihood(as_arrays(task), bins, data.bins - data.settings.first_bin, variation, samples)
-    whole = data.fft_spectrum(task.settings.replace(window="boxcar"))
+    whole = data.fft_spectrum(task.settings.replace(window="boxcar", tapers=1))
     duration = whole.settings.length / whole.settings.rate
     return _whittle(as_arrays(task), whole.settings, jnp.asarray(whole.power), (0.0, duration))

@@ -17,6 +17,7 @@ from jaxmuscle.response._linearised import LinearTask, settled
 from jaxmuscle.response._transfer import half_power_frequency
 from jaxmuscle.simulation._batch import respond
 from jaxmuscle.simulation._grid import Grid
+from jaxmuscle.spectra._bin_law import bin_rows
 from jaxmuscle.spectra._settings import SpectrumSettings, samples_in
 from jaxmuscle.spectra._welch import lowpass
 
@@ -27,7 +28,7 @@ def welch_operator(
     """The linear part of `spectrum_of` as one matrix.
 
     Low-pass, window, detrending, taper and transform are linear, so a Welch power is `Σ (A x)²` over the rows of its
-    bin; the rows are ordered (segments and real/imaginary part, bins), scaled so that the sum is the power itself.
+    bin; the rows are ordered (segments, tapers and real/imaginary part, bins), scaled so that the sum is the power itself.
     """
     x = np.eye(samples)
     if settings.sections is not None:
@@ -38,17 +39,10 @@ def welch_operator(
     count, n = settings.segments(x.shape[1]), settings.length
     if count < 1:
         raise ValueError(f"window {window} s is shorter than one segment of {n} samples at {settings.rate} Hz")
-    parts = []
-    bins = np.arange(settings.first_bin, settings.last_bin + 1)
-    doubled = np.where((bins == 0) | (2 * bins == n), 1.0, 2.0)
-    scale = np.sqrt(doubled / (settings.rate * np.sum(settings.taper**2) * count))
-    for k in range(count):
-        segment = x[:, k * settings.step : k * settings.step + n]
-        if settings.detrend != "none":
-            segment = scipy.signal.detrend(segment, type=settings.detrend)
-        transform = np.fft.rfft(np.asarray(segment) * settings.taper)[:, bins] * scale
-        parts += [transform.real.T, transform.imag.T]
-    return np.concatenate(parts)
+    rows = bin_rows(settings).swapaxes(0, 1) / np.sqrt(count)
+    segments = [x[:, k * settings.step : k * settings.step + n].T for k in range(count)]
+    each = [taper @ segment for segment in segments for taper in rows]
+    return np.concatenate([part for transform in each for part in (transform.real, transform.imag)])
 
 
 class Linear(eqx.Module):

@@ -147,6 +147,8 @@ def harmonic_frequencies(
 def candidate_frequencies(target: Target, count: int) -> Float[np.ndarray, " starts"]:
     """The target's local maxima, highest above their neighbours first, and a quarter bin beside each; then the band.
 
+    Of more maxima than `MAXIMA` (narrow bins) each is tried before any has others beside it.
+
     A maximum is the vertex of the parabola through the log powers of three bins: a line that is narrower than a bin is
     found from nearby, but not from a bin away.
     """
@@ -156,13 +158,14 @@ def candidate_frequencies(target: Target, count: int) -> Float[np.ndarray, " sta
     inner, bend = inner[np.argsort(-bend)], np.sort(bend)[::-1]
     peaks = f[inner] + 0.25 * (f[inner + 1] - f[inner - 1]) * (p[inner + 1] - p[inner - 1]) / bend
     width = target.settings.rate / target.settings.length
-    near = np.clip(peaks[:, None] + width * np.array([0.0, -0.25, 0.25]), f[0], f[-1]).ravel()
+    near = np.clip(peaks[:, None] + width * np.array([0.0, -0.25, 0.25]), f[0], f[-1])
+    near = (near.T if len(peaks) > MAXIMA else near).ravel()
     spread = np.geomspace(f[0], f[-1], max(count, 2))
     order = np.argsort([-np.min(np.abs(np.log(s / np.append(peaks, 1e9)))) for s in spread])
     return np.concatenate([near[: max(1, count // 2)], spread[order], near[max(1, count // 2) :]])[:count]
 
 
-FREQUENCIES = 32
+FREQUENCIES, MAXIMA = 32, 16
 
 
 def points_about(problem: FitProblem, theta: np.ndarray) -> np.ndarray:

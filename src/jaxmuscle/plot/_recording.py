@@ -22,8 +22,32 @@ def recording(recording: Any, settings: Any = None, ax: Axes | None = None) -> F
     band = [edge * np.sum(welch.power) for edge in target.sampling_band() or ()]
     for panel, log in ((axes[1, 0], False), (axes[1, 1], True)):
         _spectra(panel, welch, fft, band, log)
-    words = f"{recording.segments(settings)} Welch segments"
+    words = f"{target.settings.name or 'own'} spectrum, {recording.segments(settings)} Welch segments"
     fig.suptitle(f"{recording.source}; {words}", x=0.01, ha="left", fontsize=8.0, parse_math=False)
+    return fig
+
+
+@styled
+def trials(trials: Any, settings: Any = None, ax: Axes | None = None) -> Figure | SubFigure:
+    """Draws the windows of several recordings below each other, and their spectra with the mean, linear and logarithmic."""
+    if len(trials) == 1:
+        return recording(trials[0], settings, ax)
+    fig = canvas(ax, (9.0, 5.6))
+    traces, spectra = fig.subfigures(1, 2, squeeze=False, width_ratios=(1.0, 1.3))[0]
+    rows = traces.subplots(len(trials), 1, sharex=True, squeeze=False)[:, 0]
+    for panel, one in zip(rows, trials, strict=True):
+        x = one.filtered(settings)
+        panel.plot(np.arange(x.size) * one.duration / x.size, x, color=BLUE, lw=0.6)
+        panel.set_title(one.name, loc="left", fontsize=7.0, pad=2.0, parse_math=False)
+        panel.margins(x=0)
+    _label(rows[-1], "Time in the window (s)", "")
+    traces.supylabel(f"{(trials[0].quantity or 'signal').capitalize()} ({trials[0].unit})", fontsize=8.0)
+    mean, each = trials.spectrum(settings), [one.spectrum(settings) for one in trials]
+    for panel, log in zip(spectra.subplots(2, 1), (False, True), strict=True):
+        for one in each:
+            panel.plot(one.frequency, one.power, color=GREY, lw=0.6, label="trials" if one is each[0] else None)
+        panel.plot(mean.frequency, mean.power, color=BLACK, lw=1.0, marker="o", ms=2.8, label=f"mean of {len(each)}")
+        _spectrum_axes(panel, mean.unit, log)
     return fig
 
 
@@ -56,7 +80,11 @@ def _spectra(ax: Axes, welch: Any, fft: Any, band: list[Any], log: bool) -> None
     if band:
         ax.fill_between(f[shown], band[0][shown], band[1][shown], color=BLUE, alpha=0.2, lw=0, label="± 1 SD", zorder=3)
     ax.plot(f[shown], power[shown], color=BLACK, lw=1.0, marker="o", ms=2.8, label="Welch", zorder=4)
-    _label(ax, "Frequency (Hz)", f"Power ({density_unit(welch.unit)})")
+    _spectrum_axes(ax, welch.unit, log)
+
+
+def _spectrum_axes(ax: Axes, unit: str, log: bool) -> None:
+    _label(ax, "Frequency (Hz)", f"Power ({density_unit(unit)})")
     ax.set_title("Spectrum, logarithmic" if log else "Spectrum, linear")
     if log:
         ax.set(xscale="log", yscale="log")

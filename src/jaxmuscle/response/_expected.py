@@ -263,13 +263,13 @@ def low_pass_spread(settings: SpectrumSettings) -> Float[np.ndarray, " lags"]:
 def covariance_operator(settings: SpectrumSettings) -> Float[np.ndarray, "bins_and_two lags"]:
     """M with expected Welch power `E_k = Σ_l M_kl r(l Δ)`: low-pass, detrending, taper and transform.
 
-    The low-pass turns r into `r * ρ` (`low_pass_spread`); a bin is `Σ_l α_k(l) r(l)`, α_k the autocorrelation of its row of
-    `bin_rows`. Both are folded onto lags l >= 0. Two more rows: the variance of what has passed, (r * ρ)(0); and
+    The low-pass turns r into `r * ρ` (`low_pass_spread`); a bin is `Σ_l α_k(l) r(l)`, α_k the sum of the autocorrelations of
+    its `bin_rows`. Both are folded onto lags l >= 0. Two more rows: the variance of what has passed, (r * ρ)(0); and
     `Σ_l ((|·| * ρ)(l) - |l|) r(l)`, by which the low-pass lowers n² times the variance of the mean of n samples
     (`Σ_l (n - |l|) / n² r(l)` without it; where r has decayed at the n-th lag).
     """
     rows, spread = bin_rows(settings), low_pass_spread(settings)
-    lagged = np.array([scipy.signal.correlate(row, row, method="fft").real for row in rows])
+    lagged = np.array([sum(scipy.signal.correlate(row, row, method="fft").real for row in each) for each in rows])
     lagged = np.concatenate([lagged, np.eye(1, lagged.shape[1], lagged.shape[1] // 2)])
     full = np.array([scipy.signal.convolve(row, spread, method="fft") for row in lagged])
     centre, reach = full.shape[1] // 2, len(spread) // 2

@@ -98,8 +98,9 @@ def line_table(
     spin = turn_of(angle * np.arange(settings.length, dtype=angle.dtype))
     ahead, behind = rows @ spin, rows @ jnp.conj(spin)
     through = gain * _low_pass(settings, turn)
-    level = 0.25 * jnp.abs(through) ** 2 * (jnp.abs(ahead) ** 2 + jnp.abs(behind) ** 2)
-    turning = 0.5 * through**2 * jnp.mean(turn_of(2 * angle * begins.astype(angle.dtype))) * ahead * jnp.conj(behind)
+    level = 0.25 * jnp.abs(through) ** 2 * jnp.sum(jnp.abs(ahead) ** 2 + jnp.abs(behind) ** 2, axis=1)
+    both = jnp.sum(ahead * jnp.conj(behind), axis=1)
+    turning = 0.5 * through**2 * jnp.mean(turn_of(2 * angle * begins.astype(angle.dtype))) * both
     once, twice = (through**k * _turns(k * frequency / settings.rate, start, samples) for k in (1, 2))
     return LineTable(level, turning, jnp.abs(through) ** 2, once, twice)
 

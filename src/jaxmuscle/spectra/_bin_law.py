@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Complex, Float
 from scipy.special import digamma, polygamma
 
-from ._settings import LONGEST, WINDOW, SpectrumSettings, samples_in
+from ._settings import LONGEST, WINDOW, SpectrumSettings, samples_in, tapers_of
 
 LEAST = 1e-3  # share of a bin that scatters, at least
 
@@ -23,8 +23,8 @@ class BinLaw(NamedTuple):
 def welch_law(settings: SpectrumSettings, bins: np.ndarray, segments: tuple[int, ...]) -> BinLaw:
     """Law of Welch powers for a density that is flat within a segment's resolution, detrending and both signs of f included.
 
-    `Cov(S_k, S_l) = Σ_j (1 - |j|/K)/K (|E X_k X_l*|² + |E X_k X_l|²)` over segments j apart, X the tapered, detrended
-    transform; ν_k = 2 E_k² / Var_k. Trials are averaged with weights proportional to their segments.
+    `Cov(S_k, S_l) = Σ_j (1 - |j|/K)/K Σ_tu (|E X_kt X_lu*|² + |E X_kt X_lu|²)` over segments j apart and tapers t, u, X the
+    tapered, detrended transform; ν_k = 2 E_k² / Var_k. Trials are averaged with weights proportional to their segments.
     Removing the mean and leakage from negative frequencies cost bin 1 a fifth of its degrees of freedom.
     """
     return _welch_law(settings, tuple(int(k) for k in bins), tuple(segments))
@@ -33,14 +33,14 @@ def welch_law(settings: SpectrumSettings, bins: np.ndarray, segments: tuple[int,
 @functools.lru_cache(maxsize=256)
 def _welch_law(settings: SpectrumSettings, bins: tuple[int, ...], segments: tuple[int, ...]) -> BinLaw:
     rows = bin_rows(settings)[np.asarray(bins) - settings.first_bin]
-    n, step = settings.length, settings.step
-    power = np.sum(np.abs(rows) ** 2, axis=1)
-    covariance = np.zeros((len(rows), len(rows)))
+    n, step, shape = settings.length, settings.step, rows.shape[:2]
+    power = np.sum(np.abs(rows) ** 2, axis=(1, 2))
+    covariance, rows = np.zeros((len(rows), len(rows))), rows.reshape(-1, n)
     for count, trials in Counter(segments).items():
         reach = min(count - 1, (n - 1) // step)
         for j in range(-reach, reach + 1):
             near, far = (rows[:, abs(j) * step :], rows[:, : n - abs(j) * step])[:: 1 if j >= 0 else -1]
-            both = np.abs(near @ far.conj().T) ** 2 + np.abs(near @ far.T) ** 2
+            both = (np.abs(near @ far.conj().T) ** 2 + np.abs(near @ far.T) ** 2).reshape(shape * 2).sum(axis=(1, 3))
             covariance += trials * count * (1 - abs(j) / count) / sum(segments) ** 2 * both
     sd = np.sqrt(np.diag(covariance))
     return BinLaw(2 * power**2 / sd**2, covariance / np.outer(sd, sd))
@@ -155,16 +155,16 @@ def shares_map(p: Float[np.ndarray, " bins"]) -> Float[np.ndarray, "bins bins"]:
 
 
 @functools.cache
-def bin_rows(settings: SpectrumSettings) -> Complex[np.ndarray, "bins length"]:
-    """Detrending, taper and transform of a segment as one matrix: X_k = Σ_m a_km x_m, scaled so that power is |X_k|²."""
+def bin_rows(settings: SpectrumSettings) -> Complex[np.ndarray, "bins tapers length"]:
+    """Detrending, tapers and transform of a segment as one matrix: X_kt = Σ_m a_ktm x_m, so that power is Σ_t |X_kt|²."""
     n, m = settings.length, np.arange(settings.length)
     k = np.arange(settings.first_bin, settings.last_bin + 1)
     sides = np.where((k == 0) | (2 * k == n), 1.0, 2.0)
-    rows = settings.taper * np.exp(-2j * np.pi * np.outer(k, m) / n)
-    rows = rows * np.sqrt(sides / (settings.rate * np.sum(settings.taper**2)))[:, None]
+    turns = np.exp(-2j * np.pi * np.outer(k, m) / n) * np.sqrt(sides / settings.rate)[:, None]
+    rows = turns[:, None] * tapers_of(settings, n)
     if settings.detrend != "none":
-        rows = rows - rows.mean(axis=1, keepdims=True)
+        rows = rows - rows.mean(axis=-1, keepdims=True)
     if settings.detrend == "linear":
         line = m - m.mean()
-        rows = rows - np.outer(rows @ line, line) / (line @ line)
+        rows = rows - (rows @ line)[..., None] * line / (line @ line)
     return rows

@@ -2,6 +2,7 @@
 
 import dataclasses
 import difflib
+import functools
 import math
 import numbers
 from collections.abc import Callable, Mapping
@@ -12,7 +13,9 @@ import numpy as np
 import scipy
 from jaxtyping import Float
 
-Window = Literal["hann", "hamming", "boxcar"]
+from jaxmuscle._common.text import choices
+
+Window = Literal["hann", "hamming", "boxcar", "dpss"]
 Detrend = Literal["constant", "linear", "none"]
 FilterDirection = Literal["forward", "both"]
 Sampling = Literal["instant", "average"]
@@ -20,6 +23,14 @@ _CHOICES = {"window": Window, "detrend": Detrend, "filter_direction": FilterDire
 
 
 COSINES: dict[Window, float] = {"hann": 0.5, "hamming": 0.54, "boxcar": 1.0}
+_SLOW = {"length": 1000, "last_bin": 117, "detrend": "linear"}
+NAMED: dict[str, dict[str, Any]] = {
+    "standard": {},
+    "slow": _SLOW,
+    "multitaper": _SLOW | {"first_bin": 2, "window": "dpss", "tapers": 3},
+    "pwelch": {"window": "hamming", "detrend": "none"},
+}
+_AROUND = ("filter_order", "filter_cutoff", "filter_direction", "sampling")  # of the signal, not of its spectrum
 
 
 def taper_of(window: Window, samples: int) -> Float[np.ndarray, " samples"]:
@@ -41,7 +52,7 @@ def require(holds: bool | np.bool, name: str, value: object, remedy: str) -> Non
 class SpectrumSettings(eqx.Module):
     """How a spectrum is estimated; every choice the papers leave open is a field.
 
-    The defaults are the procedure of Slifkin & Newell (1999, J Exp Psychol HPP 25(3):837-851).
+    The defaults are the procedure of Slifkin & Newell (1999, J Exp Psychol HPP 25(3):837-851); `named` has others.
 
     | field | meaning |
     |---|---|
@@ -49,6 +60,7 @@ class SpectrumSettings(eqx.Module):
     | `length` | samples per segment and transform; the resolution is `rate / length` |
     | `first_bin`, `last_bin` | bins kept, both included; bin k lies at `k * rate / length` |
     | `window`, `overlap` | taper (periodic, as in `scipy.signal`) and the fraction neighbours share |
+    | `tapers` | of the window `"dpss"`: how many Slepian tapers K, of time-bandwidth NW = (K + 1) / 2; else 1 |
     | `detrend` | what is removed from each segment: its mean, its straight line, or nothing |
     | `filter_order`, `filter_cutoff` | Butterworth low-pass; cut-off [Hz], or `None` for no filter |
     | `filter_direction` | `"forward"` (from rest), or `"both"` (zero phase, for recordings) |
@@ -68,6 +80,7 @@ class SpectrumSettings(eqx.Module):
     filter_cutoff: float | None = eqx.field(static=True, default=30.0, converter=_python)
     filter_direction: FilterDirection = eqx.field(static=True, default="forward")
     sampling: Sampling = eqx.field(static=True, default="instant")
+    tapers: int = eqx.field(static=True, default=1, converter=_python)
 
     def __check_init__(self):
         def check(name: str, kind: type, valid: Callable[[Any], bool], remedy: str) -> None:
@@ -88,15 +101,40 @@ class SpectrumSettings(eqx.Module):
         for name, choice in _CHOICES.items():
             known = get_args(choice)
             check(name, str, known.__contains__, f"choose one of {', '.join(known)}")
+        slepian = self.window == "dpss"
+        remedy = f"give at least 2, at most length / 8 = {self.length // 8}" if slepian else "give 1, or window='dpss'"
+        check("tapers", int, lambda n: 2 <= n <= max(self.length // 8, 2) if slepian else n == 1, remedy)
+
+    @classmethod
+    def named(cls, name: str) -> "SpectrumSettings":
+        """Settings by name.
+
+        | name | spectrum |
+        |---|---|
+        | `"standard"` | the defaults: segments of 256 samples, bins of 0.39 Hz |
+        | `"slow"` | below 1 Hz: segments of 10 s less their straight line, bins of 0.1 Hz from 0.1 to 11.7 Hz |
+        | `"multitaper"` | the same with three Slepian tapers (NW = 2, bands of 0.4 Hz) from 0.2 Hz on |
+        | `"pwelch"` | MATLAB's defaults: Hamming window and no detrend, so the mean leaks into bin 1 |
+
+        **Raises:** `ValueError` for another name. **Source:** Thomson 1982, doi:10.1109/PROC.1982.12433 (multitaper).
+        """
+        require(name in NAMED, "settings", name, choices(str(name), NAMED))
+        return cls(**NAMED[name])
 
     @classmethod
     def pwelch(cls) -> "SpectrumSettings":
-        """MATLAB's `pwelch` defaults: Hamming window and no detrend, so the mean leaks into bin 1.
+        """MATLAB's `pwelch` defaults, `named("pwelch")`.
 
         Two details stay as they are here: `length` (MATLAB would cut the signal into eight segments) and the
         periodic form of the window (MATLAB's is symmetric).
         """
-        return cls(window="hamming", detrend="none")
+        return cls.named("pwelch")
+
+    @property
+    def name(self) -> str | None:
+        """The name of the spectrum, whatever the low-pass and the sampling; `None` if it is nobody's but yours."""
+        plain = self.replace(**{field: getattr(SpectrumSettings(), field) for field in _AROUND})
+        return next((name for name in NAMED if plain == SpectrumSettings.named(name)), None)
 
     @property
     def resolution(self) -> float:
@@ -115,11 +153,6 @@ class SpectrumSettings(eqx.Module):
         return max(self.length - math.floor(self.overlap * self.length + 1e-9), 1)
 
     @property
-    def taper(self) -> Float[np.ndarray, " length"]:
-        """The window's values, one per sample of a segment."""
-        return taper_of(self.window, self.length)
-
-    @property
     def sections(self) -> Float[np.ndarray, "sections 6"] | None:
         """The low-pass as second-order sections of `scipy.signal.butter`; `None` without filter."""
         if self.filter_cutoff is None:
@@ -134,22 +167,22 @@ class SpectrumSettings(eqx.Module):
     def degrees_of_freedom(self, segments: int) -> float:
         """Equivalent degrees of freedom ν of a bin averaged over K segments: power ~ S χ²_ν / ν.
 
-        ν = 2K / (1 + 2 Σ_j (1 - j/K) ρ_j²), where ρ_j = Σ_m w_m w_{m + j step} / Σ_m w_m² correlates segments
-        j apart, for a density that is flat across a bin; half-overlapping Hann segments have ρ_1 = 1/6 only.
-        Independent trials add their ν.
+        ν = 2K / (ρ_0² + 2 Σ_j (1 - j/K) ρ_j²), where ρ_j² = Σ_tu (Σ_m w_tm w_{u, m + j step})², Σ_tm w_tm² = 1,
+        correlates segments j apart with tapers t and u, for a density that is flat across a bin; half-overlapping Hann
+        segments have ρ_1 = 1/6 only, and T tapers ρ_0² = 1/T. Independent trials add their ν.
 
         **Raises:** `ValueError` unless K >= 1. **Source:** Welch 1967, doi:10.1109/TAU.1967.1161901.
         """
         require(segments >= 1, "segments", segments, "give the number of averaged segments, at least 1")
-        w, step = self.taper, self.step
-        lags = range(1, min(segments - 1, (self.length - 1) // step) + 1)
-        rho = [np.sum(w[: -j * step] * w[j * step :]) / np.sum(w**2) for j in lags]
-        excess = sum((1 - j / segments) * float(r) ** 2 for j, r in zip(lags, rho, strict=True))
-        return 2 * segments / (1 + 2 * excess)
+        w, n, step = tapers_of(self, self.length), self.length, self.step
+        lags = range(min(segments - 1, (n - 1) // step) + 1)
+        squares = [float(np.sum((w[:, : n - j * step] @ w[:, j * step :].T) ** 2)) for j in lags]
+        return 2 * segments / (squares[0] + 2 * sum((1 - j / segments) * squares[j] for j in lags[1:]))
 
     def to_dict(self) -> dict[str, Any]:
-        """The fields as TOML and JSON hold them; no cut-off is `"none"`, since TOML has no null."""
-        values = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+        """The fields as TOML and JSON hold them; no cut-off is `"none"`, as TOML has no null; a single taper is left out."""
+        fields = [field.name for field in dataclasses.fields(self) if field.name != "tapers" or self.tapers > 1]
+        values = {name: getattr(self, name) for name in fields}
         return values | ({"filter_cutoff": "none"} if self.filter_cutoff is None else {})
 
     @classmethod
@@ -169,6 +202,16 @@ class SpectrumSettings(eqx.Module):
     def replace(self, **changes: Any) -> "SpectrumSettings":
         """A copy with some fields changed; raises as `from_dict` does."""
         return self.from_dict(self.to_dict() | changes)
+
+
+@functools.lru_cache(maxsize=32)
+def tapers_of(settings: SpectrumSettings, samples: int) -> Float[np.ndarray, "tapers samples"]:
+    """Tapers for so many samples, one a row; all squares sum to 1, so power is `2 / rate Σ_t |Σ_m w_tm x_m e^..|²`."""
+    if settings.window == "dpss":
+        rows = np.asarray(scipy.signal.windows.dpss(samples, (settings.tapers + 1) / 2, settings.tapers))
+    else:
+        rows = taper_of(settings.window, samples)[None]
+    return rows / np.sqrt(np.sum(rows**2))
 
 
 WINDOW = (5.0, 15.0)

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float, Real
 from jaxmuscle import plot
 from jaxmuscle._common.programs import kept
 
-from ._settings import SpectrumSettings, require, taper_of
+from ._settings import SpectrumSettings, require, tapers_of
 
 
 class Spectrum(eqx.Module):
@@ -115,7 +115,7 @@ def _forward_and_backward(
 
 
 def _density(segments: Float[Array, "*batch length"], settings: SpectrumSettings) -> Float[Array, "*batch frequencies"]:
-    """One-sided density of every segment: |Σ_m w_m x_m e^{-2πikm/n}|² / (rate Σ w²), doubled inside."""
+    """One-sided density of every segment: Σ_t |Σ_m w_tm x_m e^{-2πikm/n}|² / (rate Σ w²), doubled inside."""
     samples, dtype = segments.shape[-1], segments.dtype
     if settings.detrend != "none":
         segments = segments - jnp.mean(segments, axis=-1, keepdims=True)
@@ -123,19 +123,18 @@ def _density(segments: Float[Array, "*batch length"], settings: SpectrumSettings
         line = np.arange(samples) - (samples - 1) / 2
         line = jnp.asarray(line / np.linalg.norm(line), dtype)
         segments = segments - jnp.sum(segments * line, axis=-1, keepdims=True) * line
-    taper = taper_of(settings.window, samples)
-    taper = jnp.asarray(taper / np.sqrt(settings.rate * np.sum(taper**2)), dtype)
-    transform = jnp.fft.rfft(segments * taper)
+    tapers = jnp.asarray(tapers_of(settings, samples) / np.sqrt(settings.rate), dtype)
+    transform = jnp.fft.rfft(segments[..., None, :] * tapers)
     sides = np.full(transform.shape[-1], 2.0)
     sides[[0, -1] if samples % 2 == 0 else [0]] = 1.0
-    return (transform.real**2 + transform.imag**2) * jnp.asarray(sides, dtype)
+    return jnp.sum(transform.real**2 + transform.imag**2, axis=-2) * jnp.asarray(sides, dtype)
 
 
 def welch(signal: Real[Array | np.ndarray, "*batch times"], settings: SpectrumSettings) -> Float[Array, "*batch bins"]:
     """Welch estimate of the one-sided power spectral density in the selected bins, as `scipy.signal.welch`.
 
-    P_k = 2 / (K rate Σ w²) Σ_s |Σ_m w_m x_{s,m} e^{-2πikm/n}|², x_s being segment s of K after detrending; no
-    factor 2 in bin 0 and at half the rate. Nothing is filtered here.
+    P_k = 2 / (K rate Σ w²) Σ_s Σ_t |Σ_m w_tm x_{s,m} e^{-2πikm/n}|², x_s being segment s of K after detrending, w_t one of
+    the tapers; no factor 2 in bin 0 and at half the rate. Nothing is filtered here.
 
     **Arguments:** `signal` [unit], time along the last axis, sampled at `settings.rate`; `settings`.
 
