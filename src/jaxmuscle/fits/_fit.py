@@ -7,9 +7,10 @@ from jaxtyping import PRNGKeyArray
 
 from jaxmuscle._common.progress import told
 from jaxmuscle.data._target import Target
-from jaxmuscle.model._noise import AbstractNoise, BandLimitedNoise
+from jaxmuscle.model._noise import AbstractNoise
 from jaxmuscle.model._rungs import RUNGS, is_base
 from jaxmuscle.model._tasks import AbstractTask, with_noise
+from jaxmuscle.model._white_noise import BandLimitedNoise
 from jaxmuscle.objective._arguments import DT, FitOptions, planned
 
 from ._ladder import Models, options_for

@@ -10,8 +10,9 @@ from jaxtyping import Float
 from jaxmuscle._common.arrays import as_arrays
 from jaxmuscle._common.programs import kept
 from jaxmuscle._common.text import probability
-from jaxmuscle.model._noise import NoiseSum, ResonantNoise
+from jaxmuscle.model._noise import NoiseSum
 from jaxmuscle.model._parameters import HARMONIC, default
+from jaxmuscle.model._resonant_noise import ResonantNoise
 from jaxmuscle.model._rungs import RUNGS, on_rung
 from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.objective._arguments import FitOptions, Plan

@@ -1,8 +1,8 @@
 """The models that a fit tries one after the other."""
 
 from ._activation import Activation
-from ._noise import ResonantNoise
 from ._parameters import default
+from ._resonant_noise import ResonantNoise
 from ._tasks import AbstractTask
 
 RUNGS = (
