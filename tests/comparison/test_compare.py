@@ -20,7 +20,7 @@ import jaxmuscle as jm
 from jaxmuscle.commands.main import app
 from jaxmuscle.comparison import _compare
 from jaxmuscle.comparison._comparison import COLUMNS, Evidence, decided
-from jaxmuscle.comparison._evidence import Candidate, Folds, effective_parameters, without_harmonic
+from jaxmuscle.comparison._evidence import Candidate, Folds, effective_numbers, without_harmonic
 from jaxmuscle.model._tasks import with_noise
 from jaxmuscle.objective._arguments import FitOptions, planned
 from jaxmuscle.objective._likelihood import log_density, log_likelihood, measured_bins
@@ -147,11 +147,11 @@ def test_effective_parameters_of_a_ridge_regression():
         centred = (x - x.mean(axis=0))[:, moves > 0]
         hat = centred @ np.linalg.inv(centred.T @ centred + np.diag(prior[moves > 0])) @ centred.T
         expected.append(np.trace(hat))
-    np.testing.assert_allclose(effective_parameters(curvature, prior, moving), expected, rtol=1e-10)
+    np.testing.assert_allclose(effective_numbers(curvature, prior, moving), expected, rtol=1e-10)
     without_offset = curvature.copy()
     without_offset[:, -1] = without_offset[:, :, -1] = 0.0
     hat = X[0] @ np.linalg.inv(X[0].T @ X[0] + np.diag(prior)) @ X[0].T
-    np.testing.assert_allclose(effective_parameters(without_offset, prior, np.ones((2, 4)))[0], np.trace(hat), rtol=1e-10)
+    np.testing.assert_allclose(effective_numbers(without_offset, prior, np.ones((2, 4)))[0], np.trace(hat), rtol=1e-10)
 
 
 @pytest.mark.slow

@@ -12,7 +12,7 @@ from jaxmuscle._common.arrays import as_numbers
 from jaxmuscle._common.progress import told
 from jaxmuscle._common.text import choices
 from jaxmuscle.data._target import Target
-from jaxmuscle.fits._adequacy import judged
+from jaxmuscle.fits._adequacy import Endpoint
 from jaxmuscle.model._parameters import PARAMETERS
 from jaxmuscle.model._tasks import NOISES, AbstractTask, with_noise
 from jaxmuscle.objective._arguments import FitOptions, planned
@@ -145,7 +145,7 @@ def _fitted(problem: FitProblem, folds: Folds | None, *, harmonic: bool) -> dict
     (part,) = model.likelihood.objective.parts
     problem = problem if harmonic else without_harmonic(problem)
     objective = problem.linear([peak.line[0]])
-    judgement = judged(problem, objective, expand(objective, peak.theta).row(0))
+    judgement = Endpoint(problem, objective, expand(objective, peak.theta).row(0)).adequacy
     return {
         "task": as_numbers(task_at(part.task, part.coordinates, jnp.asarray(peak.theta[0]))),
         "fitted": peak.proportional[0],

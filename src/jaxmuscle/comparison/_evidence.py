@@ -12,6 +12,7 @@ from jaxmuscle._common.programs import kept
 from jaxmuscle.data._target import Target
 from jaxmuscle.model._parameters import HARMONIC
 from jaxmuscle.objective._consequences import BATCH, expand
+from jaxmuscle.objective._covariance import effective_parameters
 from jaxmuscle.objective._likelihood import Bins, Likelihood, _precision, without_offsets
 from jaxmuscle.objective._problem import FitProblem
 from jaxmuscle.objective._scoring import Maximum, maximise
@@ -101,7 +102,7 @@ def maxima(
     return Maxima(
         peak.theta,
         marginals(model.likelihood, moments, bins),
-        effective_parameters(peak.curvature, model.precision, moving),
+        effective_numbers(peak.curvature, model.precision, moving),
         moments.power / moments.power.sum(axis=1, keepdims=True),
         moments.line / moments.power,
         settled,
@@ -146,20 +147,16 @@ def _climbed(model: Candidate, theta: np.ndarray, bins: Bins | None, moving: np.
     return maximise(model.likelihood, theta, model.precision, bins=own, moving=moving[owner], max_steps=BLOCK)
 
 
-def effective_parameters(
+def effective_numbers(
     curvature: Float[np.ndarray, "sets all all"],
     precision: Float[np.ndarray, " free"],
     moving: Float[np.ndarray, "sets free"],
 ) -> Float[np.ndarray, " sets"]:
-    """`p = tr(F (F + Λ)⁻¹)` over the moving coordinates: F the data's Fisher information, the offset integrated out.
-
-    `curvature` is that of θ and the offset, Λ included. Murata, Yoshizawa & Amari 1994, doi:10.1109/72.329683.
-    """
+    """Their effective number over the moving coordinates; `curvature` is that of θ and the offset, Λ included."""
     found = []
     for whole, moves in zip(curvature, moving > 0, strict=True):
         both = without_offsets(whole, len(precision))[np.ix_(moves, moves)]
-        data = both - np.diag(precision[moves])
-        found.append(np.trace(data @ np.linalg.pinv(both, hermitian=True)))
+        found.append(effective_parameters(both - np.diag(precision[moves]), precision[moves]))
     return np.array(found)
 
 

@@ -57,12 +57,11 @@ def fit(
     `fix`, values to set, which are then not free; `noise`, a name or an object; `residual`, "log", "linear" or
     "cumulative"; `starts` (100, or 8 for a task without linear response); `seeds` (32, or 48 then; 0: no nonlinear
     correction); `key`, a `jax.random` key or a seed number; `bounds` {name: (low, high)}; `priors` {name: sd in log, or None
-    for a flat one};
-    `coefficient_of_variation`, whether the target's, if it states one, is one more residual (it fixes the scale of the
-    noise); `mean_force` (value, sd) [N] as a further residual; `max_steps` for each descent; `check_seeds` (64, or 200
-    then; 0: not simulated); `dt` [s], noise grid of a Monte Carlo fit; `progress`, True or a function of (text, share);
-    `rungs`, how many richer models may be tried where the base model does not describe the data (`on_rung`; 3, or 0 where
-    `noise` or `free` is given); `answer`, a function that gets the result as soon as the search ends, before simulated
+    for a flat one}; `coefficient_of_variation`, whether the target's, if it states one, is one more residual (it fixes the
+    scale of the noise); `mean_force` (value, sd) [N] as a further residual; `max_steps` for each descent; `check_seeds` (64,
+    or 200 then; 0: not simulated); `dt` [s], noise grid of a Monte Carlo fit; `progress`, True or a function of (text,
+    share); `rungs`, how many richer models may be tried where the base model does not describe the data (`on_rung`; 3, or 0
+    where `noise` or `free` is given); `answer`, a function that gets the result as soon as the search ends, before simulated
     check, profile and p-value.
 
     **Returns:** a `FitResult`; a fit that fails is one, too, and says why.
