@@ -180,6 +180,8 @@ def test_bands_are_sums_of_bins():
     f, p = result.frequency_hz, result.fitted
     for low, high in ((0, 0.5), (1, 2), (8, 12)):
         assert result.derived[f"band_{low:g}_{high:g}"].value == pytest.approx(p[(f >= low) & (f < high)].sum(), rel=1e-3)
+    said = " ".join(str(result).partition("not determined")[0].split())
+    assert f"power by band: 0-0.5 Hz {100 * result.derived['band_0_0.5'].value:.2g} %" in said and "band_" not in said
 
 
 @pytest.mark.slow
