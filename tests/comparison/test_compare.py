@@ -80,6 +80,21 @@ def test_a_noise_and_its_limit_are_not_told_apart():
 
 
 @pytest.mark.slow
+def test_a_tremor_is_told_from_a_line():
+    """A broad tremor behind an activation; a harmonic is asked for only of the models that may have one."""
+    task = jm.on_rung(jm.Isometric(), 2).replace(resonance_amplitude=0.1, noise_K_z=0.002)
+    free = ("noise_K_z", "resonance_amplitude", "harmonic_amplitude", "harmonic_frequency")
+    found = jm.compare_noise(jm.Isometric(), target_of(task, 1, 300), noises=("band-limited", "tremor"), free=free,
+                             priors={"resonance_amplitude": 2.0, "harmonic_frequency": 0.3}, groups=GROUPS)  # fmt: skip
+    assert [(row.noise, row.harmonic) for row in found.rows] == [
+        ("band-limited", True), ("band-limited", False), ("tremor", False)]  # fmt: skip
+    assert found.between("tremor", "band-limited").winner == "tremor" == found.best.noise
+    assert [row.adequate for row in found.rows] == [False, False, True]
+    assert found.tasks["tremor", False]["resonance_amplitude"] == pytest.approx(0.1, rel=0.2)
+    assert "tremor rather than band-limited" in found.verdict[0] and found.harmonic.b == "no harmonic"
+
+
+@pytest.mark.slow
 def test_no_harmonic_is_shown_where_there_is_none():
     assert compared("pink", 3, False).harmonic.winner is None
 
@@ -336,6 +351,8 @@ def test_what_a_task_cannot_carry_is_left_out_with_its_own_reason():
     assert left_out == {"white": str(own.value)} and "where white noise has no value" in left_out["white"]
     carried, left_out = _compare._carried(jm.Isometric(), ("white", *COLOURS), {"noise_K_z": 0.0, "noise_C_z": 0.0})
     assert tuple(carried) == ("white", *COLOURS) and left_out == {}
+    carried, left_out = _compare._carried(jm.on_rung(jm.Isometric(), 1), ("band-limited", "pink", "tremor"), {})
+    assert tuple(carried) == ("band-limited", "pink") and "has an activation or a resonance already" in left_out["tremor"]
     mine = jm.Isometric(noise=jm.BandLimitedNoise(cutoff=20.0))
     assert float(_compare._carried(mine, COLOURS, {})[0]["band-limited"]["noise_cutoff"]) == 20.0
 
@@ -417,7 +434,6 @@ def test_the_command_writes_its_files(success, tmp_path, monkeypatch, keep_cache
         (["nobody"], "nobody"),
         ([FORCE, "--fix", "k_w"], "--fix 'k_w': write NAME=VALUE"),
         ([FORCE, "--free", "k_x"], "free: unknown parameter 'k_x'"),
-        ([FORCE, "--task", "prescribed-motion"], "noises: at least two are needed"),
     ],
 )
 def test_a_users_mistake_is_one_line(arguments, message, tmp_path, keep_cache):

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Int
 
 from jaxmuscle._common.programs import kept
 from jaxmuscle.data._target import Target
-from jaxmuscle.model._parameters import HARMONIC
+from jaxmuscle.model._parameters import HARMONIC, RESONANCE
 from jaxmuscle.objective._consequences import BATCH, expand
 from jaxmuscle.objective._covariance import effective_parameters
 from jaxmuscle.objective._likelihood import Bins, Likelihood, _precision, without_offsets
@@ -64,13 +64,12 @@ class Candidate(NamedTuple):
         rng = np.random.default_rng(np.asarray(jax.random.key_data(problem.key)).tolist())
         names = problem.coordinates.names
         scattered = 0.5 * rng.standard_normal((RANDOM, len(names)))
-        if harmonic:
-            spread = problem.coordinates.theta(starting_points(problem, SPREAD))
-            starts = np.concatenate([points_about(problem, np.zeros(len(names))), spread, scattered])
-        else:
-            problem = without_harmonic(problem)
-            spread = problem.coordinates.theta(starting_points(problem, PLAIN - RANDOM))
-            starts = np.concatenate([spread, scattered])
+        problem = problem if harmonic else without_harmonic(problem)
+        wide = harmonic or bool(set(RESONANCE) & set(names))  # a frequency has a maximum at almost every peak
+        spread = problem.coordinates.theta(starting_points(problem, SPREAD if wide else PLAIN - RANDOM))
+        about = points_about(problem, np.zeros(len(names))) if harmonic else spread[:0]
+        starts = np.concatenate([about, spread, scattered])
+        if not harmonic:
             starts[:, [n in HARMONIC for n in names]] = 0.0
         return cls(Likelihood.of(problem), problem.prior, starts)
 
@@ -152,7 +151,7 @@ def effective_numbers(
     precision: Float[np.ndarray, " free"],
     moving: Float[np.ndarray, "sets free"],
 ) -> Float[np.ndarray, " sets"]:
-    """Their effective number over the moving coordinates; `curvature` is that of θ and the offset, Λ included."""
+    """Effective numbers of parameters over the moving coordinates; `curvature` is that of θ and the offset, Λ included."""
     found = []
     for whole, moves in zip(curvature, moving > 0, strict=True):
         both = without_offsets(whole, len(precision))[np.ix_(moves, moves)]
