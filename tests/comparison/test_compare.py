@@ -361,7 +361,11 @@ FORCE = "fdi-abduction-45mvc"
 BAD = {
     "one": (jm.Isometric, {"noises": ("pink",)}, "noises: at least two are needed for a comparison, 1 can be used"),
     "left out": (jm.Isometric, {"noises": ("white", "pink")}, r"1 can be used; white: WhiteNoise on K_z cannot be used"),
-    "rough": (jm.PrescribedMotion, {}, "pink: PinkNoise on K_z cannot be used in PrescribedMotion"),
+    "rough": (
+        jm.PrescribedMotion,
+        {"noises": ("band-limited", "pink")},
+        "pink: PinkNoise on K_z cannot be used in PrescribedMotion",
+    ),
     "unknown": (jm.Isometric, {"noises": ("brown", "pink")}, "noises: 'brown'"),
     "free": (jm.Isometric, {"free": ("c_w", "k_x")}, "free: unknown parameter 'k_x'"),
     "fix": (jm.Isometric, {"fix": {"k_x": 1.0}}, "fix: unknown parameter 'k_x'"),
