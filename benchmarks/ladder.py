@@ -5,13 +5,11 @@
 Takes a quarter of an hour to an hour each; the outcome stands in docs/force.md.
 """
 
-import argparse
 import collections
-import warnings
 
 import jax
 import numpy as np
-from verdict import SETTINGS, STARTS, recordings, targets
+from verdict import SETTINGS, STARTS, recordings, run, targets
 
 import jaxmuscle as jm
 from jaxmuscle.objective._arguments import FitOptions, planned
@@ -147,9 +145,4 @@ def recovery(count: int) -> None:
 STUDIES = {"selection": selection, "line": line, "recovery": recovery}
 
 if __name__ == "__main__":
-    asked = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    asked.add_argument("study", choices=STUDIES)
-    asked.add_argument("--count", type=int, default=100)
-    given = asked.parse_args()
-    warnings.simplefilter("ignore")
-    STUDIES[given.study](given.count)
+    run(STUDIES, __doc__, 100)

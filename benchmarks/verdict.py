@@ -157,10 +157,16 @@ def harmonic(count: int) -> None:
 
 STUDIES = {"null": null, "power": power, "coverage": coverage, "harmonic": harmonic}
 
-if __name__ == "__main__":
-    asked = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    asked.add_argument("study", choices=STUDIES)
-    asked.add_argument("--count", type=int, default=500)
+
+def run(studies: dict[str, Callable[[int], None]], description: str | None, count: int) -> None:
+    """The study that the command line asks for."""
+    asked = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
+    asked.add_argument("study", choices=studies)
+    asked.add_argument("--count", type=int, default=count)
     given = asked.parse_args()
     warnings.simplefilter("ignore")
-    STUDIES[given.study](given.count)
+    studies[given.study](given.count)
+
+
+if __name__ == "__main__":
+    run(STUDIES, __doc__, 500)

@@ -20,7 +20,7 @@ import jaxmuscle as jm
 from jaxmuscle.commands.main import app
 from jaxmuscle.comparison import _compare
 from jaxmuscle.comparison._comparison import COLUMNS, Evidence, decided
-from jaxmuscle.comparison._evidence import Candidate, Folds, effective_parameters, without_harmonic
+from jaxmuscle.comparison._evidence import Candidate, Folds, effective_numbers, without_harmonic
 from jaxmuscle.model._tasks import with_noise
 from jaxmuscle.objective._arguments import FitOptions, planned
 from jaxmuscle.objective._likelihood import log_density, log_likelihood, measured_bins
@@ -77,6 +77,21 @@ def test_a_noise_and_its_limit_are_not_told_apart():
     assert found.between("band-limited", "ornstein-uhlenbeck").winner is None
     assert found.between("band-limited", "pink").winner == "band-limited"
     assert found.tasks["ornstein-uhlenbeck", True]["noise_correlation_time"] < 0.02
+
+
+@pytest.mark.slow
+def test_a_tremor_is_told_from_a_line():
+    """A broad tremor behind an activation; a harmonic is asked for only of the models that may have one."""
+    task = jm.on_rung(jm.Isometric(), 2).replace(resonance_amplitude=0.1, noise_K_z=0.002)
+    free = ("noise_K_z", "resonance_amplitude", "harmonic_amplitude", "harmonic_frequency")
+    found = jm.compare_noise(jm.Isometric(), target_of(task, 1, 300), noises=("band-limited", "tremor"), free=free,
+                             priors={"resonance_amplitude": 2.0, "harmonic_frequency": 0.3}, groups=GROUPS)  # fmt: skip
+    assert [(row.noise, row.harmonic) for row in found.rows] == [
+        ("band-limited", True), ("band-limited", False), ("tremor", False)]  # fmt: skip
+    assert found.between("tremor", "band-limited").winner == "tremor" == found.best.noise
+    assert [row.adequate for row in found.rows] == [False, False, True]
+    assert found.tasks["tremor", False]["resonance_amplitude"] == pytest.approx(0.1, rel=0.2)
+    assert "tremor rather than band-limited" in found.verdict[0] and found.harmonic.b == "no harmonic"
 
 
 @pytest.mark.slow
@@ -147,11 +162,11 @@ def test_effective_parameters_of_a_ridge_regression():
         centred = (x - x.mean(axis=0))[:, moves > 0]
         hat = centred @ np.linalg.inv(centred.T @ centred + np.diag(prior[moves > 0])) @ centred.T
         expected.append(np.trace(hat))
-    np.testing.assert_allclose(effective_parameters(curvature, prior, moving), expected, rtol=1e-10)
+    np.testing.assert_allclose(effective_numbers(curvature, prior, moving), expected, rtol=1e-10)
     without_offset = curvature.copy()
     without_offset[:, -1] = without_offset[:, :, -1] = 0.0
     hat = X[0] @ np.linalg.inv(X[0].T @ X[0] + np.diag(prior)) @ X[0].T
-    np.testing.assert_allclose(effective_parameters(without_offset, prior, np.ones((2, 4)))[0], np.trace(hat), rtol=1e-10)
+    np.testing.assert_allclose(effective_numbers(without_offset, prior, np.ones((2, 4)))[0], np.trace(hat), rtol=1e-10)
 
 
 @pytest.mark.slow
@@ -343,6 +358,8 @@ def test_what_a_task_cannot_carry_is_left_out_with_its_own_reason():
     assert left_out == {"white": str(own.value)} and "where white noise has no value" in left_out["white"]
     carried, left_out = _compare._carried(jm.Isometric(), ("white", *COLOURS), {"noise_K_z": 0.0, "noise_C_z": 0.0})
     assert tuple(carried) == ("white", *COLOURS) and left_out == {}
+    carried, left_out = _compare._carried(jm.on_rung(jm.Isometric(), 1), ("band-limited", "pink", "tremor"), {})
+    assert tuple(carried) == ("band-limited", "pink") and "has an activation or a resonance already" in left_out["tremor"]
     mine = jm.Isometric(noise=jm.BandLimitedNoise(cutoff=20.0))
     assert float(_compare._carried(mine, COLOURS, {})[0]["band-limited"]["noise_cutoff"]) == 20.0
 
@@ -351,7 +368,11 @@ FORCE = "fdi-abduction-45mvc"
 BAD = {
     "one": (jm.Isometric, {"noises": ("pink",)}, "noises: at least two are needed for a comparison, 1 can be used"),
     "left out": (jm.Isometric, {"noises": ("white", "pink")}, r"1 can be used; white: WhiteNoise on K_z cannot be used"),
-    "rough": (jm.PrescribedMotion, {}, "pink: PinkNoise on K_z cannot be used in PrescribedMotion"),
+    "rough": (
+        jm.PrescribedMotion,
+        {"noises": ("band-limited", "pink")},
+        "pink: PinkNoise on K_z cannot be used in PrescribedMotion",
+    ),
     "unknown": (jm.Isometric, {"noises": ("brown", "pink")}, "noises: 'brown'"),
     "free": (jm.Isometric, {"free": ("c_w", "k_x")}, "free: unknown parameter 'k_x'"),
     "fix": (jm.Isometric, {"fix": {"k_x": 1.0}}, "fix: unknown parameter 'k_x'"),
@@ -428,7 +449,6 @@ def test_the_command_writes_its_files(success, tmp_path, monkeypatch, keep_cache
         (["nobody"], "nobody"),
         ([FORCE, "--fix", "k_w"], "--fix 'k_w': write NAME=VALUE"),
         ([FORCE, "--free", "k_x"], "free: unknown parameter 'k_x'"),
-        ([FORCE, "--task", "prescribed-motion"], "noises: at least two are needed"),
     ],
 )
 def test_a_users_mistake_is_one_line(arguments, message, tmp_path, keep_cache):

@@ -10,13 +10,12 @@ import scipy.stats
 
 import jaxmuscle as jm
 from jaxmuscle._common.arrays import as_arrays
-from jaxmuscle.fits._adequacy import elsewhere, judged, scatter_of
+from jaxmuscle.fits._adequacy import Endpoint, elsewhere
 from jaxmuscle.fits._intervals import intervals
-from jaxmuscle.fits._refit import refit_of, without_fitted
+from jaxmuscle.fits._refit import without_fitted
 from jaxmuscle.model._parameters import DEFAULT_FREE
 from jaxmuscle.objective._arguments import FitOptions, planned
 from jaxmuscle.objective._consequences import consequences, expand, quantities
-from jaxmuscle.objective._covariance import parameter_covariance
 from jaxmuscle.response._harmonic_line import line_levels
 from jaxmuscle.spectra._bin_law import bin_statistics
 
@@ -66,7 +65,7 @@ def test_without_harmonic_and_correlation_chi_squared_has_its_distribution(x64):
     seen = expand(objective, theta).row(0)
     found = consequences(objective, seen)
     rank = np.linalg.matrix_rank(found.jacobian, tol=1e-6 * np.linalg.norm(found.jacobian))
-    judgement = judged(plan.problem, objective, seen)
+    judgement = Endpoint(plan.problem, objective, seen).adequacy
     assert judgement is not None
     degrees = 30 - 1 - rank
     assert judgement.chi2 == pytest.approx(np.sum(found.residuals**2))
@@ -137,11 +136,9 @@ def test_errors_of_such_a_fit_are_widened_and_its_harmonic_is_not_judged():
         problem = planned(TASK, result.target, FitOptions()).problem
         theta = problem.theta_of((result.task,))
         objective = problem.linear([result.harmonic_share])
-        seen = expand(objective, theta[None]).row(0)
-        found = consequences(objective, seen)
-        covariance = parameter_covariance(found.jacobian, scatter_of(problem, objective, seen), problem.prior)
-        g = found.slopes[0]["high_frequency_floor"]
-    plain = float(np.sqrt(g @ covariance @ g))
+        ended = Endpoint(problem, objective, expand(objective, theta[None]).row(0))
+        g = ended.found.slopes[0]["high_frequency_floor"]
+        plain = float(np.sqrt(g @ ended.covariance @ g))
     # The fit takes the line's share of the bins from the stage before its last.
     assert result.derived["high_frequency_floor"].stderr == pytest.approx(factor * plain, rel=0.01)
     assert result.harmonic_p_value is None
@@ -162,7 +159,7 @@ def test_nothing_is_judged_where_the_scatter_is_unknown():
         plan = planned(TASK, target, FitOptions())
         objective = plan.problem.linear()
         seen = expand(objective, np.zeros((1, 8))).row(0)
-        assert judged(plan.problem, objective, seen) is None
+        assert Endpoint(plan.problem, objective, seen).adequacy is None
 
 
 # --- what is stated
@@ -178,10 +175,7 @@ def test_a_faint_harmonic_has_no_errors_and_a_strong_one_has(x64):
         problem = plan.problem
         theta = problem.theta_of((task,))
         objective = problem.linear()
-        seen = expand(objective, theta[None]).row(0)
-        found = consequences(objective, seen)
-        covariance = parameter_covariance(found.jacobian, scatter_of(problem, objective, seen), problem.prior)
-        shares[amplitude] = elsewhere(problem, found, refit_of(problem, objective, seen, found), covariance)
+        shares[amplitude] = elsewhere(Endpoint(problem, objective, expand(objective, theta[None]).row(0)))
     assert shares[0.003] > 0.5 and shares[0.05] < 1e-3
 
 

@@ -12,7 +12,7 @@ import scipy.signal
 
 import jaxmuscle as jm
 from jaxmuscle.model import NoiseSum
-from jaxmuscle.model._noise import exact_step
+from jaxmuscle.model._resonant_noise import exact_step
 
 KEY = jax.random.key(17)
 CASES = {"tremor": (9.0, 2.0), "narrow": (9.0, 0.02), "overdamped": (4.0, 10.0)}

@@ -16,7 +16,8 @@ import jaxmuscle as jm
 from jaxmuscle._common.arrays import as_arrays
 from jaxmuscle.model import Constant, Decay, RampHold
 from jaxmuscle.objective._problem import target_variation
-from jaxmuscle.response._expected import _Autocovariance, covariance_operator, expected_moments
+from jaxmuscle.response._autocovariance import Autocovariance
+from jaxmuscle.response._expected import covariance_operator, expected_moments
 from jaxmuscle.response._linearised import has_response, linearised
 from jaxmuscle.response._transfer import system_of, transfer
 
@@ -478,7 +479,7 @@ def test_lags_and_the_variance_of_a_mean_are_plain_sums(x64, samples):
         r.append(sum(row @ state for row, state in zip(rows, states, strict=True)))
         states = [step @ state for state in states]
     powers = jnp.stack([np.linalg.matrix_power(step, 2**k) for k in range(11)])
-    found = _Autocovariance(jnp.asarray(first), jnp.asarray(rows), powers, jnp.asarray(start))
+    found = Autocovariance(jnp.asarray(first), jnp.asarray(rows), powers, jnp.asarray(start))
     np.testing.assert_allclose(found.lagged(samples), r, rtol=1e-12, atol=1e-13)
     lag = np.abs(np.subtract.outer(np.arange(samples), np.arange(samples)))
     np.testing.assert_allclose(found.mean_variance(samples), np.array(r)[lag].mean(), rtol=1e-11)

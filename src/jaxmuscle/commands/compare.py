@@ -29,10 +29,10 @@ def compare(
     force: Force = False,
     as_json: Json = False,
 ) -> None:
-    """Compare the colours of noise, each with and without a harmonic, on one target.
+    """Compare the colours of noise, each with and without a harmonic, and richer models (activation, tremor) on one target.
 
     Writes DIR/compare.csv, DIR/compare.json and DIR/compare.png, prints the table and which of them can be told apart. A
-    noise that the task cannot carry is left out, and why is said.
+    model that the task cannot carry is left out, and why is said.
 
     Examples:
 
@@ -50,7 +50,7 @@ def compare(
         names = names_in(free)
         aim, model = aim_of(target, task, {"quantity": quantity, "segments": segments})
         writable(output, "compare.json", force=force)
-        with told(True, f"comparing noises on {aim.name}") as tell:
+        with told(True, f"comparing models on {aim.name}") as tell:
             found = jm.compare_noise(model, aim, free=names, fix=fixed, key=seed, progress=tell)
         _write(found, output)
         record(output / "compare.json")

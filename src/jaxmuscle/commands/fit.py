@@ -98,8 +98,8 @@ def fit(
     they are read. Several spectra are those of several people.
 
     Prints a table as soon as the search has ended, then what the checks on simulated seeds add. Writes DIR/fit.json,
-    DIR/fit.png and DIR/spectrum.csv. Several targets: DIR/TARGET/... and
-    DIR/cohort.csv, cohort.png (and differences.csv with groups); fitted in linear response, without its last checks.
+    DIR/fit.png and DIR/spectrum.csv. Several targets: DIR/TARGET/... and DIR/cohort.csv, cohort.png (and differences.csv
+    with groups); fitted in linear response, without its last checks.
 
     Examples:
 

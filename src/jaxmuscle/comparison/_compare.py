@@ -1,4 +1,4 @@
-"""Which colour of noise, with or without a harmonic, explains a spectrum."""
+"""Which colour of noise, with or without a harmonic, or which richer model explains a spectrum."""
 
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any, TypeVar
@@ -12,8 +12,9 @@ from jaxmuscle._common.arrays import as_numbers
 from jaxmuscle._common.progress import told
 from jaxmuscle._common.text import choices
 from jaxmuscle.data._target import Target
-from jaxmuscle.fits._adequacy import judged
-from jaxmuscle.model._parameters import PARAMETERS
+from jaxmuscle.fits._adequacy import Endpoint
+from jaxmuscle.model._parameters import HARMONIC, PARAMETERS
+from jaxmuscle.model._rungs import on_rung
 from jaxmuscle.model._tasks import NOISES, AbstractTask, with_noise
 from jaxmuscle.objective._arguments import FitOptions, planned
 from jaxmuscle.objective._consequences import expand
@@ -25,13 +26,14 @@ from ._comparison import NEEDED, ComparedModel, Comparison, score_difference
 from ._evidence import Candidate, Folds, held_out, masked_bins, maxima, without_harmonic
 
 Value = TypeVar("Value")
+RICHER = {"activation": 1, "tremor": 2, "two resonances": 3}  # rungs of the task with its own noise
 
 
 def compare_noise(
     task: AbstractTask,
     target: Target,
     *,
-    noises: Iterable[str] = tuple(NOISES),
+    noises: Iterable[str] = (*NOISES, *RICHER),
     free: Iterable[str] | None = None,
     fix: Mapping[str, float] | None = None,
     priors: Mapping[str, float | None] | None = None,
@@ -41,6 +43,9 @@ def compare_noise(
     progress: bool | Callable[[str, float], None] = False,
 ) -> Comparison:
     """Fit a spectrum with every colour of noise, with and without harmonic, and say which can be told apart.
+
+    So are the richer models that a fit may climb to (`on_rung`), with the task's own noise: "activation", "tremor" instead
+    of the harmonic, "two resonances".
 
     Each model is climbed, in linear response, to the highest of the maxima of its posterior from 64 starting points (16
     without harmonic). There
@@ -54,13 +59,14 @@ def compare_noise(
     6 + 2 ln(bins).
 
     **Arguments:** `task`, whose own noise keeps its values while the others take their defaults; `target`; `noises`, names
-    of `NOISES`; `free`, `fix`, `priors`, `bounds` as in `fit`, those of a parameter that one noise has and another has not
-    for those that have it; `groups`; `key`, for an eighth of the starting points; `progress` as in `fit`.
+    of `NOISES` and of richer models; `free`, `fix`, `priors`, `bounds` as in `fit`, those of a parameter that one model has
+    and another has not for those that have it; `groups`; `key`, for an eighth of the starting points; `progress` as in
+    `fit`.
 
-    **Returns:** a `Comparison`. A noise that the task cannot carry is in its `left_out`, with the reason. With a sigma but
+    **Returns:** a `Comparison`. A model that the task cannot carry is in its `left_out`, with the reason. With a sigma but
     no segments there is no held-out score.
 
-    **Raises:** `ValueError` if fewer than two noises remain, for a target that states neither segments nor sigma, and as
+    **Raises:** `ValueError` if fewer than two models remain, for a target that states neither segments nor sigma, and as
     `fit` does.
 
     **Source:** Akaike 1974, doi:10.1109/TAC.1974.1100705; Murata et al. 1994, doi:10.1109/72.329683; Vehtari, Gelman & Gabry
@@ -68,7 +74,7 @@ def compare_noise(
     """
     if not 2 <= groups <= len(target.bins):
         raise ValueError(f"groups = {groups}: give a number from 2 to that of the target's bins, {len(target.bins)}")
-    with told(progress, f"comparing noises on {target.name}") as tell, jax.enable_x64(True):
+    with told(progress, f"comparing models on {target.name}") as tell, jax.enable_x64(True):
         carried, left_out = _carried(task, noises, dict(fix or {}))
         problems = _setups(carried, target, free, dict(fix or {}), dict(priors or {}), dict(bounds or {}), key)
         folds = None if target.segments is None else Folds.of([target], groups)
@@ -92,10 +98,13 @@ def _carried(
     carried: dict[str, AbstractTask] = {}
     left_out: dict[str, str] = {}
     for name in dict.fromkeys(noises):
-        if name not in NOISES:
-            raise ValueError(f"noises: {name!r}: {choices(name, NOISES)}")
+        if name not in (*NOISES, *RICHER):
+            raise ValueError(f"noises: {name!r}: {choices(name, (*NOISES, *RICHER))}")
         try:
-            carried[name] = task if type(task.noise) is NOISES[name] else with_noise(task, name, fix)
+            if name in RICHER:
+                carried[name] = on_rung(task, RICHER[name])
+            else:
+                carried[name] = task if type(task.noise) is NOISES[name] else with_noise(task, name, fix)
         except ValueError as error:
             left_out[name] = str(error)
     if len(carried) < 2:
@@ -123,7 +132,7 @@ def _setups(
                 raise ValueError(f"{argument}: unknown parameter {name!r}: {choices(name, everywhere)}")
     problems = {}
     for noise, task in carried.items():
-        own = set(task.parameter_names)
+        own = set(task.parameter_names) - set(HARMONIC if RICHER.get(noise, 0) > 1 else ())
         names = None if chosen is None else [n for n in chosen if n in own]
         options = FitOptions(free=names, fix=_of(fix, own), priors=_of(priors, own), bounds=_of(bounds, own), key=key)
         problems[noise] = planned(task, target, options).problem
@@ -145,7 +154,7 @@ def _fitted(problem: FitProblem, folds: Folds | None, *, harmonic: bool) -> dict
     (part,) = model.likelihood.objective.parts
     problem = problem if harmonic else without_harmonic(problem)
     objective = problem.linear([peak.line[0]])
-    judgement = judged(problem, objective, expand(objective, peak.theta).row(0))
+    judgement = Endpoint(problem, objective, expand(objective, peak.theta).row(0)).adequacy
     return {
         "task": as_numbers(task_at(part.task, part.coordinates, jnp.asarray(peak.theta[0]))),
         "fitted": peak.proportional[0],

@@ -97,7 +97,7 @@ def score_difference(
 
 
 class ComparedModel(eqx.Module):
-    """One model: a colour of noise, with or without harmonic.
+    """One model: a colour of noise or a richer model (`noise`), with or without harmonic.
 
     `log_likelihood` at the maximum of the posterior, the offset integrated out; `parameters`, their effective number
     p = tr(F (F + Λ)⁻¹); `aic` = -2 ln L + 2 p; `delta_aic` above the lowest; Akaike `weight`; `scores`, log density of every
@@ -196,8 +196,9 @@ class Comparison(eqx.Module):
 
     @property
     def harmonic(self) -> Decision | None:
-        """The best model with a harmonic against the best without; None if the task has none."""
-        sides = [[row for row in self.rows if row.harmonic == present] for present in (True, False)]
+        """The best model with a harmonic against the best of the same without; None if the task has none."""
+        both = {row.noise for row in self.rows if row.harmonic}
+        sides = [[row for row in self.rows if row.harmonic == present and row.noise in both] for present in (True, False)]
         if not all(sides):
             return None
         names = ("a harmonic", "no harmonic")

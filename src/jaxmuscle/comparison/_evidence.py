@@ -10,8 +10,9 @@ from jaxtyping import Bool, Float, Int
 
 from jaxmuscle._common.programs import kept
 from jaxmuscle.data._target import Target
-from jaxmuscle.model._parameters import HARMONIC
+from jaxmuscle.model._parameters import HARMONIC, RESONANCE
 from jaxmuscle.objective._consequences import BATCH, expand
+from jaxmuscle.objective._covariance import effective_parameters
 from jaxmuscle.objective._likelihood import Bins, Likelihood, _precision, without_offsets
 from jaxmuscle.objective._problem import FitProblem
 from jaxmuscle.objective._scoring import Maximum, maximise
@@ -63,13 +64,12 @@ class Candidate(NamedTuple):
         rng = np.random.default_rng(np.asarray(jax.random.key_data(problem.key)).tolist())
         names = problem.coordinates.names
         scattered = 0.5 * rng.standard_normal((RANDOM, len(names)))
-        if harmonic:
-            spread = problem.coordinates.theta(starting_points(problem, SPREAD))
-            starts = np.concatenate([points_about(problem, np.zeros(len(names))), spread, scattered])
-        else:
-            problem = without_harmonic(problem)
-            spread = problem.coordinates.theta(starting_points(problem, PLAIN - RANDOM))
-            starts = np.concatenate([spread, scattered])
+        problem = problem if harmonic else without_harmonic(problem)
+        wide = harmonic or bool(set(RESONANCE) & set(names))  # a frequency has a maximum at almost every peak
+        spread = problem.coordinates.theta(starting_points(problem, SPREAD if wide else PLAIN - RANDOM))
+        about = points_about(problem, np.zeros(len(names))) if harmonic else spread[:0]
+        starts = np.concatenate([about, spread, scattered])
+        if not harmonic:
             starts[:, [n in HARMONIC for n in names]] = 0.0
         return cls(Likelihood.of(problem), problem.prior, starts)
 
@@ -101,7 +101,7 @@ def maxima(
     return Maxima(
         peak.theta,
         marginals(model.likelihood, moments, bins),
-        effective_parameters(peak.curvature, model.precision, moving),
+        effective_numbers(peak.curvature, model.precision, moving),
         moments.power / moments.power.sum(axis=1, keepdims=True),
         moments.line / moments.power,
         settled,
@@ -146,20 +146,16 @@ def _climbed(model: Candidate, theta: np.ndarray, bins: Bins | None, moving: np.
     return maximise(model.likelihood, theta, model.precision, bins=own, moving=moving[owner], max_steps=BLOCK)
 
 
-def effective_parameters(
+def effective_numbers(
     curvature: Float[np.ndarray, "sets all all"],
     precision: Float[np.ndarray, " free"],
     moving: Float[np.ndarray, "sets free"],
 ) -> Float[np.ndarray, " sets"]:
-    """`p = tr(F (F + Λ)⁻¹)` over the moving coordinates: F the data's Fisher information, the offset integrated out.
-
-    `curvature` is that of θ and the offset, Λ included. Murata, Yoshizawa & Amari 1994, doi:10.1109/72.329683.
-    """
+    """Effective numbers of parameters over the moving coordinates; `curvature` is that of θ and the offset, Λ included."""
     found = []
     for whole, moves in zip(curvature, moving > 0, strict=True):
         both = without_offsets(whole, len(precision))[np.ix_(moves, moves)]
-        data = both - np.diag(precision[moves])
-        found.append(np.trace(data @ np.linalg.pinv(both, hermitian=True)))
+        found.append(effective_parameters(both - np.diag(precision[moves]), precision[moves]))
     return np.array(found)
 
 

@@ -1,5 +1,7 @@
 """Does the model describe the data? Chi² of a fit against its distribution under the fitted model, and where it fails."""
 
+import dataclasses
+import functools
 from typing import NamedTuple
 
 import jax
@@ -10,10 +12,11 @@ from scipy.special import gammaincinv, ndtr
 
 from jaxmuscle._common.keys import fold_in
 from jaxmuscle.objective._consequences import Consequences, Expansion, consequences
-from jaxmuscle.objective._covariance import residual_covariance
+from jaxmuscle.objective._covariance import parameter_covariance, residual_covariance
 from jaxmuscle.objective._problem import FitProblem
 from jaxmuscle.objective._residuals import PartResiduals, Residuals
 
+from ._checks import Stage, seen_best
 from ._refit import STRENGTHS, Refit, refit_of
 
 ADEQUATE = 0.01
@@ -44,9 +47,48 @@ class Adequacy(NamedTuple):
         return 1.0 if self.adequate else max(1.0, float(np.sqrt(self.chi2 / self.expected)))
 
 
-def adequacy(
-    problem: FitProblem, objective: Residuals, found: Consequences, refit: Refit, scatter: np.ndarray
-) -> Adequacy | None:
+@dataclasses.dataclass(frozen=True)
+class Endpoint:
+    """What follows from where a fit ended; computed when it is asked for, and once."""
+
+    problem: FitProblem
+    objective: Residuals
+    seen: Expansion
+
+    @classmethod
+    def of(cls, problem: FitProblem, stage: Stage) -> "Endpoint":
+        """The best point of a stage."""
+        return cls(problem, stage.objective, seen_best(stage.objective, stage.minima))
+
+    @functools.cached_property
+    def found(self) -> Consequences:
+        """Residuals and derived quantities with their slopes."""
+        return consequences(self.objective, self.seen)
+
+    @functools.cached_property
+    def scatter(self) -> Float[np.ndarray, "residuals residuals"]:
+        """Covariance of the data residuals of all parts."""
+        parts = zip(self.problem.parts, self.objective.parts, self.seen.moments, strict=True)
+        each = [residual_covariance(part.target, own, np.asarray(m.line / m.power)) for part, own, m in parts]
+        return np.asarray(block_diag(*each))
+
+    @functools.cached_property
+    def refit(self) -> Refit:
+        """What a refit leaves of residuals."""
+        return refit_of(self.problem, self.objective, self.seen, self.found)
+
+    @functools.cached_property
+    def covariance(self) -> Float[np.ndarray, "free free"]:
+        """That of the estimates, in prior standard deviations."""
+        return parameter_covariance(self.found.jacobian, self.scatter, self.problem.prior)
+
+    @functools.cached_property
+    def adequacy(self) -> Adequacy | None:
+        """Whether the model describes the data; None where the spread is unknown."""
+        return adequacy(self)
+
+
+def adequacy(ended: Endpoint) -> Adequacy | None:
     """Chi² of the data residuals against its distribution under the fitted model; None where the spread is unknown.
 
     The reference: residuals ε drawn by the law of the bins about the fitted spectrum, and what a refit leaves of them. The
@@ -54,6 +96,7 @@ def adequacy(
     drawn from it; but the line of one harmonic whose amplitude and frequency are free is sought anew, over the whole band,
     as a fit does.
     """
+    problem, objective, found, scatter, refit = ended.problem, ended.objective, ended.found, ended.scatter, ended.refit
     if not all(part.statistics.known for part in objective.parts):
         return None
     generator = generator_of(problem, 5)
@@ -69,27 +112,13 @@ def adequacy(
     return Adequacy(here, float(np.mean(chi2)), float(p), _misfit(problem, objective, found.residuals, inner))
 
 
-def judged(problem: FitProblem, objective: Residuals, seen: Expansion) -> Adequacy | None:
-    """`adequacy` of the model as it was seen at the point where a fit ended."""
-    found = consequences(objective, seen)
-    return adequacy(
-        problem, objective, found, refit_of(problem, objective, seen, found), scatter_of(problem, objective, seen)
-    )
-
-
-def scatter_of(problem: FitProblem, objective: Residuals, seen: Expansion) -> Float[np.ndarray, "residuals residuals"]:
-    """Covariance of the data residuals of all parts."""
-    each = [residual_covariance(part.target, own, np.asarray(moments.line / moments.power))
-            for part, own, moments in zip(problem.parts, objective.parts, seen.moments, strict=True)]  # fmt: skip
-    return np.asarray(block_diag(*each))
-
-
-def elsewhere(problem: FitProblem, found: Consequences, refit: Refit, sizes: np.ndarray) -> float:
+def elsewhere(ended: Endpoint) -> float:
     """Which share of the posterior has the harmonic further than a bin from where the fit has it; 0 without a free one.
 
-    The lines of `adequacy`'s grid, all else refitted to first order, against the fitted one by its curvature; `sizes` is the
-    covariance of the estimates, larger than the inverse curvature since neighbouring bins correlate: costs count for less.
+    The lines of `adequacy`'s grid, all else refitted to first order, against the fitted one by its curvature. The covariance
+    of the estimates is larger than the inverse curvature, since neighbouring bins correlate: costs count for less.
     """
+    problem, found, refit, sizes = ended.problem, ended.found, ended.refit, ended.covariance
     if not refit.used:
         return 0.0
     (a, f), sd = refit.used, problem.coordinates.sd

@@ -9,9 +9,10 @@ from jaxtyping import PRNGKeyArray
 from jaxmuscle._common.progress import told
 from jaxmuscle.data._as_target import as_target
 from jaxmuscle.data._target import Target
-from jaxmuscle.model._noise import AbstractNoise, BandLimitedNoise
+from jaxmuscle.model._noise import AbstractNoise
 from jaxmuscle.model._rungs import RUNGS, is_base
 from jaxmuscle.model._tasks import AbstractTask, with_noise
+from jaxmuscle.model._white_noise import BandLimitedNoise
 from jaxmuscle.objective._arguments import DT, FitOptions, at_mean, planned
 
 from ._ladder import Models, options_for
@@ -59,10 +60,9 @@ def fit(
     `fix`, values to set, which are then not free; `noise`, a name or an object; `residual`, "log", "linear" or
     "cumulative"; `starts` (100, or 8 for a task without linear response); `seeds` (32, or 48 then; 0: no nonlinear
     correction); `key`, a `jax.random` key or a seed number; `bounds` {name: (low, high)}; `priors` {name: sd in log, or None
-    for a flat one};
-    `coefficient_of_variation`, whether the target's, if it states one, is one more residual (it fixes the scale of the
-    noise); `mean_force` (value, sd) [N] as a further residual, by default the target's if it states its mean in newtons:
-    the task is then carried to it (`at_force`) and P_w is free (False: not used); `max_steps` for each descent;
+    for a flat one}; `coefficient_of_variation`, whether the target's, if it states one, is one more residual (it fixes the
+    scale of the noise); `mean_force` (value, sd) [N] as a further residual, by default the target's if it states its mean in
+    newtons: the task is then carried to it (`at_force`) and P_w is free (False: not used); `max_steps` for each descent;
     `check_seeds` (64, or 200 then; 0: not simulated); `dt` [s], noise grid of a Monte Carlo fit; `progress`, True or a
     function of (text, share); `rungs`, how many richer models may be tried where the base model does not describe the data
     (`on_rung`; 3, or 0 where `noise` or `free` is given); `answer`, a function that gets the result as soon as the search

@@ -10,19 +10,18 @@ from jaxtyping import Float
 from jaxmuscle._common.arrays import as_arrays
 from jaxmuscle._common.programs import kept
 from jaxmuscle._common.text import probability
-from jaxmuscle.model._noise import NoiseSum, ResonantNoise
+from jaxmuscle.model._noise import NoiseSum
 from jaxmuscle.model._parameters import HARMONIC, default
+from jaxmuscle.model._resonant_noise import ResonantNoise
 from jaxmuscle.model._rungs import RUNGS, on_rung
 from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.objective._arguments import FitOptions, Plan
-from jaxmuscle.objective._consequences import Expansion, consequences
+from jaxmuscle.objective._covariance import effective_parameters
 from jaxmuscle.objective._likelihood import log_marginal, measured_bins
-from jaxmuscle.objective._problem import FitProblem
-from jaxmuscle.objective._residuals import Residuals
 from jaxmuscle.objective._starts import starting_points
 
-from ._adequacy import ADEQUATE, judged, scatter_of
-from ._checks import Stage, seen_best
+from ._adequacy import ADEQUATE, Endpoint
+from ._checks import Stage
 from ._harmonic_evidence import SIGNIFICANT, p_value
 
 STARTS = 32
@@ -52,11 +51,12 @@ class Rung(NamedTuple):
 
 
 class Climbed(NamedTuple):
-    """A rung that was fitted: its plan, the stages of its search, what its best point knows of the scatter."""
+    """A rung that was fitted: its plan, the stages of its search, what is known of the scatter, where it ended."""
 
     plan: Plan
     stages: list[Stage]
     known: Any
+    ended: Endpoint
     rung: Rung
 
 
@@ -93,7 +93,8 @@ def climb(first: Plan, models: Models, descend: Descend, keep: Callable[[Climbed
         known = descend(plan, starting_points(plan.problem, plan.starts) if best is None else _warm(plan, best), stages)
         if known is None:
             continue
-        found = Climbed(plan, stages, known, _judged(plan, stages[-1], number))
+        ended = Endpoint.of(plan.problem, stages[-1])
+        found = Climbed(plan, stages, known, ended, _judged(ended, number))
         tried.append(found)
         described = best is not None and best.rung.p >= ADEQUATE
         if best is None or found.rung.aic < best.rung.aic - ALIKE * described:
@@ -116,32 +117,26 @@ def _warm(plan: Plan, best: Climbed) -> Float[np.ndarray, "starts free"]:
     """Starts of a richer model: for the most part what it shares with the best one begins where that ended."""
     problem, before = plan.problem, best.plan.problem
     points = np.array(problem.coordinates.theta(starting_points(problem, min(plan.starts, STARTS))))
-    (task,) = before.tasks_at(seen_best(best.stages[-1].objective, best.stages[-1].minima).theta)
+    (task,) = before.tasks_at(best.ended.seen.theta)
     for column, name in enumerate(problem.coordinates.names):
         if name in before.coordinates.names and problem.coordinates.positive[column]:
             points[: 2 * len(points) // 3, column] = problem.coordinates.theta_of(name, float(task[name]))
     return problem.coordinates.from_theta(points)
 
 
-def _judged(plan: Plan, stage: Stage, number: int) -> Rung:
-    seen = seen_best(stage.objective, stage.minima)
-    verdict = judged(plan.problem, stage.objective, seen)
+def _judged(ended: Endpoint, number: int) -> Rung:
+    verdict = ended.adequacy
     assert verdict is not None
-    (part,) = plan.problem.parts
-    aic, parameters = criterion(plan.problem, stage.objective, seen)
+    (part,) = ended.problem.parts
+    aic, parameters = criterion(ended)
     return Rung(number, RUNGS[number], aic, parameters, verdict.chi2 / (len(part.target.bins) - 1), verdict.p)
 
 
-def criterion(problem: FitProblem, objective: Residuals, seen: Expansion) -> tuple[float, float]:
-    """AIC of the likelihood at a point, and the effective number of parameters, `p = tr(F (F + Λ)⁻¹)`.
-
-    F is the Fisher information of the data, their bins correlated, and Λ the precision of the prior.
-    """
-    found, scatter = consequences(objective, seen), scatter_of(problem, objective, seen)
-    precision = np.linalg.pinv(scatter, rcond=1e-9, hermitian=True)
-    information = found.jacobian.T @ precision @ found.jacobian
-    parameters = float(np.trace(information @ np.linalg.pinv(information + np.diag(problem.prior), hermitian=True)))
-    (part,), moments = problem.parts, seen.moments[0]
+def criterion(ended: Endpoint) -> tuple[float, float]:
+    """AIC of the likelihood where a fit ended, and the effective number of parameters."""
+    found, precision = ended.found, np.linalg.pinv(ended.scatter, rcond=1e-9, hermitian=True)
+    parameters = effective_parameters(found.jacobian.T @ precision @ found.jacobian, ended.problem.prior)
+    (part,), (moments,) = ended.problem.parts, ended.seen.moments
     bins = len(part.target.bins)
     if part.target.segments is None:
         height = -0.5 * float(found.residuals @ precision @ found.residuals)
@@ -176,17 +171,17 @@ def line_or_resonance(
             others = parts[:i] + parts[i + 1 :]
             rest = task.with_parts(noise=NoiseSum(others))
             line = {"harmonic_amplitude": default("harmonic_amplitude"), "harmonic_frequency": float(found.frequency)}
-            aic, other = _aic_of(models.plan_of(rest.replace(**line)), descend)
-            return () if other is None else (told_apart(aic, chosen.aic),)
+            aic = _aic_of(models.plan_of(rest.replace(**line)), descend)
+            return () if aic is None else (told_apart(aic, chosen.aic),)
     return ()
 
 
-def _aic_of(plan: Plan, descend: Descend) -> tuple[float, AbstractTask | None]:
+def _aic_of(plan: Plan, descend: Descend) -> float | None:
+    """What a model reaches; None if no start has a finite spectrum."""
     stages: list[Stage] = []
     if descend(plan, starting_points(plan.problem, min(plan.starts, STARTS)), stages) is None:
-        return np.inf, None
-    seen = seen_best(stages[-1].objective, stages[-1].minima)
-    return criterion(plan.problem, stages[-1].objective, seen)[0], plan.problem.tasks_at(seen.theta)[0]
+        return None
+    return criterion(Endpoint.of(plan.problem, stages[-1]))[0]
 
 
 def told_apart(line: float, resonance: float) -> str:

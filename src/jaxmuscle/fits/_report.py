@@ -12,8 +12,8 @@ from jaxmuscle._common.keys import fold_in
 from jaxmuscle.ensembles._ensemble import ensemble
 from jaxmuscle.model._tasks import AbstractTask, with_active_noise
 from jaxmuscle.objective._arguments import Plan, base_of
-from jaxmuscle.objective._consequences import BANDS, consequences, jackknife, observed
-from jaxmuscle.objective._covariance import Identifiability, common_scales, known_products, parameter_covariance
+from jaxmuscle.objective._consequences import BANDS, jackknife, observed
+from jaxmuscle.objective._covariance import Identifiability, common_scales, known_products
 from jaxmuscle.objective._moment_models import Linear
 from jaxmuscle.objective._problem import FitProblem, Part
 from jaxmuscle.objective._residuals import PartResiduals, further_residuals
@@ -23,7 +23,7 @@ from jaxmuscle.response._second_order import negative_coefficients, second_order
 from jaxmuscle.spectra._bin_law import bin_statistics, standardised, trial_samples
 from jaxmuscle.spectra._settings import WINDOW
 
-from ._adequacy import adequacy, elsewhere, scatter_of
+from ._adequacy import Endpoint, elsewhere
 from ._checks import (
     Stage,
     controlled_moments,
@@ -34,14 +34,12 @@ from ._checks import (
     polish_check,
     polish_notices,
     rivals,
-    seen_best,
     unsettled,
 )
 from ._harmonic_evidence import harmonic_test
 from ._intervals import intervals
 from ._ladder import Rung
 from ._part import FittedPart, Start
-from ._refit import refit_of
 from ._result import FitResult
 from ._tables import (
     correlation_table,
@@ -68,12 +66,14 @@ def report_fit(
     stages: list[Stage],
     ladder: tuple[Rung, ...] = (),
     *,
+    ended: Endpoint | None = None,
     interrupted: bool = False,
     preliminary: bool = False,
 ) -> FitResult:
     """The result of a fit that ended at the best point of the last stage; with no `check_seeds` nothing is simulated.
 
-    Then the second order says whether the linear response holds, unless the result is `preliminary`.
+    Then the second order says whether the linear response holds, unless the result is `preliminary`. `ended` is that point,
+    if it has been looked at already.
     """
     problem, objective, final = plan.problem, stages[-1].objective, stages[-1].minima
     first = stages[0].minima
@@ -85,7 +85,8 @@ def report_fit(
               "versions": versions(), "ladder": ladder}  # fmt: skip
     if not np.isfinite(final.cost[final.best]):
         return _failed(problem, common, _not_finite(problem))
-    seen = seen_best(objective, final)
+    ended = Endpoint.of(problem, stages[-1]) if ended is None else ended
+    seen = ended.seen
     theta, tasks = seen.theta, problem.tasks_at(seen.theta)
     try:
         for part, moments in zip(problem.parts, seen.moments, strict=True):
@@ -97,14 +98,11 @@ def report_fit(
                 for part, task, moments in zip(problem.parts, tasks, seen.moments, strict=True)]  # fmt: skip
     except (SimulationError, ValueError) as error:
         return _failed(problem, common, f"the fitted task cannot be simulated: {error}")
-    found = consequences(objective, seen)
+    found = ended.found
     made = [m._replace(each=m.each._replace(line=np.tile(np.minimum(x.line, np.mean(m.each.power, axis=0)),
                                                          (len(m.each.mean), 1))))
             for m, x in zip(made, seen.moments, strict=True)]  # fmt: skip
-    scatter = scatter_of(problem, objective, seen)
-    refit = refit_of(problem, objective, seen, found)
-    judgement = adequacy(problem, objective, found, refit, scatter)
-    covariance = parameter_covariance(found.jacobian, scatter, problem.prior)
+    judgement, covariance = ended.adequacy, ended.covariance
     known = Identifiability.of_covariance(covariance)
     success, message = convergence(
         final, found.residuals, found.jacobian, problem.prior, theta, known, starts, plan.max_steps
@@ -118,7 +116,7 @@ def report_fit(
     c = problem.coordinates
     products = tuple(known_products(c.names, c.positive, c.sd, known))
     other, moved = rivals(problem, stages[0] if problem.method == "linear" else stages[-1], parameters | derived)
-    share = elsewhere(problem, found, refit, covariance)
+    share = elsewhere(ended)
     if share > UNSETTLED:
         moved |= {n for n in parameters | derived if base_of(n).startswith("harmonic_")}
         other += (f"the harmonic may lie elsewhere or be too faint to be seen: {100 * share:.0f} % of the posterior is more "

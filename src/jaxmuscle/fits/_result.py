@@ -17,7 +17,8 @@ from jaxmuscle._common.tables import frame
 from jaxmuscle._common.text import choices, folded, probability
 from jaxmuscle.data._target import Target
 from jaxmuscle.model._tasks import AbstractTask
-from jaxmuscle.objective._consequences import derived_names
+from jaxmuscle.objective._arguments import base_of
+from jaxmuscle.objective._consequences import BANDS, derived_names
 
 from ._adequacy import Adequacy
 from ._ladder import HEAD, Rung
@@ -227,7 +228,10 @@ class FitResult(eqx.Module):
         every = self.found
         shown = self.determined
         intervals = any(p.interval is not None for p in shown.values())
-        lines += _table("determined by the data", shown, " 95 % interval  " * intervals)
+        in_bands = {name: p for name, p in shown.items() if base_of(name) in BANDS}
+        rows = {name: p for name, p in shown.items() if name not in in_bands}
+        lines += _table("determined by the data", rows, " 95 % interval  " * intervals)
+        lines += [f"  {sentence}" for sentence in _by_band(in_bands)]
         fixed = [name for name in self.products if name not in self.parameters]
         lines += [f"  they also fix, roughly: {', '.join(fixed)}"] if fixed else []
         loose = {name: p for name, p in every.items() if name not in shown and p.free}
@@ -250,6 +254,16 @@ def _table(title: str, table: dict[str, Estimate], column: str = "") -> list[str
         interval = f"{p.interval_in_words():<18}" if column else ""
         lines.append(f"    {name:<{wide}}{p.in_words():<20}{interval}{unit}".rstrip())
     return lines if table else [*lines, "    nothing"]
+
+
+def _by_band(table: dict[str, Estimate]) -> list[str]:
+    """The shares of power in bands, a sentence for each target."""
+    said: dict[str, list[str]] = {}
+    for name, p in table.items():
+        band, _, whose = name.partition("@")
+        low, high = BANDS[band]
+        said.setdefault(f" of {whose}" if whose else "", []).append(f"{low:g}-{high:g} Hz {100 * p.value:.2g} %")
+    return [f"power by band{whose}: {', '.join(each)}" for whose, each in said.items()]
 
 
 def _per_newton(result: FitResult) -> str:

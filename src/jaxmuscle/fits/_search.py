@@ -21,6 +21,7 @@ from jaxmuscle.objective._starts import contenders, recombined, starting_points
 from jaxmuscle.response._expected import Moments
 from jaxmuscle.response._linearised import settled
 
+from ._adequacy import Endpoint
 from ._checks import Stage, controlled_moments, seen_best
 from ._ladder import Climbed, Models, Rung, climb, line_or_resonance
 from ._report import UNCHECKED, report_fit
@@ -44,8 +45,8 @@ class FitInterrupted(KeyboardInterrupt):
 def search(plan: Plan, answer: Callable[[FitResult], None] | None = None, models: Models | None = None) -> FitResult:
     """From the starting points to a result; Ctrl-C ends it with what had been reached.
 
-    `answer` gets the result before its checks. Ctrl-C in these keeps it. Of richer `models` one
-    after the other is tried until one describes the data.
+    `answer` gets the result before its checks; Ctrl-C in these keeps it. Of richer `models` one after the other is tried
+    until one describes the data.
     """
     problem = plan.problem
     stages: list[Stage] = []
@@ -74,26 +75,34 @@ def search(plan: Plan, answer: Callable[[FitResult], None] | None = None, models
         raise KeyboardInterrupt("fit interrupted before its first step")
     if interrupted:
         raise FitInterrupted(_unchecked(plan, stages, ladder, interrupted=True))
-    problem = plan.problem
+    problem, ended = plan.problem, Endpoint.of(plan.problem, stages[-1])
     if answer is not None:
-        found = _unchecked(plan, stages, ladder)
+        found = _unchecked(plan, stages, ladder, ended)
         later = tuple(n for n in found.notices if n != UNCHECKED) if plan.check_seeds else found.notices
         answer(dataclasses.replace(found, notices=later))
     try:
         problem.tell("checking on fresh seeds" if plan.check_seeds else "reporting", 0.8)
-        result = report_fit(plan, stages, ladder)
+        result = report_fit(plan, stages, ladder, ended=ended)
         if models is not None and result.success:
             said = line_or_resonance(plan, result.task, ladder, models, _descended)
             result = dataclasses.replace(result, notices=(*result.notices, *said))
     except KeyboardInterrupt:
-        raise FitInterrupted(_unchecked(plan, stages, ladder)) from None
+        raise FitInterrupted(_unchecked(plan, stages, ladder, ended)) from None
     problem.tell("done", 1.0)
     return result
 
 
-def _unchecked(plan: Plan, stages: list[Stage], ladder: tuple[Rung, ...], *, interrupted: bool = False) -> FitResult:
+def _unchecked(
+    plan: Plan,
+    stages: list[Stage],
+    ladder: tuple[Rung, ...],
+    ended: Endpoint | None = None,
+    *,
+    interrupted: bool = False,
+) -> FitResult:
     """The result before anything is simulated to check it."""
-    return report_fit(plan._replace(check_seeds=0), stages, ladder, interrupted=interrupted, preliminary=True)
+    plan = plan._replace(check_seeds=0)
+    return report_fit(plan, stages, ladder, ended=ended, interrupted=interrupted, preliminary=True)
 
 
 def search_together(plans: list[Plan], tell: Callable[[str, float], None]) -> list[FitResult]:

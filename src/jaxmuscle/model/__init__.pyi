@@ -7,17 +7,14 @@ from ._muscle import Muscle as Muscle
 from ._muscle import QuadraticDamping as QuadraticDamping
 from ._muscle import QuadraticStiffness as QuadraticStiffness
 from ._noise import AbstractNoise as AbstractNoise
-from ._noise import BandLimitedNoise as BandLimitedNoise
 from ._noise import NoiseSum as NoiseSum
-from ._noise import OrnsteinUhlenbeckNoise as OrnsteinUhlenbeckNoise
-from ._noise import ResonantNoise as ResonantNoise
-from ._noise import WhiteNoise as WhiteNoise
 from ._parameters import PARAMETERS as PARAMETERS
 from ._parameters import Parameter as Parameter
 from ._partition import partition as partition
 from ._pink_noise import PinkNoise as PinkNoise
 from ._presets import load_preset as load_preset
 from ._presets import save_preset as save_preset
+from ._resonant_noise import ResonantNoise as ResonantNoise
 from ._rungs import on_rung as on_rung
 from ._signals import AbstractSignal as AbstractSignal
 from ._signals import Constant as Constant
@@ -31,3 +28,6 @@ from ._tasks import AbstractTask as AbstractTask
 from ._tasks import Isometric as Isometric
 from ._tasks import PrescribedForce as PrescribedForce
 from ._tasks import PrescribedMotion as PrescribedMotion
+from ._white_noise import BandLimitedNoise as BandLimitedNoise
+from ._white_noise import OrnsteinUhlenbeckNoise as OrnsteinUhlenbeckNoise
+from ._white_noise import WhiteNoise as WhiteNoise

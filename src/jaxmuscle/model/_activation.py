@@ -3,16 +3,15 @@
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
 from jaxmuscle._common.arrays import require
+from jaxmuscle._common.quadrature import NODES, WEIGHTS
 from jaxmuscle._common.types import Scalar
 
 from ._parameters import default
 
 ACTIVE = (0, 2, 4)  # K_w, C_w and P_w among the inputs: those of the active tissue
-NODES, WEIGHTS = np.polynomial.legendre.leggauss(12)
 
 
 class Activation(eqx.Module):
@@ -40,8 +39,9 @@ class Activation(eqx.Module):
         """Values and slopes of what comes out, from rest; what goes in runs straight from `before` to `after` in a step."""
         x = jnp.asarray(dt / self.time, before.dtype)
         fade = jnp.exp(-x)
-        y = 0.5 * x * (1 - jnp.asarray(NODES, x.dtype))  # time left in the step
-        weight, share = 0.5 * x * jnp.asarray(WEIGHTS, x.dtype) * jnp.exp(-y), jnp.asarray(0.5 * (1 + NODES), x.dtype)
+        share = jnp.asarray(NODES, x.dtype)
+        y = x * (1 - share)  # time left in the step
+        weight = x * jnp.asarray(WEIGHTS, x.dtype) * jnp.exp(-y)
         late, late_slope = jnp.sum(weight * y * share), jnp.sum(weight * (1 - y) * share)
         early, early_slope = jnp.sum(weight * y * (1 - share)), jnp.sum(weight * (1 - y) * (1 - share))
 

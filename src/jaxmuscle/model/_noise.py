@@ -1,4 +1,4 @@
-"""Random perturbations: white, band-limited, Ornstein-Uhlenbeck and resonant noise and their sums, exact on the grid."""
+"""Random perturbations: what every noise has, and sums of noises."""
 
 import abc
 from typing import Any, ClassVar
@@ -12,7 +12,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from jaxmuscle._common.arrays import require
 from jaxmuscle._common.types import Scalar
 
-from ._parameters import CHANNELS, INPUTS, PARAMETERS, default
+from ._parameters import CHANNELS, INPUTS, default
 
 Amplitude = Scalar | tuple | list | dict | None
 
@@ -44,7 +44,7 @@ class AbstractNoise(eqx.Module):
 
     `amplitude` is one number for the four coefficients; or four; or five, the last for the drive; or a mapping by name. It
     is a fraction of the base coefficient (`relative`) or in its unit [N/m, N s/m]; that of the drive is a fraction of P_w.
-    `smoothness`: 0 white (has no values), 1 continuous, 2 differentiable.
+    `smoothness`: 0 white (has no values), 1 continuous, 2 differentiable. `sort` begins the names of its parameters.
 
     Noises add: `BandLimitedNoise() + ResonantNoise()`.
     """
@@ -53,6 +53,7 @@ class AbstractNoise(eqx.Module):
     relative: eqx.AbstractVar[bool]
     shared: eqx.AbstractVar[bool]
     smoothness: ClassVar[int]
+    sort: ClassVar[str] = "noise"
 
     @abc.abstractmethod
     def density(self, f: Scalar) -> Scalar:
@@ -144,253 +145,6 @@ def check_amplitude(noise: AbstractNoise) -> None:
     require(noise.amplitude >= 0, f"noise amplitude {noise.amplitude} must not be negative")
 
 
-class WhiteNoise(AbstractNoise):
-    """White noise whose samples at `rate` have standard deviation `amplitude`: two-sided density `amplitude² / rate`.
-
-    The convention of a Simulink band-limited white noise block with that sample rate. In the stochastic differential
-    equation its diffusion is `amplitude / √rate`, in the Stratonovich sense (the limit of band-limited noise).
-
-    **Arguments:** `amplitude` (see `AbstractNoise`), `rate` [Hz] > 0, `relative`, `shared`.
-    """
-
-    amplitude: Scalar = eqx.field(converter=as_amplitude, default=None)
-    rate: Scalar = 100.0
-    relative: bool = eqx.field(static=True, default=True)
-    shared: bool = eqx.field(static=True, default=False)
-    smoothness: ClassVar[int] = 0
-
-    def __check_init__(self):
-        check_amplitude(self)
-        require(self.rate > 0, f"noise rate = {self.rate} Hz must be positive")
-
-    def density(self, f: Scalar) -> Scalar:
-        return jnp.ones_like(f) / self.rate
-
-    def draw(self, key: PRNGKeyArray, steps: int) -> Float[Array, "..."]:
-        return standard_normals(key, (steps, self.channels))
-
-    def realise(self, normals: Float[Array, "..."], dt: Scalar) -> Realisation:
-        return Realisation(increments=normals * jnp.sqrt(dt / self.rate))
-
-    def shaping_filter(self) -> ShapingFilter:
-        direct = 1 / jnp.sqrt(jnp.asarray(self.rate))
-        return ShapingFilter(jnp.zeros((0, 0)), jnp.zeros((0, 1)), jnp.zeros(0), direct[None])
-
-    def check_step(self, dt: float) -> None:
-        pass
-
-
-class BandLimitedNoise(AbstractNoise):
-    """White noise through a second-order Butterworth low-pass, `density = 1 / rate / (1 + (f / cutoff)⁴)`.
-
-    `N'' + √2 ω N' + ω² N = ω² w`, ω = 2π cutoff, w white of density amplitude² / rate: the same in-band density as
-    `WhiteNoise`, with differentiable paths. The two states per channel are advanced by their exact transition.
-
-    **Arguments:** `amplitude` (see `AbstractNoise`; the standard deviation that a white noise of the same in-band density
-    has when sampled at `rate`), `rate` [Hz], `cutoff` [Hz], `relative`, `shared`.
-    """
-
-    amplitude: Scalar = eqx.field(converter=as_amplitude, default=None)
-    rate: Scalar = 100.0
-    cutoff: Scalar = default("noise_cutoff")
-    relative: bool = eqx.field(static=True, default=True)
-    shared: bool = eqx.field(static=True, default=False)
-    smoothness: ClassVar[int] = 2
-
-    def __check_init__(self):
-        check_amplitude(self)
-        require(self.rate > 0, f"noise rate = {self.rate} Hz must be positive")
-        require(self.cutoff > 0, f"noise_cutoff = {self.cutoff} Hz must be positive")
-
-    def density(self, f: Scalar) -> Scalar:
-        return 1 / self.rate / (1 + (f / self.cutoff) ** 4)
-
-    def draw(self, key: PRNGKeyArray, steps: int) -> Float[Array, "..."]:
-        return standard_normals(key, (steps + 1, 2 * self.channels))
-
-    def realise(self, normals: Float[Array, "..."], dt: Scalar) -> Realisation:
-        omega = 2 * jnp.pi * self.cutoff
-        p = omega * dt / np.sqrt(2)
-        fade, c, s = jnp.exp(-p), jnp.cos(p), jnp.sin(p)
-        # Transition of (N, N'/ω), both scaled to unit stationary variance; its process noise is I - F Fᵀ = L Lᵀ.
-        f11, f12, f21, f22 = fade * (c + s), fade * np.sqrt(2) * s, -fade * np.sqrt(2) * s, fade * (c - s)
-        l11 = jnp.sqrt(1 - f11**2 - f12**2)
-        l21 = -(f11 * f21 + f12 * f22) / l11
-        l22 = jnp.sqrt(1 - f21**2 - f22**2 - l21**2)
-
-        def advance(state, kick):
-            n, slope = state
-            first, second = jnp.split(kick, 2)
-            new = f11 * n + f12 * slope + l11 * first, f21 * n + f22 * slope + l21 * first + l22 * second
-            return new, new
-
-        # Two outputs, so that XLA leaves the slopes out where nobody asks for them.
-        start = jnp.split(normals[0], 2)
-        _, (n, slope) = jax.lax.scan(advance, (start[0], start[1]), normals[1:])
-        std = jnp.sqrt(omega / (2 * np.sqrt(2) * self.rate))
-        values, slopes = jnp.concatenate([start[0][None], n]), jnp.concatenate([start[1][None], slope])
-        return Realisation(values=std * values, slopes=std * omega * slopes)
-
-    def shaping_filter(self) -> ShapingFilter:
-        # States (N, N'/ω), so that both have the same scale.
-        omega = 2 * jnp.pi * jnp.asarray(self.cutoff)
-        F = omega * jnp.array([[0.0, 1.0], [-1.0, -np.sqrt(2)]])
-        G = jnp.stack([0 * omega, omega])[:, None] / jnp.sqrt(self.rate)
-        return ShapingFilter(F, G, jnp.array([1.0, 0.0]), jnp.zeros(1))
-
-    def check_step(self, dt: float) -> None:
-        require(
-            self.cutoff * dt <= 0.25,
-            f"dt = {dt} s is too coarse for noise_cutoff = {self.cutoff} Hz: use dt <= 0.25 / noise_cutoff",
-        )
-
-
-class OrnsteinUhlenbeckNoise(AbstractNoise):
-    """`dN = -N/τ dt + std √(2/τ) dW`, `density = 2 τ / (1 + (2π f τ)²)` times std².
-
-    Continuous, not differentiable. **Arguments:** `std` (stationary standard deviation, see `AbstractNoise`),
-    `correlation_time` τ [s] > 0, `relative`, `shared`.
-    """
-
-    amplitude: Scalar = eqx.field(converter=as_amplitude)
-    correlation_time: Scalar
-    relative: bool = eqx.field(static=True)
-    shared: bool = eqx.field(static=True)
-    smoothness: ClassVar[int] = 1
-
-    def __init__(
-        self,
-        std: Amplitude = None,
-        correlation_time: Scalar = PARAMETERS["noise_correlation_time"].default,
-        *,
-        relative: bool = True,
-        shared: bool = False,
-    ):
-        self.amplitude, self.correlation_time = std, correlation_time
-        self.relative, self.shared = relative, shared
-
-    def __check_init__(self):
-        check_amplitude(self)
-        require(self.correlation_time > 0, f"noise_correlation_time = {self.correlation_time} s must be positive")
-
-    def density(self, f: Scalar) -> Scalar:
-        return 2 * self.correlation_time / (1 + (2 * jnp.pi * f * self.correlation_time) ** 2)
-
-    def draw(self, key: PRNGKeyArray, steps: int) -> Float[Array, "..."]:
-        return standard_normals(key, (steps + 1, self.channels))
-
-    def realise(self, normals: Float[Array, "..."], dt: Scalar) -> Realisation:
-        x = dt / self.correlation_time
-        keep, kick = jnp.exp(-x), jnp.sqrt(-jnp.expm1(-2 * x))
-
-        def advance(n, normal):
-            n = keep * n + kick * normal
-            return n, n
-
-        _, later = jax.lax.scan(advance, normals[0], normals[1:])
-        return Realisation(values=jnp.concatenate([normals[:1], later]))
-
-    def shaping_filter(self) -> ShapingFilter:
-        rate = 1 / jnp.asarray(self.correlation_time)
-        return ShapingFilter(-rate[None, None], jnp.sqrt(2 * rate)[None, None], jnp.ones(1), jnp.zeros(1))
-
-    def check_step(self, dt: float) -> None:
-        require(
-            dt <= 0.5 * self.correlation_time,
-            f"dt = {dt} s is too coarse for noise_correlation_time = {self.correlation_time} s: use at most half of it",
-        )
-
-
-NODES, WEIGHTS = (0.5 * (1 + x) if i == 0 else 0.5 * x for i, x in enumerate(np.polynomial.legendre.leggauss(8)))
-
-
-def exact_step(made: ShapingFilter, dt: Scalar) -> tuple[Float[Array, "states states"], Float[Array, "states states"]]:
-    """Transition Φ = exp(F dt) of a filter over a step, and L with `L Lᵀ = ∫ exp(F s) G Gᵀ exp(Fᵀ s) ds` over it.
-
-    By Gauss-Legendre quadrature, a sum of squares: of `P - Φ P Φᵀ` short steps leave no digits in single precision.
-    """
-    size = len(made.F)
-    steps = jax.vmap(jax.scipy.linalg.expm)(made.F * dt * jnp.append(jnp.asarray(NODES, made.F.dtype), 1.0)[:, None, None])
-    kicks = jnp.moveaxis(steps[:-1] @ made.G * jnp.sqrt(dt * jnp.asarray(WEIGHTS, made.F.dtype))[:, None, None], 0, 1)
-    kicks = kicks.reshape(size, -1)
-    # Rows of unit length, so that rounding is relative to each.
-    scale = jnp.sqrt(jnp.sum(kicks**2, axis=1))
-    unit = kicks / scale[:, None]
-    return steps[-1], scale[:, None] * jnp.linalg.cholesky(unit @ unit.T)
-
-
-class ResonantNoise(AbstractNoise):
-    """A tremor: white noise through a resonance, `S(f) = std² (b/π) f² / ((f0² - f²)² + b² f²)`, ∫ S df = std².
-
-    Two-sided density, f0 the `frequency` and b the `width`: the full width at half power. Without power at 0. In the time
-    domain `N' = -2πb N - 2πf0 q + std √(4πb) w`, `q' = 2πf0 N`; N and q have the variance std². As b → 0 it becomes a line
-    whose phase and amplitude are random (Rayleigh). Continuous, not differentiable.
-
-    **Arguments:** `std`, the standard deviation: one number is that of the drive, a fraction of P_w; four or five, or a
-    mapping, as in `AbstractNoise`; `frequency` [Hz] > 0, `width` [Hz] > 0; `relative`, `shared`.
-    """
-
-    amplitude: Scalar = eqx.field(converter=as_amplitude)
-    frequency: Scalar
-    width: Scalar
-    relative: bool = eqx.field(static=True)
-    shared: bool = eqx.field(static=True)
-    smoothness: ClassVar[int] = 1
-    _channels_of_one_number: ClassVar[int] = 1
-
-    def __init__(
-        self,
-        std: Amplitude = PARAMETERS["resonance_amplitude"].default,
-        frequency: Scalar = PARAMETERS["resonance_frequency"].default,
-        width: Scalar = PARAMETERS["resonance_width"].default,
-        *,
-        relative: bool = True,
-        shared: bool = False,
-    ):
-        self.amplitude, self.frequency, self.width = std, frequency, width
-        self.relative, self.shared = relative, shared
-
-    def __check_init__(self):
-        check_amplitude(self)
-        require(self.frequency > 0, f"resonance_frequency = {self.frequency} Hz must be positive")
-        require(self.width > 0, f"resonance_width = {self.width} Hz must be positive")
-
-    def density(self, f: Scalar) -> Scalar:
-        b2 = self.width**2 * f**2
-        return self.width / jnp.pi * f**2 / ((self.frequency**2 - f**2) ** 2 + b2)
-
-    def draw(self, key: PRNGKeyArray, steps: int) -> Float[Array, "..."]:
-        return standard_normals(key, (steps + 1, 2, self.channels))
-
-    def realise(self, normals: Float[Array, "..."], dt: Scalar) -> Realisation:
-        made = jax.tree.map(lambda x: x.astype(normals.dtype), self.shaping_filter())
-        step, kick = exact_step(made, dt)
-
-        def advance(state, normal):
-            (q, n), (first, second) = state, normal
-            new = (
-                step[0, 0] * q + step[0, 1] * n + kick[0, 0] * first,
-                (step[1, 0] * q + step[1, 1] * n + kick[1, 0] * first + kick[1, 1] * second),
-            )
-            return new, new[1]
-
-        _, later = jax.lax.scan(advance, (normals[0, 0], normals[0, 1]), normals[1:])
-        return Realisation(values=jnp.concatenate([normals[:1, 1], later]))
-
-    def shaping_filter(self) -> ShapingFilter:
-        omega, rate = 2 * jnp.pi * jnp.asarray(self.frequency), 2 * jnp.pi * jnp.asarray(self.width)
-        none = jnp.zeros_like(omega + rate)
-        F = jnp.stack([jnp.stack([none, omega]), jnp.stack([-omega, -rate])])
-        return ShapingFilter(F, jnp.stack([none, jnp.sqrt(2 * rate)])[:, None], jnp.array([0.0, 1.0]), jnp.zeros(1))
-
-    def check_step(self, dt: float) -> None:
-        require(
-            (self.frequency + self.width) * dt <= 0.1,
-            f"dt = {dt} s is too coarse for a resonance at {self.frequency} Hz, {self.width} Hz wide: use "
-            "dt <= 0.1 / (resonance_frequency + resonance_width)",
-        )
-
-
 class NoiseSum(AbstractNoise):
     """A sum of independent noises, its `parts`, each with amplitudes of its own. Made by `+`."""
 
@@ -425,11 +179,6 @@ class NoiseSum(AbstractNoise):
         """Whether all parts are."""
         return all(part.shared for part in self.parts)
 
-    @property
-    def smoothness(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """That of the roughest part."""
-        return min(part.smoothness for part in self.parts)
-
     def density(self, f: Scalar) -> Scalar:
         raise ValueError("a sum of noises has no density of unit amplitude: ask its components, or psd(f)")
 
@@ -439,13 +188,6 @@ class NoiseSum(AbstractNoise):
         for part in self.parts:
             rows = rows.at[jnp.array(part.acts_on)].add(part.psd(f))
         return rows
-
-    def per_channel(self) -> "NoiseSum":
-        return self
-
-    @property
-    def channels(self) -> int:
-        return sum(part.channels for part in self.parts)
 
     def draw(self, key: PRNGKeyArray, steps: int) -> Any:
         # The first part draws what it would draw alone, so that a tremor can be added to a path.

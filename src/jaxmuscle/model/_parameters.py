@@ -1,5 +1,6 @@
 """The one table of parameters: symbol, unit, default, bounds, prior and source; and how a name finds its value."""
 
+import collections
 import dataclasses
 import math
 from typing import Any, NamedTuple
@@ -150,14 +151,13 @@ def paths_of(task: Any) -> dict[str, tuple]:
 def _noise_paths(noise: Any) -> dict[str, tuple]:
     """Of a sum: `noise_` and `resonance_`, then `noise_2_` and so on for further ones of the same sort."""
     paths: dict[str, tuple] = {}
-    counts = {"noise": 0, "resonance": 0}
+    counts = collections.Counter()
     for i, part in enumerate(noise.components):
-        sort = "resonance" if hasattr(part, "width") else "noise"
-        counts[sort] += 1
-        first = f"{sort}_" if counts[sort] == 1 else f"{sort}_{counts[sort]}_"
+        counts[part.sort] += 1
+        first = f"{part.sort}_" if counts[part.sort] == 1 else f"{part.sort}_{counts[part.sort]}_"
         here = ("noise",) if part is noise else ("noise", "parts", i)
         inputs = [INPUTS[k] for k in part.acts_on]
-        if sort == "resonance" and len(inputs) == 1:
+        if part.sort == "resonance" and len(inputs) == 1:
             inputs = ["amplitude"]
         paths |= {f"{first}{name}": (*here, "amplitude", k) for k, name in enumerate(inputs)}
         others = [field for field, value in _dynamic_fields(part) if field != "amplitude" and _is_scalar(value)]

@@ -17,21 +17,16 @@ from jaxmuscle._common.files import write_text
 from jaxmuscle._common.text import choices
 from jaxmuscle.spectra._settings import SpectrumSettings
 
-from . import _activation, _muscle, _noise
-from . import _muscle as _law
-from . import _pink_noise as _pink
-from . import _signals as _harmonic
-from . import _signals as _signal
-from . import _tasks as _task
+from . import _activation, _muscle, _noise, _pink_noise, _resonant_noise, _signals, _tasks, _white_noise
 from ._tasks import TASKS, AbstractTask
 
 _KINDS: dict[str, type] = {
     kind.__name__: kind
-    for module in (_activation, _harmonic, _law, _muscle, _noise, _pink, _signal, _task)
+    for module in (_activation, _muscle, _noise, _pink_noise, _resonant_noise, _signals, _tasks, _white_noise)
     for kind in vars(module).values()
     if isinstance(kind, type) and issubclass(kind, eqx.Module) and not kind.__name__.startswith("Abstract")
 }
-_BASES = (_muscle.AbstractMuscle, _law.AbstractLaw, _noise.AbstractNoise, _signal.AbstractSignal)
+_BASES = (_muscle.AbstractMuscle, _muscle.AbstractLaw, _noise.AbstractNoise, _signals.AbstractSignal)
 _NAMES = {kind: name for name, kind in TASKS.items()}
 
 
@@ -90,7 +85,7 @@ def _build(kind: type, table: dict[str, Any], where: str) -> Any:
         values[key] = _from_table(key, value, f"{where}.{key}")
         if not _fits(fields[key].type, values[key]):
             raise PresetError(f"{where}.{key} = {value!r} is of the wrong kind")
-    if kind in (_noise.OrnsteinUhlenbeckNoise, _noise.ResonantNoise, _pink.PinkNoise):
+    if kind in (_white_noise.OrnsteinUhlenbeckNoise, _resonant_noise.ResonantNoise, _pink_noise.PinkNoise):
         values["std"] = values.pop("amplitude", None)
     try:
         return kind(**values)
@@ -104,7 +99,7 @@ def _fits(kind: Any, value: Any) -> bool:
         kind = get_args(kind)[0]
     if isinstance(kind, type) and issubclass(kind, eqx.Module):
         number = isinstance(value, int | float) and not isinstance(value, bool)
-        return isinstance(value, kind) or (kind is _signal.AbstractSignal and number)
+        return isinstance(value, kind) or (kind is _signals.AbstractSignal and number)
     if kind is bool or isinstance(value, bool):
         return kind is bool and isinstance(value, bool)
     return isinstance(value, str) == (get_origin(kind) is Literal) and not isinstance(value, eqx.Module)

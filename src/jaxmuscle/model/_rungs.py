@@ -1,8 +1,8 @@
 """The models that a fit tries one after the other."""
 
 from ._activation import Activation
-from ._noise import ResonantNoise
 from ._parameters import default
+from ._resonant_noise import ResonantNoise
 from ._tasks import AbstractTask
 
 RUNGS = (
@@ -13,12 +13,12 @@ RUNGS = (
 )
 
 
-def on_rung(task: AbstractTask, rung: int, *, harmonic: bool = False) -> AbstractTask:
+def on_rung(task: AbstractTask, rung: int) -> AbstractTask:
     """The task with what measured force asks for beyond the base model, by `rung`:
 
     0, as it is; 1, with an `Activation` between the nervous drive and the active tissue; 2, with a `ResonantNoise` on the
     drive as well, the tremor, instead of the harmonic; 3, with a second resonance. Each begins at the default of the
-    parameter table. `harmonic` keeps the harmonic beside the resonances.
+    parameter table.
 
     **Raises:** `ValueError` for other rungs, and for a task that has an activation or a resonance already.
     """
@@ -31,7 +31,7 @@ def on_rung(task: AbstractTask, rung: int, *, harmonic: bool = False) -> Abstrac
     for which in ("resonance", "resonance_2")[: max(rung - 1, 0)]:
         values = (default(f"{which}_{what}") for what in ("amplitude", "frequency", "width"))
         task = task.with_parts(noise=task.noise + ResonantNoise(*values))
-    return task.replace(harmonic_amplitude=0.0) if rung >= 2 and not harmonic else task
+    return task.replace(harmonic_amplitude=0.0) if rung >= 2 else task
 
 
 def is_base(task: AbstractTask) -> bool:

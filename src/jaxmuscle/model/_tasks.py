@@ -18,10 +18,12 @@ from jaxmuscle.spectra._settings import SpectrumSettings
 
 from ._activation import ACTIVE, Activation
 from ._muscle import AbstractMuscle, Muscle, Perturbation
-from ._noise import AbstractNoise, BandLimitedNoise, NoiseSum, OrnsteinUhlenbeckNoise, ResonantNoise, WhiteNoise
+from ._noise import AbstractNoise, NoiseSum
 from ._parameters import CHANNELS, INPUTS, default, get_parameter, paths_of, set_parameters
 from ._pink_noise import PinkNoise
+from ._resonant_noise import ResonantNoise
 from ._signals import AbstractSignal, Harmonic, as_signal, derivatives
+from ._white_noise import BandLimitedNoise, OrnsteinUhlenbeckNoise, WhiteNoise
 
 NOISES: dict[str, type[AbstractNoise]] = {
     "white": WhiteNoise,

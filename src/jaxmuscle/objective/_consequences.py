@@ -9,8 +9,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxmuscle._common.programs import kept
-from jaxmuscle.model._noise import ResonantNoise
 from jaxmuscle.model._parameters import PARAMETERS, USUALLY_FREE
+from jaxmuscle.model._resonant_noise import ResonantNoise
 from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.response._expected import Moments
 from jaxmuscle.spectra._fluctuations import BANDS

@@ -79,6 +79,16 @@ def parameter_covariance(
     return gain @ (jacobian.T @ residual_covariance @ jacobian + prior) @ gain
 
 
+def effective_parameters(
+    information: Float[np.ndarray, "parameters parameters"], prior_precision: Float[np.ndarray, " parameters"]
+) -> float:
+    """`p = tr(F (F + Λ)⁻¹)`, F the Fisher information of the data: how many parameters they determine.
+
+    Murata, Yoshizawa & Amari 1994, doi:10.1109/72.329683.
+    """
+    return float(np.trace(information @ np.linalg.pinv(information + np.diag(prior_precision), hermitian=True)))
+
+
 SCALES = (
     (
         "all noise amplitudes and the harmonic's can be scaled together",

@@ -9,7 +9,8 @@ import numpy as np
 import scipy
 from jaxtyping import Array, Float, Int
 
-from jaxmuscle.model._noise import Realisation, ResonantNoise
+from jaxmuscle.model._noise import Realisation
+from jaxmuscle.model._resonant_noise import ResonantNoise
 from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.response._equilibrium import slowest, slowest_rate
 from jaxmuscle.response._expected import Moments, expected_moments, response

@@ -12,8 +12,8 @@ from jaxtyping import Float
 
 from jaxmuscle._common.arrays import all_concrete, as_arrays, as_numbers, is_concrete
 from jaxmuscle.data._target import Target
-from jaxmuscle.model._noise import ResonantNoise
 from jaxmuscle.model._parameters import paths_of
+from jaxmuscle.model._resonant_noise import ResonantNoise
 from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.response._equilibrium import fastest_rate
 from jaxmuscle.response._expected import Moments, log_variation_sd

@@ -7,10 +7,10 @@ from jaxtyping import Float
 
 from jaxmuscle.ensembles._ensemble import ensemble
 from jaxmuscle.model._muscle import Muscle
-from jaxmuscle.model._noise import BandLimitedNoise
 from jaxmuscle.model._parameters import CHANNELS
 from jaxmuscle.model._signals import Harmonic, Sampled
 from jaxmuscle.model._tasks import AbstractTask, Isometric, PrescribedForce, PrescribedMotion
+from jaxmuscle.model._white_noise import BandLimitedNoise
 from jaxmuscle.response._expected import expected_moments
 from jaxmuscle.spectra._measures import peaks
 from jaxmuscle.spectra._settings import WINDOW, SpectrumSettings

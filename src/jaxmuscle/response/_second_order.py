@@ -14,9 +14,10 @@ from jaxmuscle._common.arrays import as_arrays
 from jaxmuscle._common.errors import FirstOrderWarning
 from jaxmuscle._common.programs import kept
 from jaxmuscle.model._activation import ACTIVE
-from jaxmuscle.model._noise import BandLimitedNoise, ShapingFilter, WhiteNoise
+from jaxmuscle.model._noise import ShapingFilter
 from jaxmuscle.model._parameters import CHANNELS, INPUTS
 from jaxmuscle.model._tasks import AbstractTask
+from jaxmuscle.model._white_noise import BandLimitedNoise, WhiteNoise
 from jaxmuscle.spectra._settings import WINDOW, SpectrumSettings
 
 from ._equilibrium import HOLD

@@ -1,4 +1,4 @@
-"""Transfer functions from the harmonic, and from the noise of the active tissue, to the output."""
+"""Transfer functions from one signal, the harmonic or noise on the active tissue, to the output."""
 
 from typing import NamedTuple
 
@@ -25,8 +25,8 @@ def times_i(x: Float[Array, "*any"]) -> Complex[Array, "*any"]:
     return jax.lax.complex(jnp.zeros_like(x), x)
 
 
-class HarmonicSystem(NamedTuple):
-    """`y' = A y + b h`, `z = c y + d h + e h'`: the output's response to a harmonic h of amplitude 1, on all its inputs."""
+class SignalSystem(NamedTuple):
+    """`y' = A y + b h`, `z = c y + d h + e h'`: the output's response to one signal h, on all the inputs that it moves."""
 
     A: Float[Array, "states states"]
     b: Float[Array, " states"]
@@ -35,37 +35,37 @@ class HarmonicSystem(NamedTuple):
     e: Float[Array, ""]
 
 
-def harmonic_system(task: AbstractTask, system: Linearisation) -> HarmonicSystem:
+def harmonic_system(task: AbstractTask, system: Linearisation) -> SignalSystem:
     """The response to the harmonic."""
     return system_of(task, system, task.harmonic_base())
 
 
-def system_of(task: AbstractTask, system: Linearisation, base: Perturbation) -> HarmonicSystem:
+def system_of(task: AbstractTask, system: Linearisation, base: Perturbation) -> SignalSystem:
     """The response to one signal that acts on every input by so much.
 
     With an activation, its states beside the task's: the active inputs get what has passed it.
     """
     if task.activation is None:
-        return HarmonicSystem(system.A, system.B @ base, system.C, system.D @ base, system.E @ base)
+        return SignalSystem(system.A, system.B @ base, system.C, system.D @ base, system.E @ base)
     active = np.isin(np.arange(len(base)), ACTIVE)
     later, now = jnp.where(active, base, 0.0), jnp.where(active, 0.0, base)
     own, into = (x.astype(base.dtype) for x in task.activation.states())
     first = jnp.array([1.0, 0.0], base.dtype)
     A = jnp.block([[system.A, jnp.outer(system.B @ later, first)], [jnp.zeros((2, len(system.A)), base.dtype), own]])
     read = (system.D @ later) * first + (system.E @ later) * own[0]
-    return HarmonicSystem(A, jnp.concatenate([system.B @ now, into]), jnp.concatenate([system.C, read]),
-                          system.D @ now, system.E @ now)  # fmt: skip
+    return SignalSystem(A, jnp.concatenate([system.B @ now, into]), jnp.concatenate([system.C, read]),
+                        system.D @ now, system.E @ now)  # fmt: skip
 
 
-def transfer(system: HarmonicSystem, omega: Float[Array, ""]) -> Complex[Array, ""]:
-    """Response of the output to the harmonic, `c (s - A)⁻¹ b + d + s e`, s = iω."""
+def transfer(system: SignalSystem, omega: Float[Array, ""]) -> Complex[Array, ""]:
+    """Response of the output to the signal, `c (s - A)⁻¹ b + d + s e`, s = iω."""
     s = times_i(omega)
     A, b, c = (x.astype(s.dtype) for x in system[:3])
     inside = jnp.linalg.solve(s * jnp.eye(len(A), dtype=s.dtype) - A, b)
     return c @ inside + jax.lax.complex(system.d, omega * system.e)
 
 
-def polynomials(system: HarmonicSystem) -> tuple[Array, Array]:
+def polynomials(system: SignalSystem) -> tuple[Array, Array]:
     """`c (s - A)⁻¹ b + d + s e` as numerator and denominator, highest power first: Faddeev and LeVerrier."""
     A, b, c, d, e = system
     n, eye = len(A), jnp.eye(len(A), dtype=A.dtype)
