@@ -207,12 +207,12 @@ def test_text_shows_what_is_known_and_what_is_not():
     words = " ".join(text.split())
     for part in (
         "converged: 1 of 2 starts agree",
-        "c_w 16.667 ± 0.033 N",
+        "c_w 6.667 ± 0.013",  # 16.667 N over a mean of 2.5 N
         "corner_frequency 0.333 ± 0.010 above 0.31 Hz",
         "they also fix, roughly: k_w / c_w",
-        "not determined (near their defaults by the prior): k_w 5e+05 N",
+        "not determined (near their defaults by the prior): k_w",
         "do not notice if: - stiffness and damping can be scaled together",
-        "Per newton of mean force: K_w0 80 1/m",
+        "what has newtons in its unit is stated per newton of mean force",
         "note: a notice",
         "chi2 per bin 0.90",
     ):

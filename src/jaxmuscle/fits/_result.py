@@ -1,6 +1,7 @@
 """The result of a fit, of one target or of several: what was found, how sure it is, and what it cannot say."""
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,15 +15,15 @@ from jaxmuscle._common.errors import ResultError
 from jaxmuscle._common.files import write_json
 from jaxmuscle._common.parts import of_only, only
 from jaxmuscle._common.tables import frame
-from jaxmuscle._common.text import choices, folded, probability
+from jaxmuscle._common.text import choices, probability
 from jaxmuscle.data._target import Target
 from jaxmuscle.model._tasks import AbstractTask
-from jaxmuscle.objective._arguments import base_of
-from jaxmuscle.objective._consequences import BANDS, derived_names
+from jaxmuscle.objective._consequences import derived_names
 
 from ._adequacy import Adequacy
-from ._ladder import HEAD, Rung
+from ._ladder import Rung
 from ._part import Estimate, FittedPart, Start, estimates_to_table, part_to_table, read_estimates, read_part
+from ._result_text import per_newton, text_of
 
 if TYPE_CHECKING:
     import pandas
@@ -213,74 +214,12 @@ class FitResult(eqx.Module):
         """Write JSON atomically; `load_result` reads it back equal. That of one target serves wherever a preset does."""
         write_json(path, to_table(self))
 
+    def as_shown(self, table: Mapping[str, Estimate]) -> dict[str, Estimate]:
+        """A table of quantities as it is shown: per newton of mean force where the scale of force is unknown."""
+        return per_newton(table, self.derived["mean"].value) if self.per_newton else dict(table)
+
     def __str__(self) -> str:
-        single = len(self.parts) == 1
-        lines = [self.verdict[0].upper() + self.verdict[1:], f"  {_head(self)}"]
-        lines += [f"  {self.message}"] * self.success
-        lines += [f"  {HEAD}", *(f"  {rung}" for rung in self.ladder)] if self.ladder else []
-        if not single:
-            lines += [f"  {name}: {p.target.name}, {p.model}{_closeness(p, ', ')}" for name, p in self.parts.items()]
-        lines += [f"  {sentence}" for sentence in self.advice]
-        lines += [f"  note: {notice}" for notice in self.notices]
-        if single and self.rms_log_error is not None:
-            lines.append(f"  {_closeness(self.only)}")
-        lines += [f"  {sentence}" for sentence in self.remarks]
-        every = self.found
-        shown = self.determined
-        intervals = any(p.interval is not None for p in shown.values())
-        in_bands = {name: p for name, p in shown.items() if base_of(name) in BANDS}
-        rows = {name: p for name, p in shown.items() if name not in in_bands}
-        lines += _table("determined by the data", rows, " 95 % interval  " * intervals)
-        lines += [f"  {sentence}" for sentence in _by_band(in_bands)]
-        fixed = [name for name in self.products if name not in self.parameters]
-        lines += [f"  they also fix, roughly: {', '.join(fixed)}"] if fixed else []
-        loose = {name: p for name, p in every.items() if name not in shown and p.free}
-        lines += _table("not determined (near their defaults by the prior)", loose) if loose else []
-        if self.per_newton:
-            lines += ["  the scale of force is unknown, since no mean force was given: newtons are those of the task's own "
-                      "muscle. Per newton of mean force: " + _per_newton(self)]  # fmt: skip
-        if self.undetermined:
-            whose = "the data do" if single else "all targets together do"
-            lines += [f"  {whose} not notice if:", *(f"    - {sentence}" for sentence in self.undetermined)]
-        return folded(lines)
-
-
-def _table(title: str, table: dict[str, Estimate], column: str = "") -> list[str]:
-    """Rows of name, value ± error, interval and unit."""
-    wide = max([26, *(2 + len(name) for name in table)])
-    lines = [f"  {title}:"] if not column else [f"  {title + ':':<{wide + 24}}{column.strip():<18}"]
-    for name, p in table.items():
-        unit = "" if p.unit == "1" else p.unit
-        interval = f"{p.interval_in_words():<18}" if column else ""
-        lines.append(f"    {name:<{wide}}{p.in_words():<20}{interval}{unit}".rstrip())
-    return lines if table else [*lines, "    nothing"]
-
-
-def _by_band(table: dict[str, Estimate]) -> list[str]:
-    """The shares of power in bands, a sentence for each target."""
-    said: dict[str, list[str]] = {}
-    for name, p in table.items():
-        band, _, whose = name.partition("@")
-        low, high = BANDS[band]
-        said.setdefault(f" of {whose}" if whose else "", []).append(f"{low:g}-{high:g} Hz {100 * p.value:.2g} %")
-    return [f"power by band{whose}: {', '.join(each)}" for whose, each in said.items()]
-
-
-def _per_newton(result: FitResult) -> str:
-    return ", ".join(f"{n} {v:.3g} {'1/m' if n[0] == 'K' else 's/m'}" for n, v in result.per_newton.items())
-
-
-def _head(result: FitResult) -> str:
-    if len(result.parts) > 1:
-        return f"together: {', '.join(result.parts)}"
-    return f"{result.target.name} ({result.target.provenance}), {result.only.model}, {result.method}"
-
-
-def _closeness(part: FittedPart, before: str = "") -> str:
-    """χ² per bin and rms error, as far as they are known."""
-    said = [] if part.chi2_per_bin is None else [f"chi2 per bin {part.chi2_per_bin:.2f}"]
-    said += [] if part.rms_log_error is None else [f"rms log error {part.rms_log_error:.3f}"]
-    return before * bool(said) + ", ".join(said)
+        return text_of(self)
 
 
 def to_table(result: FitResult) -> dict[str, Any]:

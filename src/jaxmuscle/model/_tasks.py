@@ -142,9 +142,8 @@ class AbstractTask(eqx.Module):
     def harmonic_base(self) -> Perturbation:
         """What the harmonic is a fraction of: (K_w0, K_z0, 0, 0, 0)."""
         base = self.muscle.base()
-        return jnp.append(base, jnp.zeros((), base.dtype)) * np.array(
-            [1.0, 1.0, 0.0, 0.0, 0.0], dtype=jnp.result_type(float)
-        )
+        stiffness = np.array([1.0, 1.0, 0.0, 0.0, 0.0], dtype=jnp.result_type(float))
+        return jnp.append(base, jnp.zeros((), base.dtype)) * stiffness
 
 
 def with_noise(

@@ -37,8 +37,9 @@ def fit(result: Any, ax: Axes | None = None) -> Figure | SubFigure:
     **Arguments:** `result`, what `jaxmuscle.fit` returns; `ax`, its place. **Returns:** the figure.
     """
     header, notes = _header(result), _notes(result)
-    free = {name: estimate for name, estimate in result.parameters.items() if estimate.free}
-    rows = 1 + max(len(free), len(result.derived), 1)
+    free = result.as_shown({name: estimate for name, estimate in result.parameters.items() if estimate.free})
+    derived = result.as_shown(result.derived)
+    rows = 1 + max(len(free), len(derived), 1)
     panels = _panels(result)
     text = [LINE * (rows + 1), *[LINE * len(notes)] * bool(notes)]
     heights = [LINE * (len(header) + 0.7), *(height for height, _ in panels), *text]
@@ -50,7 +51,7 @@ def fit(result: Any, ax: Axes | None = None) -> Figure | SubFigure:
             panel(fig.add_subplot(grid[row, column] if len(draw) > 1 else grid[row, :]))
     below = 1 + len(panels)
     _table(fig.add_subplot(grid[below, 0]), "Fitted parameters", free, rows)
-    _table(fig.add_subplot(grid[below, 1]), "Derived quantities", result.derived, rows)
+    _table(fig.add_subplot(grid[below, 1]), "Derived quantities", derived, rows)
     if notes:
         _lines(fig.add_subplot(grid[below + 1, :]), notes)
     return fig

@@ -1,0 +1,95 @@
+"""The result of a fit as text."""
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+from jaxmuscle._common.text import folded
+from jaxmuscle.objective._arguments import base_of
+from jaxmuscle.objective._consequences import BANDS
+
+from ._ladder import HEAD
+from ._part import Estimate, FittedPart
+
+if TYPE_CHECKING:
+    from ._result import FitResult
+
+RELATIVE = {"N": "1", "N/m": "1/m", "N s/m": "s/m", "N/m^3": "1/m^3", "N s^3/m^3": "s^3/m^3", "kg": "kg/N"}
+
+
+def text_of(result: "FitResult") -> str:
+    """The verdict, what the data determine and what they do not, and what to know about it."""
+    single = len(result.parts) == 1
+    lines = [result.verdict[0].upper() + result.verdict[1:], f"  {_head(result)}"]
+    lines += [f"  {result.message}"] * result.success
+    lines += [f"  {HEAD}", *(f"  {rung}" for rung in result.ladder)] if result.ladder else []
+    if not single:
+        lines += [f"  {name}: {p.target.name}, {p.model}{_closeness(p, ', ')}" for name, p in result.parts.items()]
+    lines += [f"  {sentence}" for sentence in result.advice]
+    lines += [f"  note: {notice}" for notice in result.notices]
+    if single and result.rms_log_error is not None:
+        lines.append(f"  {_closeness(result.only)}")
+    lines += [f"  {sentence}" for sentence in result.remarks]
+    every, shown = result.as_shown(result.found), result.as_shown(result.determined)
+    intervals = any(p.interval is not None for p in shown.values())
+    in_bands = {name: p for name, p in shown.items() if base_of(name) in BANDS}
+    rows = {name: p for name, p in shown.items() if name not in in_bands}
+    lines += _table("determined by the data", rows, " 95 % interval  " * intervals)
+    lines += [f"  {sentence}" for sentence in _by_band(in_bands)]
+    fixed = [name for name in result.products if name not in result.parameters]
+    lines += [f"  they also fix, roughly: {', '.join(fixed)}"] if fixed else []
+    loose = {name: p for name, p in every.items() if name not in shown and p.free}
+    lines += _table("not determined (near their defaults by the prior)", loose) if loose else []
+    if result.per_newton:
+        lines += ["  the scale of force is unknown, since no mean in newtons was given: what has newtons in its unit is "
+                  "stated per newton of mean force"]  # fmt: skip
+    if result.undetermined:
+        whose = "the data do" if single else "all targets together do"
+        lines += [f"  {whose} not notice if:", *(f"    - {sentence}" for sentence in result.undetermined)]
+    return folded(lines)
+
+
+def per_newton(table: Mapping[str, Estimate], mean: float) -> dict[str, Estimate]:
+    """The table with whatever has newtons (or masses, which go with them) over the mean force; without that itself."""
+    return {n: _over(p, mean) if p.unit in RELATIVE else p for n, p in table.items() if base_of(n) != "mean"}
+
+
+def _over(p: Estimate, mean: float) -> Estimate:
+    def over(value: float | None) -> float | None:
+        return None if value is None else value / mean
+
+    interval = None if p.interval is None else (over(p.interval[0]), over(p.interval[1]))
+    return Estimate(p.value / mean, RELATIVE[p.unit], over(p.stderr), p.free, p.identifiable, interval)
+
+
+def _table(title: str, table: dict[str, Estimate], column: str = "") -> list[str]:
+    """Rows of name, value ± error, interval and unit."""
+    wide = max([26, *(2 + len(name) for name in table)])
+    lines = [f"  {title}:"] if not column else [f"  {title + ':':<{wide + 24}}{column.strip()}"]
+    for name, p in table.items():
+        unit = "" if p.unit == "1" else p.unit
+        interval = f"{p.interval_in_words():<18}" if column else ""
+        lines.append(f"    {name:<{wide}}{p.in_words():<20}{interval}{unit}".rstrip())
+    return lines if table else [*lines, "    nothing"]
+
+
+def _by_band(table: dict[str, Estimate]) -> list[str]:
+    """The shares of power in bands, a sentence for each target."""
+    said: dict[str, list[str]] = {}
+    for name, p in table.items():
+        band, _, whose = name.partition("@")
+        low, high = BANDS[band]
+        said.setdefault(f" of {whose}" if whose else "", []).append(f"{low:g}-{high:g} Hz {100 * p.value:.2g} %")
+    return [f"power by band{whose}: {', '.join(each)}" for whose, each in said.items()]
+
+
+def _head(result: "FitResult") -> str:
+    if len(result.parts) > 1:
+        return f"together: {', '.join(result.parts)}"
+    return f"{result.target.name} ({result.target.provenance}), {result.only.model}, {result.method}"
+
+
+def _closeness(part: FittedPart, before: str = "") -> str:
+    """χ² per bin and rms error, as far as they are known."""
+    said = [] if part.chi2_per_bin is None else [f"chi2 per bin {part.chi2_per_bin:.2f}"]
+    said += [] if part.rms_log_error is None else [f"rms log error {part.rms_log_error:.3f}"]
+    return before * bool(said) + ", ".join(said)
