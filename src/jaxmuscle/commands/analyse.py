@@ -38,7 +38,7 @@ def analyse(
         jaxmuscle analyse trial.c3d --column finger --axis principal --reference stand --window all
     """
     with reporting():
-        edges = _edges(window)
+        edges = edges_of(window)
         if save_target is not None and save_target.suffix.lower() != ".toml":
             raise ValueError(f"--save-target {save_target}: a target is saved as TOML; give a name that ends in .toml")
         writable(output)
@@ -53,7 +53,7 @@ def analyse(
         _write(recording, output, save_target)
 
 
-def _edges(window: str | None) -> Any:
+def edges_of(window: str | None) -> Any:
     if window is None or window == "all":
         return window
     start, colon, stop = window.partition(":")

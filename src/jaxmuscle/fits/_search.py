@@ -11,6 +11,7 @@ from jaxtyping import Float
 from jaxmuscle._common.errors import SimulationError
 from jaxmuscle._common.keys import fold_in
 from jaxmuscle.ensembles._ensemble import ensemble
+from jaxmuscle.model._rungs import RUNGS
 from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.objective._arguments import Plan
 from jaxmuscle.objective._consequences import BATCH
@@ -22,7 +23,7 @@ from jaxmuscle.response._expected import Moments
 from jaxmuscle.response._linearised import settled
 
 from ._checks import Stage, controlled_moments, seen_best
-from ._ladder import Climbed, Models, Rung, climb, line_or_resonance
+from ._ladder import Climbed, Models, Rung, climb, criterion, line_or_resonance
 from ._report import UNCHECKED, report_fit
 from ._result import FitResult
 
@@ -96,10 +97,11 @@ def _unchecked(plan: Plan, stages: list[Stage], ladder: tuple[Rung, ...], *, int
     return report_fit(plan._replace(check_seeds=0), stages, ladder, interrupted=interrupted, preliminary=True)
 
 
-def search_together(plans: list[Plan], tell: Callable[[str, float], None]) -> list[FitResult]:
+def search_together(plans: list[Plan], tell: Callable[[str, float], None], number: int = 0) -> list[FitResult]:
     """Fits of one model to several data on the same bins, all starts of all fits in one minimisation.
 
-    Linear response alone: no nonlinear correction, no check on simulated seeds, no profile over the frequency.
+    Linear response alone: no nonlinear correction, no check on simulated seeds, no profile over the frequency. The AIC of
+    the model, whose `number` on the ladder this is, stands in every result.
     """
     problems = [plan.problem for plan in plans]
     points = [starting_points(plan.problem, plan.starts) for plan in plans]
@@ -113,9 +115,20 @@ def search_together(plans: list[Plan], tell: Callable[[str, float], None]) -> li
     results = []
     for plan, *stages in zip(plans, first, second, strict=True):
         unused = plan.settings | {"seeds": 0, "check_seeds": 0}
-        results.append(report_fit(plan._replace(settings=unused, check_seeds=0), stages))
+        found = report_fit(plan._replace(settings=unused, check_seeds=0), stages)
+        results.append(_with_criterion(found, plan.problem, stages[-1], number))
         tell(f"reporting {plan.problem.title}", 0.8 + 0.2 * len(results) / len(plans))
     return results
+
+
+def _with_criterion(result: FitResult, problem: FitProblem, stage: Stage, number: int) -> FitResult:
+    """The result with the one rung that was fitted, so that models of many targets can be compared by their AIC."""
+    if result.adequacy is None:
+        return result
+    aic, parameters = criterion(problem, stage.objective, seen_best(stage.objective, stage.minima))
+    per_bin = result.adequacy.chi2 / (len(result.target.bins) - 1)
+    rung = Rung(number, RUNGS[number], aic, parameters, per_bin, result.adequacy.p, chosen=True)
+    return dataclasses.replace(result, ladder=(rung,))
 
 
 def _together(

@@ -20,6 +20,7 @@ from ._spectra import QUANTILES as QUANTILES
 from ._spectra import estimate as estimate
 from ._spectra import spectrum as spectrum
 from ._spectra import target as target
+from ._study import study as study
 from ._style import BLUE as BLUE
 from ._style import GREEN as GREEN
 from ._style import ORANGE as ORANGE
