@@ -23,6 +23,7 @@ from .reproduce import reproduce
 from .simulate import simulate
 from .speed import speed
 from .steadiness import steadiness
+from .study import study
 
 app = typer.Typer(add_completion=False, no_args_is_help=True, rich_markup_mode="markdown", pretty_exceptions_enable=False)
 
@@ -36,6 +37,7 @@ app.command()(posterior)
 app.command()(compare)
 app.command()(reproduce)
 app.command()(speed)
+app.command()(study)
 
 
 def show_version(wanted: bool) -> bool:

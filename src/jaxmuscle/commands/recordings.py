@@ -40,7 +40,7 @@ def read_trials(paths: Sequence[str], reading: dict[str, Any], window: str | Non
     """The recordings of one condition, each with its steady part: several files, or all columns of one (`--column all`)."""
     if len(paths) > 1 or reading["column"] != "all":
         return jm.Trials([read(path, reading, window) for path in paths])
-    edges = _edges(window)
+    edges = edges_of(window)
     options = {name: value for name, value in reading.items() if name not in ("column", "reference")}
     trials = jm.load_recordings(paths[0], **options)
     return trials if edges == "all" else trials.steady(edges)
@@ -48,7 +48,7 @@ def read_trials(paths: Sequence[str], reading: dict[str, Any], window: str | Non
 
 def read(path: str, reading: dict[str, Any], window: str | None = "all") -> "Recording":
     """The recording of a file, its steady part as window: the one that is given, `all`, or None to find it."""
-    edges = _edges(window)
+    edges = edges_of(window)
     try:
         recording = jm.load_recording(path, **reading)
     except ImportError as error:
@@ -56,7 +56,8 @@ def read(path: str, reading: dict[str, Any], window: str | None = "all") -> "Rec
     return recording if edges == "all" else recording.steady(edges)
 
 
-def _edges(window: str | None) -> Any:
+def edges_of(window: str | None) -> Any:
+    """The window of --window in s, `all`, or None."""
     if window is None or window == "all":
         return window
     start, colon, stop = window.partition(":")

@@ -1,8 +1,8 @@
 """Public names of this wing."""
 
 from ._cohort import CohortResult as CohortResult
-from ._cohort import Difference as Difference
 from ._cohort import fit_cohort as fit_cohort
+from ._differences import Difference as Difference
 from ._fit import fit as fit
 from ._joint import fit_joint as fit_joint
 from ._part import Estimate as Estimate
@@ -10,3 +10,5 @@ from ._part import FittedPart as FittedPart
 from ._result import FitResult as FitResult
 from ._result import load_result as load_result
 from ._search import FitInterrupted as FitInterrupted
+from ._study import StudyResult as StudyResult
+from ._study import run_study as run_study

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Any
 import equinox as eqx
 import jax
 import numpy as np
-import scipy
 from jaxtyping import PRNGKeyArray
 
 from jaxmuscle import plot
@@ -22,6 +21,7 @@ from jaxmuscle.model._tasks import AbstractTask, with_noise
 from jaxmuscle.objective._arguments import FitOptions, Plan, at_mean, planned, task_for
 from jaxmuscle.spectra._bin_law import trial_samples
 
+from ._differences import Difference, difference
 from ._ladder import options_for
 from ._result import FitResult
 from ._search import search_together
@@ -33,28 +33,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure, SubFigure
 
 
-CONFIDENCE = 0.95
 COLUMNS = ("target", "group", "quantity", "value", "stderr", "unit", "determined", "mvc_fraction", "chi2_per_bin",
            "adequate", "adequacy_p", "success")  # fmt: skip
-
-
-class Difference(eqx.Module):
-    """Mean of `quantity` in group `b` minus that in group `a`, the `difference`, with its 95 % interval (`low`, `high`).
-
-    All in `unit`; `members` is how many the groups have.
-    `basis` says what the interval stands on: "people", the spread within the groups (Welch's t; the fits' own errors are
-    part of that spread), or "fits", the standard errors of the fits, where a group has one member only.
-    """
-
-    quantity: str
-    a: str
-    b: str
-    difference: float
-    low: float
-    high: float
-    unit: str
-    basis: str
-    members: tuple[int, int]
 
 
 class CohortResult(eqx.Module):
@@ -134,7 +114,7 @@ class CohortResult(eqx.Module):
             for a, b in itertools.combinations(groups, 2):
                 left, right = self._members(quantity, a), self._members(quantity, b)
                 if left and right:
-                    found.append(_difference(quantity, (a, left), (b, right)))
+                    found.append(difference(quantity, (a, left), (b, right)))
         return tuple(found)
 
     def _members(self, quantity: str, group: str) -> list[Any]:
@@ -157,20 +137,6 @@ def _quantities(result: FitResult) -> dict[str, Any]:
 
 def _determined(result: FitResult) -> dict[str, Any]:
     return result.determined
-
-
-def _difference(quantity: str, a: tuple[str, list[Any]], b: tuple[str, list[Any]]) -> Difference:
-    left, right = ([e.value for e in members] for _, members in (a, b))
-    middle = float(np.mean(right) - np.mean(left))
-    if len(left) > 1 and len(right) > 1:
-        interval = scipy.stats.ttest_ind(right, left, equal_var=False).confidence_interval(CONFIDENCE)
-        low, high, basis = float(interval.low), float(interval.high), "people"
-    else:
-        parts = [np.sum(np.square([e.stderr for e in members])) / len(members) ** 2 for _, members in (a, b)]
-        reach = scipy.stats.norm.ppf(0.5 + CONFIDENCE / 2) * np.sqrt(sum(parts))
-        low, high, basis = float(middle - reach), float(middle + reach), "fits"
-    unit = a[1][0].unit
-    return Difference(quantity, a[0], b[0], middle, low, high, unit, basis, (len(left), len(right)))
 
 
 def fit_cohort(
@@ -227,7 +193,7 @@ def fit_cohort(
                 continue
             batches.setdefault(_alike(plan), {})[name] = plan
         for batch in batches.values():
-            results |= zip(batch, search_together(list(batch.values()), tell), strict=True)
+            results |= zip(batch, search_together(list(batch.values()), tell, rung), strict=True)
     ordered = {name: results[name] for name in loaded if name in results}
     return CohortResult(ordered, {name: (groups or {})[name] for name in ordered if name in (groups or {})}, failed)
 

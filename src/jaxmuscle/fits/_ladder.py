@@ -94,7 +94,7 @@ def climb(first: Plan, models: Models, descend: Descend, keep: Callable[[Climbed
         if known is None:
             continue
         ended = Endpoint.of(plan.problem, stages[-1])
-        found = Climbed(plan, stages, known, ended, _judged(ended, number))
+        found = Climbed(plan, stages, known, ended, rung_of(ended, number))
         tried.append(found)
         described = best is not None and best.rung.p >= ADEQUATE
         if best is None or found.rung.aic < best.rung.aic - ALIKE * described:
@@ -124,7 +124,8 @@ def _warm(plan: Plan, best: Climbed) -> Float[np.ndarray, "starts free"]:
     return problem.coordinates.from_theta(points)
 
 
-def _judged(ended: Endpoint, number: int) -> Rung:
+def rung_of(ended: Endpoint, number: int) -> Rung:
+    """The rung that was fitted, of data whose scatter is known."""
     verdict = ended.adequacy
     assert verdict is not None
     (part,) = ended.problem.parts

@@ -49,7 +49,7 @@ class FitResult(eqx.Module):
     belongs to one is called "name@target", what is the same number for all by its own name), their errors widened by
     `adequacy.widening`; `products` and ratios of parameters that the data determine; `correlation` of the free
     parameters; `undetermined`, sentences naming what can be scaled together without the data noticing;
-    `ladder`, the models that were tried (`Rung`s; empty where one was asked for);
+    `ladder`, the models that were tried (`Rung`s; empty where one was asked for, in a cohort the one that all got);
     `singular_values` of the Jacobian (residuals in standard deviations, parameters in the prior's); the table of
     `starts`; `profile`, harmonic frequencies [Hz] and the rise of chi² there, all else fitted anew; `harmonic_p_value`,
     how often spectra without harmonic would show one as strong (both None with several targets); `notices`; `seed`;

@@ -21,7 +21,7 @@ def text_of(result: "FitResult") -> str:
     single = len(result.parts) == 1
     lines = [result.verdict[0].upper() + result.verdict[1:], f"  {_head(result)}"]
     lines += [f"  {result.message}"] * result.success
-    lines += [f"  {HEAD}", *(f"  {rung}" for rung in result.ladder)] if result.ladder else []
+    lines += [f"  {HEAD}", *(f"  {rung}" for rung in result.ladder)] if len(result.ladder) > 1 else []
     if not single:
         lines += [f"  {name}: {p.target.name}, {p.model}{_closeness(p, ', ')}" for name, p in result.parts.items()]
     lines += [f"  {sentence}" for sentence in result.advice]

@@ -23,7 +23,7 @@ from jaxmuscle.response._linearised import settled
 
 from ._adequacy import Endpoint
 from ._checks import Stage, controlled_moments, seen_best
-from ._ladder import Climbed, Models, Rung, climb, line_or_resonance
+from ._ladder import Climbed, Models, Rung, climb, line_or_resonance, rung_of
 from ._report import UNCHECKED, report_fit
 from ._result import FitResult
 
@@ -105,10 +105,11 @@ def _unchecked(
     return report_fit(plan, stages, ladder, ended=ended, interrupted=interrupted, preliminary=True)
 
 
-def search_together(plans: list[Plan], tell: Callable[[str, float], None]) -> list[FitResult]:
+def search_together(plans: list[Plan], tell: Callable[[str, float], None], number: int = 0) -> list[FitResult]:
     """Fits of one model to several data on the same bins, all starts of all fits in one minimisation.
 
-    Linear response alone: no nonlinear correction, no check on simulated seeds, no profile over the frequency.
+    Linear response alone: no nonlinear correction, no check on simulated seeds, no profile over the frequency. The AIC of
+    the model, whose `number` on the ladder this is, stands in every result.
     """
     problems = [plan.problem for plan in plans]
     points = [starting_points(plan.problem, plan.starts) for plan in plans]
@@ -122,7 +123,10 @@ def search_together(plans: list[Plan], tell: Callable[[str, float], None]) -> li
     results = []
     for plan, *stages in zip(plans, first, second, strict=True):
         unused = plan.settings | {"seeds": 0, "check_seeds": 0}
-        results.append(report_fit(plan._replace(settings=unused, check_seeds=0), stages))
+        finite = np.isfinite(stages[-1].minima.cost[stages[-1].minima.best])
+        ended = Endpoint.of(plan.problem, stages[-1]) if finite else None
+        rungs = () if ended is None or ended.adequacy is None else (rung_of(ended, number)._replace(chosen=True),)
+        results.append(report_fit(plan._replace(settings=unused, check_seeds=0), stages, rungs, ended=ended))
         tell(f"reporting {plan.problem.title}", 0.8 + 0.2 * len(results) / len(plans))
     return results
 

@@ -22,6 +22,7 @@ from ._spectra import estimate as estimate
 from ._spectra import spectrum as spectrum
 from ._spectra import target as target
 from ._steadiness import steadiness as steadiness
+from ._study import study as study
 from ._style import BLUE as BLUE
 from ._style import GREEN as GREEN
 from ._style import ORANGE as ORANGE

@@ -1,5 +1,6 @@
 """The figure of a cohort: what its data determine, by person, group or level."""
 
+from collections.abc import Collection
 from typing import Any
 
 import numpy as np
@@ -15,15 +16,19 @@ SHARE = 0.5  # of the targets that must determine a quantity for it to be drawn
 
 
 @styled
-def cohort(cohort: Any, by: str = "person", ax: Axes | None = None) -> Figure | SubFigure:
+def cohort(
+    cohort: Any, by: str = "person", ax: Axes | None = None, *, quantities: Collection[str] | None = None
+) -> Figure | SubFigure:
     """Draws what at least half of the targets determine, `by` "person", "group" or "level" (fraction of MVC).
+
+    `quantities`, only these.
 
     **Raises:** `ValueError` for another `by`, and if there is nothing to draw.
     """
     if by not in WAYS:
         raise ValueError(f"by = {by!r}: choose one of {', '.join(WAYS)}")
     rows = [row for row in cohort.table() if row["stderr"] is not None]
-    names = list(dict.fromkeys(row["quantity"] for row in rows))
+    names = list(dict.fromkeys(row["quantity"] for row in rows if quantities is None or row["quantity"] in quantities))
     enough = SHARE * max(len(cohort.results), 1)
     names = [name for name in names if sum(row["quantity"] == name for row in rows) >= enough]
     if not names:

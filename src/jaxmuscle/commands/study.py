@@ -1,0 +1,71 @@
+"""`jaxmuscle study`."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+import jaxmuscle as jm
+
+from .console import CONVERGED, NOT_CONVERGED, err, out, plain, record, reporting, show, writable
+from .options import Force, Json, Noise, Output, Seed, names_in
+from .recordings import edges_of
+
+
+def study(
+    table: Annotated[Path, typer.Argument(help="study.csv or study.toml.")],
+    rung: Annotated[str | None, typer.Option(help="Model of all people, 0 to 3 (2), or auto (lowest AIC).")] = None,
+    noise: Noise = None,
+    column: Annotated[str | None, typer.Option(help="Which column of the files, where the table does not say it.")] = None,
+    rate: Annotated[float | None, typer.Option(help="Sampling rate [Hz] where neither file nor table state it.")] = None,
+    units: Annotated[str | None, typer.Option(help="Unit of the recordings where the table does not say it.")] = None,
+    window: Annotated[
+        str | None, typer.Option(metavar="A:B", help="Part to analyse [s]; by default the steady part.")
+    ] = None,
+    quantities: Annotated[str | None, typer.Option(metavar="NAMES", help="Comma-separated; what is compared.")] = None,
+    alpha: Annotated[float | None, typer.Option(help="Level of the tests (0.05); intervals hold 1 - alpha.")] = None,
+    correction: Annotated[str | None, typer.Option(help="For many comparisons: holm (default), fdr or none.")] = None,
+    seed: Seed = 0,
+    output: Output = Path("out"),
+    force: Force = False,
+    as_json: Json = False,
+) -> None:
+    """Compare groups and conditions: fit all recordings of a study with one model, write tables, figures and methods.
+
+    The table has a line for each recording: file, person, and as far as there are any group, condition, trial. Writes
+    DIR/people.csv, differences.csv, study.json, spectra.png, quantities.png and methods.txt, all at the end.
+
+    Examples:
+
+        jaxmuscle study study.csv --out out/study
+
+        jaxmuscle study study.toml --correction fdr --quantities tremor_frequency,tremor_share
+    """
+    with reporting(as_json):
+        from jaxmuscle._common.environment import keep_compiled_programs
+
+        keep_compiled_programs()
+        span = edges_of(window)
+        writable(output, "study.json", force=force)
+        found = jm.run_study(
+            table,
+            rung=int(rung) if rung is not None and rung.isdigit() else rung,
+            noise=None if noise is None else str(noise),
+            column=column,
+            rate=rate,
+            units=units,
+            window=span,
+            quantities=names_in(quantities),
+            alpha=alpha,
+            correction=correction,
+            key=seed,
+            progress=True,
+        )
+        for cell in found.cells:
+            for notice in cell.target.notices:
+                err.print(f"[yellow]notice:[/] {plain(cell.target.name)}: {plain(notice)}", highlight=False)
+        found.save(output)
+        record(output / "study.json")
+        show(found, success=found.success)
+        out.print(f"Written: {output}/{', '.join(sorted(path.name for path in output.iterdir()))}", highlight=False)
+    raise typer.Exit(CONVERGED if found.success else NOT_CONVERGED)

@@ -1,0 +1,189 @@
+"""The table of a study: which file is which trial of whom, in which group and condition, and how files are read."""
+
+import os
+import tomllib
+from collections import defaultdict
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from jaxmuscle._common.files import text_of
+from jaxmuscle._common.text import choices
+
+from ._recording_files import load_recording
+from ._target import Target
+from ._text_tables import SIGNS, cells_of, lines_of, number_in
+from ._trials import Trials
+
+NEEDED = ("file", "person")
+LABELS = (*NEEDED, "group", "condition", "trial")
+NUMBERS = ("rate", "window_start", "window_stop")
+COLUMNS = (*LABELS, "column", "units", *NUMBERS)
+READING = ("column", "rate", "units", "window")
+OPTIONS = (*READING, "rung", "noise", "quantities", "alpha", "correction")
+
+
+class Row(NamedTuple):
+    """A recording of a study: `place`, what an error calls it; whose it is; `reading`, how the file is read."""
+
+    place: str
+    file: Path
+    person: str
+    group: str
+    condition: str
+    trial: str
+    reading: dict[str, Any]
+
+
+class StudyTable(NamedTuple):
+    """The recordings of a study, in order; the `options` that its file states; its `source`."""
+
+    rows: tuple[Row, ...]
+    options: dict[str, Any]
+    source: str
+
+
+class Cell(NamedTuple):
+    """One person in one condition: how many `trials`, at which `rates` [Hz], and their `target`."""
+
+    person: str
+    group: str
+    condition: str
+    trials: int
+    rates: tuple[float, ...]
+    target: Target
+
+
+def read_study(study: "str | os.PathLike[str] | Iterable[Mapping[str, Any]]") -> StudyTable:
+    """The table of a study from a .csv, .tsv or .txt, from a .toml that names one or has `[[recordings]]`, or from rows.
+
+    **Raises:** `ValueError` naming file, line and column, and the remedy.
+    """
+    if not isinstance(study, str | os.PathLike):
+        places = ((f"row {number}", dict(row)) for number, row in enumerate(study, 1))
+        return StudyTable(_checked(places, Path(), "the table"), {}, "a table in memory")
+    path = Path(study).expanduser()
+    if path.suffix.lower() != ".toml":
+        return StudyTable(_checked(_lines(path), path.parent, str(path)), {}, path.name)
+    try:
+        stated = tomllib.loads(text_of(_bytes(path), str(path)))
+    except tomllib.TOMLDecodeError as error:
+        raise ValueError(f"{path}: is not TOML: {error}") from None
+    known = ("table", "recordings", *OPTIONS)
+    for name in stated:
+        if name not in known:
+            raise ValueError(f"{path}: unknown option {name!r}; {choices(name, known)}")
+    options = {name: value for name, value in stated.items() if name in OPTIONS}
+    if ("table" in stated) == ("recordings" in stated):
+        raise ValueError(f'{path}: give either table = "study.csv" or [[recordings]], each with file and person')
+    if "table" in stated:
+        table = path.parent / Path(stated["table"]).expanduser()
+        return StudyTable(_checked(_lines(table), table.parent, str(table)), options, path.name)
+    places = ((f"{path}: recording {number}", dict(row)) for number, row in enumerate(stated["recordings"], 1))
+    return StudyTable(_checked(places, path.parent, str(path)), options, path.name)
+
+
+def cells_of_study(rows: Iterable[Row], defaults: Mapping[str, Any]) -> list[Cell]:
+    """The trials of every person in every condition made one target, each in its own or the `defaults`' window, or steady.
+
+    **Raises:** `ValueError` naming the line of a file that cannot be read or has no steady part.
+    """
+    together: dict[tuple[str, str, str], list[Any]] = defaultdict(list)
+    for row in rows:
+        reading = {**defaults, **row.reading}
+        window = reading.pop("window", None)
+        try:
+            together[row.person, row.group, row.condition].append(load_recording(row.file, **reading).steady(window))
+        except ValueError as error:
+            raise ValueError(f"{row.place}: {error}") from None
+    found = []
+    for (person, group, condition), recordings in together.items():
+        name = ", ".join(filter(None, (person, condition)))
+        try:
+            target = Trials(recordings).target(name)
+        except ValueError as error:
+            raise ValueError(f"{name}: {error}") from None
+        found.append(Cell(person, group, condition, len(recordings), tuple(r.rate for r in recordings), target))
+    return found
+
+
+def _bytes(path: Path) -> bytes:
+    try:
+        return path.read_bytes()
+    except FileNotFoundError:
+        raise ValueError(f"{path}: no such file") from None
+    except OSError as error:
+        raise ValueError(f"{path}: cannot be read: {error.strerror or error}") from None
+
+
+def _lines(path: Path) -> list[tuple[str, dict[str, Any]]]:
+    """Place and cells of every row of a text table; empty cells left out."""
+    lines = [line for line in lines_of(text_of(_bytes(path), str(path))) if line.body.strip()]
+    delimiter = next((sign for sign in SIGNS if lines and sign in lines[0].body), ",")
+    head, *body = lines
+    names = [name.casefold() for name in cells_of(head.body, delimiter)]
+    for name in names:
+        if name not in COLUMNS:
+            raise ValueError(f"{path}: {head.place}: unknown column {name!r}; {choices(name, COLUMNS)}")
+        if names.count(name) > 1:
+            raise ValueError(f"{path}: {head.place}: two columns are called {name}: leave one out")
+    for name in NEEDED:
+        if name not in names:
+            raise ValueError(f"{path}: {head.place}: no column {name}; the header needs file and person, and may have "
+                             f"{', '.join(COLUMNS[2:])}")  # fmt: skip
+    found = []
+    for line in body:
+        cells, place = cells_of(line.body, delimiter), f"{path}: {line.place}"
+        if len(cells) != len(names):
+            raise ValueError(f"{place}: has {len(cells)} cells, the header {len(names)} columns")
+        row: dict[str, Any] = {name: cell for name, cell in zip(names, cells, strict=True) if cell}
+        for name in set(NUMBERS) & set(row):
+            try:
+                row[name] = number_in(row[name], delimiter)
+            except ValueError:
+                raise ValueError(f"{place}: {name} = {row[name]!r} is not a number") from None
+        found.append((place, row))
+    return found
+
+
+def _checked(places: Iterable[tuple[str, dict[str, Any]]], folder: Path, source: str) -> tuple[Row, ...]:
+    """The rows, and that together they are a study."""
+    rows = tuple(_row(place, given, folder) for place, given in places)
+    group: dict[str, Row] = {}
+    seen: dict[Any, Row] = {}
+    for row in rows:
+        for label in ("group", "condition"):
+            if not getattr(row, label) and any(getattr(other, label) for other in rows):
+                raise ValueError(f"{row.place}: has no {label}, others do; give every recording one, or none")
+        first = group.setdefault(row.person, row)
+        if first.group != row.group:
+            raise ValueError(f"{row.place}: {row.person} is in group {row.group} here and in group {first.group} at "
+                             f"{first.place}; a person has one group (what changes within people: a condition)")  # fmt: skip
+        same = seen.setdefault((row.file, repr(row.reading)), row)
+        if same is not row:
+            raise ValueError(f"{row.place}: the same recording as at {same.place}: leave one out")
+        twin = seen.setdefault((row.person, row.condition, row.trial), row) if row.trial else row
+        if twin is not row:
+            raise ValueError(f"{row.place}: trial {row.trial} of {row.person} is there already, at {twin.place}")
+    if len(group) < 2:
+        raise ValueError(f"{source}: holds {len(group)} people; a study needs at least 2 (one person: jaxmuscle.fit)")
+    return rows
+
+
+def _row(place: str, given: dict[str, Any], folder: Path) -> Row:
+    for name in given:
+        if name not in COLUMNS:
+            raise ValueError(f"{place}: unknown column {name!r}; {choices(name, COLUMNS)}")
+    for name in NEEDED:
+        if not str(given.get(name) or "").strip():
+            raise ValueError(f"{place}: no {name}; every recording needs a file and a person")
+    window = [given.get(name) for name in ("window_start", "window_stop")]
+    if window.count(None) == 1:
+        raise ValueError(f"{place}: give window_start and window_stop, or neither")
+    file = folder / Path(str(given["file"])).expanduser()
+    if not file.is_file():
+        raise ValueError(f"{place}: {file}: no such file")
+    reading = {name: given[name] for name in ("column", "rate", "units") if given.get(name) is not None}
+    reading |= {"window": tuple(window)} if None not in window else {}
+    person, group, condition, trial = (str(given.get(name, "")).strip() for name in LABELS[1:])
+    return Row(place, file, person, group, condition, trial, reading)

@@ -1,0 +1,337 @@
+"""A study: trials of people in conditions and groups, one model fitted to all, what differs, one folder of results."""
+
+import dataclasses
+import itertools
+import os
+import tempfile
+import textwrap
+from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import equinox as eqx
+import numpy as np
+
+from jaxmuscle import plot
+from jaxmuscle._common.arrays import with_nulls
+from jaxmuscle._common.environment import versions
+from jaxmuscle._common.files import write_json, write_text
+from jaxmuscle._common.progress import Tell, told
+from jaxmuscle._common.text import WIDTH, choices, folded
+from jaxmuscle.data._study_table import READING, Cell, cells_of_study, read_study
+from jaxmuscle.model._parameters import PARAMETERS
+from jaxmuscle.model._rungs import RUNGS
+from jaxmuscle.objective._consequences import DERIVED
+
+from ._cohort import CohortResult, fit_cohort
+from ._differences import CORRECTIONS, Difference, change, corrected, difference, paired
+from ._part import Estimate, estimates_to_table
+from ._study_words import methods_paragraph, report_lines
+
+if TYPE_CHECKING:
+    import pandas
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure, SubFigure
+
+AUTO = "auto"
+USUAL = {"rung": 2, "noise": None, "quantities": None, "alpha": 0.05, "correction": "holm"}
+FORMAT = 1
+
+
+class StudyResult(eqx.Module):
+    """What a study found.
+
+    `cohort`, the fits, one of each person in each condition; `cells`, whose recordings they stand on; `aic`, the summed AIC
+    of every model that was tried (by rung), of which the lowest was taken; the `options` as they were used; the `source` of
+    the table.
+    """
+
+    cohort: CohortResult
+    cells: tuple[Cell, ...]
+    aic: dict[int, float]
+    options: dict[str, Any]
+    source: str
+
+    @property
+    def success(self) -> bool:
+        """Whether every fit succeeded."""
+        return self.cohort.success
+
+    @property
+    def rung(self) -> int:
+        """The model of all people: which rung of the ladder."""
+        return min(self.aic, key=lambda number: self.aic[number])
+
+    @property
+    def people(self) -> dict[str, str]:
+        """The group of every person."""
+        return {cell.person: cell.group for cell in self.cells}
+
+    @property
+    def groups(self) -> tuple[str, ...]:
+        """The groups, in the order of the table."""
+        return tuple(dict.fromkeys(cell.group for cell in self.cells))
+
+    @property
+    def conditions(self) -> tuple[str, ...]:
+        """The conditions, in the order of the table."""
+        return tuple(dict.fromkeys(cell.condition for cell in self.cells))
+
+    @property
+    def quantities(self) -> tuple[str, ...]:
+        """What is compared: what was asked for, else all derived quantities (not the parameters) that a fit determines."""
+        asked = self.options["quantities"]
+        seen = {name for result in self.cohort.results.values() for name in result.determined}
+        return tuple(name for name in (DERIVED if asked is None else asked) if name in seen)
+
+    def table(self) -> list[dict[str, Any]]:
+        """Tidy rows, one for each person, condition and quantity; `stderr` None where the data do not determine it."""
+        asked = self.options["quantities"]
+        cells = {cell.target.name: cell for cell in self.cells}
+        drop = ("target", "group", "mvc_fraction")
+        return [
+            {label: getattr(cells[row["target"]], label) for label in ("person", "group", "condition", "trials")}
+            | {name: value for name, value in row.items() if name not in drop}
+            for row in self.cohort.table()
+            if asked is None or row["quantity"] in asked
+        ]
+
+    def to_dataframe(self) -> "pandas.DataFrame":
+        """The rows of `table`."""
+        import pandas
+
+        return pandas.DataFrame(self.table())
+
+    def differences(self) -> tuple[Difference, ...]:
+        """Every comparison of `quantities` with at least two people on each side.
+
+        Groups in each condition by Welch's t, conditions within people by the paired t, their interaction (the change from
+        one condition to the other in one group against that in the other) by Welch's t. `p_corrected` is for all
+        comparisons of its kind. People whose fits do not determine a quantity are `left_out` of it: a selection.
+        """
+        kinds: dict[str, list[Difference]] = {}
+        for quantity in self.quantities:
+            for found in (*self._between_groups(quantity), *self._within_people(quantity)):
+                kinds.setdefault(found.kind, []).append(found)
+        correction = self.options["correction"]
+        return tuple(each for family in kinds.values() for each in corrected(family, correction))
+
+    def _between_groups(self, quantity: str) -> Iterable[Difference]:
+        for condition in self.conditions:
+            there = [cell for cell in self.cells if cell.condition == condition]
+            known = [(cell.group, self._number(quantity, cell)) for cell in there]
+            yield from self._compared(quantity, known, "groups", condition)
+
+    def _within_people(self, quantity: str) -> Iterable[Difference]:
+        cells = {(cell.person, cell.condition): cell for cell in self.cells}
+        for a, b in itertools.combinations(self.conditions, 2):
+            both = [(group, cells[person, a], cells[person, b]) for person, group in self.people.items()
+                    if (person, a) in cells and (person, b) in cells]  # fmt: skip
+            pairs = [(group, self._number(quantity, x), self._number(quantity, y)) for group, x, y in both]
+            changes = [(group, None if x is None or y is None else change(x, y)) for group, x, y in pairs]
+            known = [each for _, each in changes if each is not None]
+            if len(known) > 1:
+                found = paired(quantity, a, b, known, 1 - self.options["alpha"])
+                yield dataclasses.replace(found, left_out=len(changes) - len(known))
+            yield from self._compared(quantity, changes, "interaction", f"{b} - {a}")
+
+    def _compared(
+        self, quantity: str, numbers: list[tuple[str, Estimate | None]], kind: str, where: str
+    ) -> Iterable[Difference]:
+        """Every two groups."""
+        for pair in itertools.combinations(self.groups, 2):
+            a, b = ((group, [e for g, e in numbers if g == group and e is not None]) for group in pair)
+            if min(len(a[1]), len(b[1])) > 1:
+                found = difference(quantity, a, b, 1 - self.options["alpha"])
+                left_out = sum(g in pair and e is None for g, e in numbers)
+                yield dataclasses.replace(found, kind=kind, where=where, left_out=left_out)
+
+    def _number(self, quantity: str, cell: Cell) -> Estimate | None:
+        result = self.cohort.results.get(cell.target.name)
+        return None if result is None else result.determined.get(quantity)
+
+    def methods(self) -> str:
+        """A paragraph for the methods section of a paper: people, recordings, spectra, model, statistics, versions."""
+        return methods_paragraph(self)
+
+    def plot(self, ax: "Axes | None" = None, *, proportional: bool = True) -> "Figure | SubFigure":
+        """Spectra of people and means of groups, a panel for each condition; see `jaxmuscle.plot.study`."""
+        return plot.study(self, ax, proportional=proportional)
+
+    def save(self, folder: str | os.PathLike[str]) -> None:
+        """Write people.csv, differences.csv, study.json, spectra.png, quantities.png and methods.txt into `folder`.
+
+        They are made beside it first and then moved: a save that is interrupted changes nothing. Without a comparison there
+        is no differences.csv, and where the fits determine too little no quantities.png.
+        """
+        folder = Path(folder)
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(prefix=".study-", dir=folder) as made:
+            new = Path(made)
+            self._write(new)
+            for name in FILES:
+                (folder / name).unlink(missing_ok=True)  # of an earlier study, which may have had more of them
+            for path in sorted(new.iterdir()):
+                os.replace(path, folder / path.name)
+
+    def _write(self, folder: Path) -> None:
+        import matplotlib.pyplot as plt
+        import pandas
+
+        tables = {"people.csv": self.table(), "differences.csv": [_row(d) for d in self.differences()]}
+        for name, rows in tables.items():
+            if rows:
+                write_text(folder / name, pandas.DataFrame(rows).to_csv(index=False, float_format="%.8g"))
+        write_json(folder / "study.json", to_table(self))
+        write_text(folder / "methods.txt", textwrap.fill(self.methods(), WIDTH) + "\n")
+        figures: dict[str, Callable[[], Any]] = {"spectra.png": self.plot}
+        if self.quantities:
+            figures["quantities.png"] = lambda: plot.cohort(self.cohort, "group", quantities=self.quantities)
+        for name, draw in figures.items():
+            figure = draw()
+            figure.savefig(folder / name, dpi=150)
+            plt.close(figure)
+
+    def __str__(self) -> str:
+        return folded(report_lines(self))
+
+
+FILES = ("people.csv", "differences.csv", "study.json", "methods.txt", "spectra.png", "quantities.png")
+
+
+def _row(difference: Difference) -> dict[str, Any]:
+    names = ("kind", "quantity", "where", "a", "b", "difference", "low", "high", "unit", "p", "p_corrected")
+    people = dict(zip(("people_a", "people_b"), difference.members, strict=True))
+    return {name: getattr(difference, name) for name in names} | people | {"left_out": difference.left_out}
+
+
+def to_table(study: StudyResult) -> dict[str, Any]:
+    """What study.json holds."""
+    rows = [{name: with_nulls(value) if isinstance(value, float) else value for name, value in _row(d).items()}
+            for d in study.differences()]  # fmt: skip
+    return {
+        "format": FORMAT,
+        "source": study.source,
+        "options": study.options,
+        "model": {"rung": study.rung, "name": RUNGS[study.rung]},
+        "aic": {str(number): with_nulls(aic) for number, aic in study.aic.items()},
+        "fits": [_fit_to_table(cell, study.cohort) for cell in study.cells],
+        "differences": rows,
+        "methods": study.methods(),
+        "versions": versions(),
+    }  # fmt: skip
+
+
+def _fit_to_table(cell: Cell, cohort: CohortResult) -> dict[str, Any]:
+    target, result = cell.target, cohort.results.get(cell.target.name)
+    own = {"person": cell.person, "group": cell.group, "condition": cell.condition, "rates_hz": list(cell.rates),
+           "segments": list(target.segments or ()), "source": target.source, "notices": list(target.notices),
+           "dispersion": None if target.dispersion is None else target.dispersion[0], "mean": target.mean,
+           "unit": target.unit, "frequency_hz": target.frequency.tolist(),
+           "proportional_power": target.proportional_power.tolist()}  # fmt: skip
+    if result is None:
+        return own | {"failed": cohort.failed[target.name]}
+    return own | {"success": result.success, "verdict": result.verdict, "adequate": result.adequate,
+                  "adequacy_p": result.adequacy_p, "fitted": with_nulls(result.fitted),
+                  "estimates": estimates_to_table(result.found)}  # fmt: skip
+
+
+def run_study(
+    study: "str | os.PathLike[str] | Iterable[Mapping[str, Any]]",
+    *,
+    rung: int | str | None = None,
+    window: tuple[float, float] | None = None,
+    column: str | int | None = None,
+    rate: float | None = None,
+    units: str | None = None,
+    noise: str | None = None,
+    quantities: Iterable[str] | None = None,
+    alpha: float | None = None,
+    correction: str | None = None,
+    starts: int = 32,
+    key: int = 0,
+    progress: bool | Tell = False,
+) -> StudyResult:
+    """Fit the recordings of a whole study with one model and compare groups and conditions.
+
+        found = jm.run_study("study.csv")
+        print(found)
+        found.save("results")
+
+    The trials of a person in a condition make one target (`Trials.target`), each in its steady part. All targets are fitted
+    by `fit_cohort` with the same model, so that their numbers can be compared.
+
+    **Arguments:**
+
+    - `study`: a table (.csv, .tsv, .txt) with the columns file, person and, as far as there are any, group, condition,
+      trial, column, rate, units, window_start, window_stop, files relative to it; or a .toml with `table = "study.csv"` or
+      `[[recordings]]` of the same fields, and any of the options below up to `correction`; or rows, as dictionaries.
+    - `rung`: the model of all (`on_rung`), 0 to 3, by default 2, activation and tremor; "auto" takes the one whose AIC,
+      summed over all targets, is lowest, and takes three or four times as long.
+    - `window` (start, stop) [s], `column`, `rate` [Hz], `units`: how files are read where a row does not say it.
+    - `noise`: as in `fit`; `starts` of each fit; `key` of its random numbers.
+    - `quantities`: what is reported and compared, by default the derived quantities. Fewer mean less correction.
+    - `alpha`: 0.05 by default; intervals hold 1 - alpha.
+    - `correction`: for many comparisons, "holm" (default), "fdr" or "none"; a family is all comparisons of one kind.
+    - `progress`: True or a function of (text, share).
+
+    What is given here goes before what the file says. **Returns:** a `StudyResult`.
+
+    **Raises:** `ValueError` naming file, line and column, or the argument, and the remedy.
+    """
+    table = read_study(study)
+    given = {"rung": rung, "window": window, "column": column, "rate": rate, "units": units, "noise": noise,
+             "quantities": quantities, "alpha": alpha, "correction": correction}  # fmt: skip
+    options = USUAL | table.options | {name: value for name, value in given.items() if value is not None}
+    reading = {name: options.pop(name) for name in READING if name in options}
+    options = _checked(options) | {"starts": starts, "key": key}
+    with told(progress, f"study of {len({row.person for row in table.rows})} people") as tell:
+        tell("reading recordings", 0.0)
+        cells = cells_of_study(table.rows, reading)
+        cohort, aic = _fitted(cells, options, tell)
+    return StudyResult(cohort, tuple(cells), aic, options | {"reading": reading}, table.source)
+
+
+def _checked(options: dict[str, Any]) -> dict[str, Any]:
+    """The options, of whichever origin, fit for use."""
+    rung, alpha, names = (options[name] for name in ("rung", "alpha", "quantities"))
+    if rung != AUTO and (isinstance(rung, bool) or rung not in range(len(RUNGS))):
+        raise ValueError(f'rung = {rung!r}: give a rung of the ladder, 0 to {len(RUNGS) - 1}, or "auto"')
+    if isinstance(alpha, bool | str) or not 0 < alpha < 1:
+        raise ValueError(f"alpha = {alpha!r}: give a share between 0 and 1, as 0.05")
+    if options["correction"] not in CORRECTIONS:
+        raise ValueError(f"correction = {options['correction']!r}: {choices(str(options['correction']), CORRECTIONS)}")
+    names = None if names is None else list(names)
+    for name in names or ():
+        if name not in DERIVED and name not in PARAMETERS:
+            raise ValueError(f"quantities: unknown {name!r}; {choices(str(name), DERIVED)}")
+    return options | {"quantities": names}
+
+
+def _fitted(cells: list[Cell], options: dict[str, Any], tell: Tell) -> tuple[CohortResult, dict[int, float]]:
+    """The fits on the rung that is asked for, or on that of lowest AIC; and the AIC of each that was tried.
+
+    What no model can be fitted to has no part in the choice. After the tremor, the first rung that gains nothing ends it.
+    """
+    numbers = range(len(RUNGS)) if options["rung"] == AUTO else (options["rung"],)
+    labels = {cell.target.name: ", ".join(filter(None, (cell.group, cell.condition))) for cell in cells}
+    tried: dict[int, CohortResult] = {}
+    aic: dict[int, float] = {}
+    for number in numbers:
+        first = len(tried)
+        tried[number] = fit_cohort(
+            [cell.target for cell in cells], groups=labels, noise=options["noise"], rung=number, starts=options["starts"],
+            key=options["key"], progress=lambda text, share, n=number, i=first: tell(f"model {n}: {text}",
+                                                                                   (i + share) / len(numbers)),
+        )  # fmt: skip
+        table = np.array([[_aic(cohort, cell) for cell in cells] for cohort in tried.values()])
+        table = table[:, np.isfinite(table).any(axis=0)]
+        aic = dict(zip(tried, map(float, table.sum(axis=1)), strict=True))
+        if number >= 2 and min(aic, key=lambda n: aic[n]) != number:
+            break
+    return tried[min(aic, key=lambda n: aic[n])], aic
+
+
+def _aic(cohort: CohortResult, cell: Cell) -> float:
+    result = cohort.results.get(cell.target.name)
+    return result.ladder[0].aic if result is not None and result.ladder else np.inf

@@ -1,0 +1,147 @@
+"""A study in words: the report on a terminal, and the paragraph for a paper."""
+
+import platform
+from collections import Counter
+from typing import TYPE_CHECKING, Any
+
+import scipy
+
+from jaxmuscle._common.environment import versions
+from jaxmuscle.model._rungs import RUNGS
+
+from ._differences import Difference
+
+if TYPE_CHECKING:
+    from ._study import StudyResult
+
+MOST = 12  # comparisons on a terminal
+NAMES = {
+    "holm": "Holm's method, which bounds the chance of any false positive",
+    "fdr": "the method of Benjamini and Hochberg, which bounds the expected share of false positives",
+}
+DETREND = {"constant": "mean removed", "linear": "straight line removed", "none": "mean not removed"}
+TESTS = {
+    "groups": "groups within each condition by Welch's t test",
+    "conditions": "conditions within people by the paired t test",
+    "interaction": "the change between conditions of two groups by Welch's t test",
+}
+
+
+def report_lines(study: "StudyResult") -> list[str]:
+    """What a terminal shows."""
+    cohort, found = study.cohort, sorted(study.differences(), key=lambda d: (d.p_corrected, d.p))
+    alpha = study.options["alpha"]
+    clear = [d for d in found if d.p_corrected is not None and d.p_corrected < alpha]
+    model = f"model of all: {study.rung}, {RUNGS[study.rung]}{_aic(study)}"
+    lines = [f"Study: {_people(study)}", f"  {_trials(study)}", f"  {model}", f"  {cohort.verdict}"]
+    lines += [f"  not fitted: {name}: {why}" for name, why in cohort.failed.items()]
+    if not found:
+        return [*lines, "  nothing to compare: no quantity is determined for two people on each side of a comparison"]
+    families = Counter(d.kind for d in found)
+    lines.append(f"  comparisons: {', '.join(f'{n} of {kind}' for kind, n in families.items())}; "
+                 f"after correction ({study.options['correction']}) {len(clear)} have p < {alpha:g}")  # fmt: skip
+    lines += [f"    {_sentence(d, alpha)}" for d in found[:MOST]]
+    lines += [f"    and {len(found) - MOST} more"] if len(found) > MOST else []
+    if any(d.left_out for d in found):
+        lines.append("  People whose fits do not determine a quantity are left out of its comparisons: a selection")
+    return lines
+
+
+def _sentence(d: Difference, alpha: float) -> str:
+    unit = "" if d.unit == "1" else f" {d.unit}"
+    where = f", {d.where}" if d.where else ""
+    people = "/".join(map(str, d.members if d.kind != "conditions" else d.members[:1]))
+    left = f", {d.left_out} left out" if d.left_out else ""
+    return (f"{'*' if d.p_corrected is not None and d.p_corrected < alpha else ' '} {d.quantity}{where}: {d.b} - {d.a} = "
+            f"{d.difference:.3g}{unit} ({d.low:.3g} to {d.high:.3g}), p = {d.p:.2g}, corrected "
+            f"{d.p_corrected:.2g} ({people} people{left})")  # fmt: skip
+
+
+def _people(study: "StudyResult") -> str:
+    count = Counter(study.people.values())
+    groups = f" in {len(count)} groups ({', '.join(f'{g} {n}' for g, n in count.items())})" if any(count) else ""
+    conditions = f" in {len(study.conditions)} conditions ({', '.join(study.conditions)})" if any(study.conditions) else ""
+    return f"{len(study.people)} people{groups}{conditions}"
+
+
+def _trials(study: "StudyResult") -> str:
+    each = [cell.trials for cell in study.cells]
+    segments = [sum(cell.target.segments or ()) for cell in study.cells]
+    per = "person and condition" if any(study.conditions) else "person"
+    return f"{sum(each)} recordings, {_range(each)} per {per}, {sum(segments)} Welch segments, {_range(segments)} per {per}"
+
+
+def _aic(study: "StudyResult") -> str:
+    if len(study.aic) < 2:
+        return ""
+    above = {number: aic - study.aic[study.rung] for number, aic in study.aic.items() if number != study.rung}
+    return f" (lowest summed AIC; above it: {', '.join(f'{number} by {aic:.0f}' for number, aic in above.items())})"
+
+
+def _count(comparisons: int) -> str:
+    return f"{comparisons} comparison" + "s" * (comparisons > 1)
+
+
+def _range(values: list[Any]) -> str:
+    low, high = min(values), max(values)
+    return f"{low:g}" if low == high else f"{low:g} to {high:g}"
+
+
+def methods_paragraph(study: "StudyResult") -> str:
+    """People, recordings, spectra, model, fit, statistics and versions, in sentences."""
+    s = study.cells[0].target.settings
+    cohort, window = study.cohort, study.options["reading"].get("window")
+    rates = [rate for cell in study.cells for rate in cell.rates]
+    part = "the steady part of each recording" if window is None else f"{window[0]:g} s to {window[1]:g} s"
+    low_pass = "no low-pass" if s.filter_cutoff is None else (
+        f"low-pass filtered (Butterworth, order {s.filter_order}, {s.filter_cutoff:g} Hz, "
+        f"{'forwards and backwards' if s.filter_direction == 'both' else 'forwards'})")  # fmt: skip
+    whose = "person and condition" if any(study.conditions) else "person"
+    noise = "" if study.options["noise"] is None else f" with {study.options['noise']} noise"
+    said = [
+        f"We analysed {_people(study)}: {_trials(study)}.",
+        f"Recordings (sampled at {_range(rates)} Hz) were resampled to {s.rate:g} Hz and {low_pass}; {part} was analysed "
+        "where the table of the study states no other window.",
+        f"Power spectra were estimated by Welch's method ({s.window.capitalize()} window, {s.length} samples, "
+        f"{100 * s.overlap:g} % overlap, {DETREND[s.detrend]}) from {s.frequency[0]:.2f} to {s.frequency[-1]:.2f} Hz. "
+        f"Spectra of trials of one {whose} were averaged, weighted with their segments; where trials scattered more than "
+        "their segments explain, all errors were widened by that.",
+        f"A stochastic rheological muscle model{noise} was fitted to every averaged spectrum, its coefficient of variation "
+        f"and, where recorded in newtons, its mean force (linear response, Levenberg-Marquardt, {study.options['starts']} "
+        "starts, log power weighted by the scatter of Welch's estimate).",
+        f"All spectra were fitted with the same model ({RUNGS[study.rung]}){_choice(study)}.",
+        f"{cohort.verdict[0].upper()}{cohort.verdict[1:]} (criterion: p >= 0.01).",
+        *_statistics(study),
+        f"Software: {', '.join(f'{name} {number}' for name, number in versions().items())}, scipy {scipy.__version__}, "
+        f"Python {platform.python_version()}.",
+    ]  # fmt: skip
+    return " ".join(said)
+
+
+def _choice(study: "StudyResult") -> str:
+    if len(study.aic) < 2:
+        return ""
+    return (f", of the models tried ({'; '.join(RUNGS[n] for n in study.aic)}) the one with the lowest AIC summed over all "
+            "spectra; groups and conditions had no part in this choice")  # fmt: skip
+
+
+def _statistics(study: "StudyResult") -> list[str]:
+    found = study.differences()
+    if not found:
+        return []
+    families = Counter(d.kind for d in found)
+    tests = "; ".join(f"{TESTS[kind]} ({_count(n)})" for kind, n in families.items())
+    correction = NAMES.get(study.options["correction"])
+    p = (f"p-values were corrected by {correction}, for all comparisons of the same kind together" if correction
+         else "p-values are not corrected for the number of comparisons")  # fmt: skip
+    left = [d.left_out for d in found if d.left_out]
+    selected = (
+        [f"A quantity that a person's fit does not determine was left out for that person (in {len(left)} of {len(found)} "
+         f"comparisons, {_range(left)} people), which is a selection."]
+        if left else []
+    )  # fmt: skip
+    return [
+        f"We compared {tests}, with people as the unit and quantities as they are, not their logarithms. Intervals hold "
+        f"{100 * (1 - study.options['alpha']):g} % for one comparison at a time; {p}.",
+        *selected,
+    ]

@@ -1,0 +1,63 @@
+"""The figure of a study: spectra of people and means of their groups, a panel for each condition."""
+
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure, SubFigure
+
+from ._style import PALETTE, PROPORTIONAL, canvas, density_unit, frequency_axis, styled
+
+WIDTH, HEIGHT, ACROSS = 3.6, 3.0, 3  # inches, inches, panels
+
+
+@styled
+def study(study: Any, ax: Axes | None = None, *, proportional: bool = True) -> Figure | SubFigure:
+    """Draws the spectrum of every person (thin) and the geometric mean of each group with its standard error (thick).
+
+    **Arguments:** `study`, a `StudyResult`; `ax`, its place, or a new figure; `proportional`, or else power in unit²/Hz,
+    which is known where everybody has at least two trials.
+
+    **Raises:** `ValueError` for power in unit²/Hz where it is not known, or where people were measured in different units.
+    """
+    cells = study.cells
+    units = {cell.target.unit for cell in cells}
+    if not proportional and (len(units) > 1 or any(cell.target.trial_power is None for cell in cells)):
+        raise ValueError("proportional = False: power is known where everybody has at least two trials, in the same unit")
+    down, across = -(-len(study.conditions) // ACROSS), min(len(study.conditions), ACROSS)
+    fig = canvas(ax, (WIDTH * max(across, 1.3), HEIGHT * down))
+    axes = fig.subplots(down, across, squeeze=False, sharex=True, sharey=True)
+    for panel, condition in zip(axes.flat, study.conditions, strict=False):
+        for number, group in enumerate(study.groups):
+            here = [cell.target for cell in cells if (cell.group, cell.condition) == (group, condition)]
+            if here:
+                _group(panel, here, PALETTE[number % len(PALETTE)], group, proportional)
+        panel.set_title(condition)
+        frequency_axis(panel, log=True)
+        panel.legend(loc="lower left")
+    for panel in axes.flat[len(study.conditions) :]:
+        panel.remove()
+    unit = next(iter(units)) or "?"
+    axes[0, 0].set_ylabel(PROPORTIONAL if proportional else f"Power ({density_unit(unit)})")
+    return fig
+
+
+def _group(ax: Axes, targets: list[Any], colour: str, group: str, proportional: bool) -> None:
+    rows = [target.proportional_power if proportional else _power(target) for target in targets]
+    for target, row in zip(targets, rows, strict=True):
+        ax.plot(target.frequency, row, color=colour, lw=0.5, alpha=0.45, zorder=2)
+    log = np.log(np.stack(rows))
+    mean = log.mean(axis=0)
+    count = len(rows)
+    if count > 1:
+        error = log.std(axis=0, ddof=1) / np.sqrt(count)
+        band = np.exp(mean - error), np.exp(mean + error)
+        ax.fill_between(targets[0].frequency, *band, color=colour, alpha=0.25, lw=0, zorder=3)
+    people = f"{count} people" if count > 1 else "1 person"
+    label = f"{group} ({people})" if group else people
+    ax.plot(targets[0].frequency, np.exp(mean), color=colour, lw=1.8, label=label, zorder=4)
+
+
+def _power(target: Any) -> Float[np.ndarray, " bins"]:
+    return np.average(target.trial_power, axis=0, weights=target.segments)

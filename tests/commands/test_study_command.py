@@ -1,0 +1,59 @@
+"""`jaxmuscle study`: mistakes in one line, a folder that is not overwritten unasked, what is printed."""
+
+import numpy as np
+import pytest
+from test_study import made_study
+from typer.testing import CliRunner
+
+import jaxmuscle as jm
+from jaxmuscle.commands.main import app
+
+
+@pytest.fixture
+def table(tmp_path):
+    for name in "ab":
+        np.save(tmp_path / f"{name}.npy", 5 + np.random.default_rng(ord(name)).standard_normal(1200))
+    path = tmp_path / "study.csv"
+    path.write_text("file,person\na.npy,a\nb.npy,b\n")
+    return path
+
+
+def command(*arguments):
+    result = CliRunner().invoke(app, ["study", *map(str, arguments)], env={"COLUMNS": "300"})
+    assert result.exception is None or isinstance(result.exception, SystemExit), repr(result.exception)
+    return result
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ((), "study.csv: line 2: "),  # no rate
+        (("--rate", 100, "--rung", 7), "rung = 7: give a rung of the ladder"),
+        (("--window", "early"), "--window early: give start and end in s"),
+        (("--quantities", "tremor_frequenzy"), "did you mean 'tremor_frequency'?"),
+    ],
+)
+def test_mistakes(options, message, table, tmp_path):
+    result = command(table, "--out", tmp_path / "out", *options)
+    assert result.exit_code == 2 and message in result.stderr, result.stderr
+    assert not (tmp_path / "out" / "study.json").exists()
+
+
+def test_a_study_is_overwritten_only_with_force(table, tmp_path, monkeypatch):
+    asked = {}
+
+    def run_study(path, **options):
+        asked.update(options)
+        return made_study()
+
+    monkeypatch.setattr(jm, "run_study", run_study)
+    out = tmp_path / "out"
+    first = command(table, "--out", out, "--rung", "2", "--window", "1:9", "--quantities", "mean, tremor_share")
+    assert first.exit_code == 0, first.stderr
+    assert (asked["rung"], asked["window"], asked["quantities"]) == (2, (1.0, 9.0), ["mean", "tremor_share"])
+    assert "Study: 10 people in 2 groups" in first.stdout and "differences.csv" in first.stdout
+    before = (out / "study.json").read_bytes()
+    again = command(table, "--out", out)
+    assert again.exit_code == 2 and "overwrite it with --force" in again.stderr
+    assert (out / "study.json").read_bytes() == before
+    assert command(table, "--out", out, "--force").exit_code == 0
