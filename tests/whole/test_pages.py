@@ -94,7 +94,8 @@ def readme(once, tmp_path_factory):
     """What the README leaves behind."""
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(tmp_path_factory.mktemp("readme"))
-        write_recording("trial.csv")
+        for number, name in enumerate(("trial.csv", "trial1.csv", "trial2.csv", "trial3.csv")):
+            write_recording(name, 5 + number)
         for seed, name in enumerate("abc"):
             write_spectrum(f"{name}.csv", seed)
         with contextlib.redirect_stdout(io.StringIO()) as printed:

@@ -131,12 +131,12 @@ def _or_nan(value: float | None) -> float:
 
 
 def _quantities(result: FitResult) -> dict[str, Any]:
-    """Free parameters and derived quantities; what is both (the harmonic's frequency) once."""
-    return {name: p for name, p in result.parameters.items() if p.free} | result.derived
+    """Free parameters and derived quantities, as they are shown; what is both (the harmonic's frequency) once."""
+    return result.as_shown({name: p for name, p in result.parameters.items() if p.free} | result.derived)
 
 
 def _determined(result: FitResult) -> dict[str, Any]:
-    return result.determined
+    return result.as_shown(result.determined)
 
 
 def fit_cohort(

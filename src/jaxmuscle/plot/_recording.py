@@ -9,6 +9,8 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from ._style import BLACK, BLUE, GREY, ORANGE, SKY, canvas, density_unit, legend, styled
 
+MOST = 8  # traces of trials that are drawn
+
 
 @styled
 def recording(recording: Any, settings: Any = None, ax: Axes | None = None) -> Figure | SubFigure:
@@ -32,13 +34,19 @@ def trials(trials: Any, settings: Any = None, ax: Axes | None = None) -> Figure 
     """Draws the windows of several recordings below each other, and their spectra with the mean, linear and logarithmic."""
     if len(trials) == 1:
         return recording(trials[0], settings, ax)
-    fig = canvas(ax, (9.0, 5.6))
+    fig, shown = canvas(ax, (9.0, 5.6)), trials[:MOST]
     traces, spectra = fig.subfigures(1, 2, squeeze=False, width_ratios=(1.0, 1.3))[0]
-    rows = traces.subplots(len(trials), 1, sharex=True, squeeze=False)[:, 0]
-    for panel, one in zip(rows, trials, strict=True):
+    rows = traces.subplots(len(shown), 1, sharex=True, sharey=True, squeeze=False)[:, 0]
+    for panel, one in zip(rows, shown, strict=True):
         x = one.filtered(settings)
         panel.plot(np.arange(x.size) * one.duration / x.size, x, color=BLUE, lw=0.6)
-        panel.set_title(one.name, loc="left", fontsize=7.0, pad=2.0, parse_math=False)
+        panel.set_title(
+            one.name if len(shown) == len(trials) else f"{one.name} (of {len(trials)} trials)",
+            loc="left",
+            fontsize=7.0,
+            pad=2.0,
+            parse_math=False,
+        )
         panel.margins(x=0)
     _label(rows[-1], "Time in the window (s)", "")
     traces.supylabel(f"{(trials[0].quantity or 'signal').capitalize()} ({trials[0].unit})", fontsize=8.0)

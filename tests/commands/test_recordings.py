@@ -1,0 +1,101 @@
+"""Commands that take recordings: several trials make one target, spectra and recordings are not mixed."""
+
+import json
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+import jaxmuscle as jm
+from jaxmuscle.commands.main import app
+
+RATE, LEVEL = 200, 40.5
+
+
+def run(*arguments):
+    return CliRunner().invoke(app, ["-q", *map(str, arguments)])
+
+
+def force(seed, seconds=17.0):
+    """A held force of 40.5 N whose fluctuation has a corner at 1 Hz."""
+    decay = np.exp(-2 * np.pi / RATE)
+    noise = np.random.default_rng(seed).normal(size=round(seconds * RATE) + 2000) * np.sqrt(1 - decay**2)
+    x = np.zeros(noise.size)
+    for i in range(1, noise.size):
+        x[i] = decay * x[i - 1] + noise[i]
+    return LEVEL + 0.6 * x[2000:]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Five trials, one of them in another unit; and the first three as columns of one file."""
+    made = tmp_path_factory.mktemp("trials")
+    trials = [force(seed) for seed in range(5)]
+    time = np.arange(trials[0].size) / RATE
+    for number, x in enumerate(trials):
+        np.savetxt(made / f"trial{number}.csv", np.column_stack([time, x]), delimiter=",", header="time,force (N)",
+        comments="", fmt="%.6g")  # fmt: skip
+    np.savetxt(made / "all.csv", np.column_stack([time, *trials[:3]]), delimiter=",", header="time,a (N),b (N),c (N)",
+               comments="", fmt="%.6g")  # fmt: skip
+    (made / "volts.csv").write_text((made / "trial0.csv").read_text().replace("(N)", "(V)"))
+    return made
+
+
+def paths(folder, count=5):
+    return [folder / f"trial{number}.csv" for number in range(count)]
+
+
+def test_trials_are_analysed_together(folder, tmp_path):
+    found = run("analyse", *paths(folder), "--out", tmp_path, "--save-target", tmp_path / "anna.toml", "--mvc", 300)
+    assert found.exit_code == 0, found.output
+    record = json.loads((tmp_path / "analysis.json").read_text())
+    assert [trial["recording"]["name"] for trial in record["trials"]] == [f"trial{n}" for n in range(5)]
+    means = [trial["summary"]["mean"] for trial in record["trials"]]
+    target = jm.load_target(tmp_path / "anna.toml")
+    assert target.mean == pytest.approx(means) and len(target.segments) == 5
+    assert list(target.dispersion) == record["dispersion"] and target.mvc_fraction == pytest.approx(np.mean(means) / 300)
+    np.testing.assert_allclose(record["spectrum"]["proportional_power"], target.proportional_power, rtol=1e-9)
+    assert (tmp_path / "analysis.png").stat().st_size > 20_000
+    assert "differ" in found.output and "times as much as their segments explain" in " ".join(found.output.split())
+
+
+def test_a_column_for_each_trial(folder, tmp_path):
+    found = run("analyse", folder / "all.csv", "--column", "all", "--out", tmp_path, "--json")
+    assert found.exit_code == 0, found.output
+    assert len(json.loads(found.stdout)["trials"]) == 3
+    refused = run("analyse", folder / "all.csv", "--out", tmp_path, "--force")
+    assert refused.exit_code == 2 and "--column" in refused.stderr
+
+
+REFUSED = {
+    "units": (("trial0.csv", "volts.csv"), (), "units N and V cannot be averaged"),
+    "mixed": (("trial0.csv", "fdi-abduction-45mvc"), (), "fit them one at a time, or `jaxmuscle analyse ... --save-target`"),
+    "segments": (("trial0.csv", "trial1.csv"), ("--segments", 6), "--segments and --dataset belong to spectra"),
+    "groups": (("trial0.csv",), ("--groups", "x.csv"), "--groups needs several targets"),
+    "missing": (("nothing.csv", "trial0.csv"), (), "nothing.csv"),
+}
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_what_does_not_go_together_is_refused(case, folder, tmp_path):
+    names, options, message = REFUSED[case]
+    given = [name if "." not in name else folder / name for name in names]
+    found = run("fit", *given, *options, "--out", tmp_path)
+    assert found.exit_code == 2 and message in " ".join(found.stderr.split()), found.stderr
+
+
+@pytest.mark.slow
+def test_two_commands_from_raw_trials_to_a_fit(folder, tmp_path):
+    """The mean of the fit is that of the recordings within its error."""
+    target = tmp_path / "anna.toml"
+    assert run("analyse", *paths(folder), "--out", tmp_path, "--save-target", target).exit_code == 0
+    options = ("--quick", "--rungs", 0, "--starts", 16)
+    assert run("fit", target, *options, "--out", tmp_path / "two").exit_code == 0
+    result = jm.load_result(tmp_path / "two" / "fit.json")
+    measured = [np.mean(jm.load_recording(path).steady().samples) for path in paths(folder)]
+    mean = result["mean"]
+    assert abs(mean.value - np.mean(measured)) < 2 * mean.stderr < 0.02 * LEVEL
+    # One command does the same.
+    assert run("fit", *paths(folder), *options, "--out", tmp_path / "one").exit_code == 0
+    again = jm.load_result(tmp_path / "one" / "fit.json")
+    assert again["mean"].value == pytest.approx(mean.value) and again.chi2_per_bin == pytest.approx(result.chi2_per_bin)
