@@ -8,6 +8,7 @@ from types import SimpleNamespace
 
 import matplotlib.pyplot as plt
 import numpy as np
+import pages
 import pytest
 import scipy.stats
 from test_result import made_result
@@ -226,20 +227,25 @@ def recorded(tmp_path_factory):
         np.save(folder / f"{number}.npy", force)
         rows.append(f"{number}.npy,{person},{group},{condition},{trial}")
     (folder / "study.csv").write_text("\n".join(["file,person,group,condition,trial", *rows]) + "\n")
-    (folder / "study.toml").write_text('table = "study.csv"\nrate = 100.0\nrung = 0\nquantities = ["corner_frequency"]\n')
+    (folder / "study.toml").write_text(
+        'table = "study.csv"\nrate = 100.0\nunits = "N m"\nrung = 0\nquantities = ["corner_frequency"]\n'
+    )
     return folder
 
 
 @pytest.mark.slow
-def test_a_whole_study(recorded):
-    said = []
-    found = jm.run_study(recorded / "study.toml", alpha=0.01, starts=8, progress=lambda text, share: said.append(share))
-    assert found.rung == 0 and set(found.aic) == {0} and found.options["alpha"] == 0.01
+def test_a_whole_study_as_the_page_does_it(recorded, monkeypatch):
+    monkeypatch.chdir(recorded)
+    found = pages.run("docs/study.md", smaller={'run_study("study.toml")': 'run_study("study.toml", starts=8)'})["found"]
+    plt.close("all")
+    assert found.rung == 0 and set(found.aic) == {0} and found.options["reading"] == {"rate": 100.0, "units": "N m"}
     assert [(c.person, c.condition, c.trials) for c in found.cells] == [(p, c, 2) for p in "abcd" for c in CONDITIONS]
     alone = jm.fit_cohort([found.cells[3].target], starts=8).results["b, tired"]
     (rung,) = found.cohort.results["b, tired"].ladder
     assert rung.chosen and rung.aic == pytest.approx(alone.ladder[0].aic, abs=1e-3)
     assert np.isclose(found.aic[0], sum(r.ladder[0].aic for r in found.cohort.results.values()))
     assert "with the same model (base: noise and a harmonic)" in found.methods()
-    assert said and max(said) <= 1
     assert "Study: 4 people in 2 groups (x 2, y 2) in 2 conditions (rest, tired)" in str(found)
+    assert {"people.csv", "study.json", "spectra.png", "methods.txt"} <= {p.name for p in (recorded / "out/study").iterdir()}
+    table = json.loads((recorded / "out/study/study.json").read_text())
+    assert len(table["fits"]) == 8 and all(np.isfinite(fit["fitted"]).all() for fit in table["fits"])

@@ -18,7 +18,10 @@ from jaxmuscle.commands.main import app
 from jaxmuscle.uncertainty import _posterior_checks as _mixing
 
 TRUTH = jm.Isometric().replace(harmonic_frequency=6.0, harmonic_amplitude=0.012)
-ELSEWHERE = {"docs/digitise.md": "data/test_digitised.py", "docs/own-muscle.md": "whole/test_hill.py"}
+ELSEWHERE = {
+    "docs/digitise.md": "data/test_digitised.py", "docs/own-muscle.md": "whole/test_hill.py",
+    "docs/study.md": "fits/test_study.py",
+}  # fmt: skip
 BELOW = {"docs/gallery.md"}  # its program is read instead
 RUN_HERE = {
     "README.md", "docs/coming-from-diffrax.md", "docs/coming-from-matlab.md", "docs/ensembles.md", "docs/fit-a-csv.md",

@@ -61,9 +61,13 @@ def study(
             key=seed,
             progress=True,
         )
+        whose: dict[str, list[str]] = {}
         for cell in found.cells:
             for notice in cell.target.notices:
-                err.print(f"[yellow]notice:[/] {plain(cell.target.name)}: {plain(notice)}", highlight=False)
+                whose.setdefault(notice, []).append(cell.target.name)
+        for notice, names in whose.items():
+            said = "all" if len(names) == len(found.cells) else "; ".join(names)
+            err.print(f"[yellow]notice:[/] {plain(said)}: {plain(notice)}", highlight=False)
         found.save(output)
         record(output / "study.json")
         show(found, success=found.success)

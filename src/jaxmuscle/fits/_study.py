@@ -1,11 +1,12 @@
 """A study: trials of people in conditions and groups, one model fitted to all, what differs, one folder of results."""
 
+import contextlib
 import dataclasses
 import itertools
 import os
 import tempfile
 import textwrap
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -36,6 +37,7 @@ if TYPE_CHECKING:
 AUTO = "auto"
 USUAL = {"rung": 2, "noise": None, "quantities": None, "alpha": 0.05, "correction": "holm"}
 FORMAT = 1
+COMPARED = tuple(name for name in DERIVED if name != "high_frequency_floor")  # which is the band from 8 to 12 Hz again
 
 
 class StudyResult(eqx.Module):
@@ -82,7 +84,7 @@ class StudyResult(eqx.Module):
         """What is compared: what was asked for, else all derived quantities (not the parameters) that a fit determines."""
         asked = self.options["quantities"]
         seen = {name for result in self.cohort.results.values() for name in result.determined}
-        return tuple(name for name in (DERIVED if asked is None else asked) if name in seen)
+        return tuple(name for name in (COMPARED if asked is None else asked) if name in seen)
 
     def table(self) -> list[dict[str, Any]]:
         """Tidy rows, one for each person, condition and quantity; `stderr` None where the data do not determine it."""
@@ -184,11 +186,10 @@ class StudyResult(eqx.Module):
                 write_text(folder / name, pandas.DataFrame(rows).to_csv(index=False, float_format="%.8g"))
         write_json(folder / "study.json", to_table(self))
         write_text(folder / "methods.txt", textwrap.fill(self.methods(), WIDTH) + "\n")
-        figures: dict[str, Callable[[], Any]] = {"spectra.png": self.plot}
-        if self.quantities:
-            figures["quantities.png"] = lambda: plot.cohort(self.cohort, "group", quantities=self.quantities)
-        for name, draw in figures.items():
-            figure = draw()
+        figures: dict[str, Any] = {"spectra.png": self.plot()}
+        with contextlib.suppress(ValueError):  # nothing that half of the targets determine
+            figures["quantities.png"] = plot.cohort(self.cohort, "group", quantities=self.quantities)
+        for name, figure in figures.items():
             figure.savefig(folder / name, dpi=150)
             plt.close(figure)
 

@@ -59,8 +59,9 @@ def _sentence(d: Difference, alpha: float) -> str:
 
 def _people(study: "StudyResult") -> str:
     count = Counter(study.people.values())
-    groups = f" in {len(count)} groups ({', '.join(f'{g} {n}' for g, n in count.items())})" if any(count) else ""
-    conditions = f" in {len(study.conditions)} conditions ({', '.join(study.conditions)})" if any(study.conditions) else ""
+    names = study.conditions
+    groups = f" in {_count(len(count), 'group')} ({', '.join(f'{g} {n}' for g, n in count.items())})" if any(count) else ""
+    conditions = f" in {_count(len(names), 'condition')} ({', '.join(names)})" if any(names) else ""
     return f"{len(study.people)} people{groups}{conditions}"
 
 
@@ -78,8 +79,8 @@ def _aic(study: "StudyResult") -> str:
     return f" (lowest summed AIC; above it: {', '.join(f'{number} by {aic:.0f}' for number, aic in above.items())})"
 
 
-def _count(comparisons: int) -> str:
-    return f"{comparisons} comparison" + "s" * (comparisons > 1)
+def _count(number: int, what: str) -> str:
+    return f"{number} {what}" + "s" * (number > 1)
 
 
 def _range(values: list[Any]) -> str:
@@ -90,10 +91,11 @@ def _range(values: list[Any]) -> str:
 def methods_paragraph(study: "StudyResult") -> str:
     """People, recordings, spectra, model, fit, statistics and versions, in sentences."""
     s = study.cells[0].target.settings
-    cohort, window = study.cohort, study.options["reading"].get("window")
+    window = study.options["reading"].get("window")
+    judged = [result.adequate for result in study.cohort.results.values() if result.adequate is not None]
     rates = [rate for cell in study.cells for rate in cell.rates]
     part = "the steady part of each recording" if window is None else f"{window[0]:g} s to {window[1]:g} s"
-    low_pass = "no low-pass" if s.filter_cutoff is None else (
+    low_pass = "not low-pass filtered" if s.filter_cutoff is None else (
         f"low-pass filtered (Butterworth, order {s.filter_order}, {s.filter_cutoff:g} Hz, "
         f"{'forwards and backwards' if s.filter_direction == 'both' else 'forwards'})")  # fmt: skip
     whose = "person and condition" if any(study.conditions) else "person"
@@ -110,7 +112,7 @@ def methods_paragraph(study: "StudyResult") -> str:
         f"and, where recorded in newtons, its mean force (linear response, Levenberg-Marquardt, {study.options['starts']} "
         "starts, log power weighted by the scatter of Welch's estimate).",
         f"All spectra were fitted with the same model ({RUNGS[study.rung]}){_choice(study)}.",
-        f"{cohort.verdict[0].upper()}{cohort.verdict[1:]} (criterion: p >= 0.01).",
+        f"The model describes {sum(judged)} of {len(judged)} spectra (p >= 0.01); the errors of the others were widened.",
         *_statistics(study),
         f"Software: {', '.join(f'{name} {number}' for name, number in versions().items())}, scipy {scipy.__version__}, "
         f"Python {platform.python_version()}.",
@@ -130,7 +132,7 @@ def _statistics(study: "StudyResult") -> list[str]:
     if not found:
         return []
     families = Counter(d.kind for d in found)
-    tests = "; ".join(f"{TESTS[kind]} ({_count(n)})" for kind, n in families.items())
+    tests = "; ".join(f"{TESTS[kind]} ({_count(n, 'comparison')})" for kind, n in families.items())
     correction = NAMES.get(study.options["correction"])
     p = (f"p-values were corrected by {correction}, for all comparisons of the same kind together" if correction
          else "p-values are not corrected for the number of comparisons")  # fmt: skip
