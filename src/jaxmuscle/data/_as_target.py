@@ -21,7 +21,7 @@ ROWS, POINTS = 90, 500
 def as_target(given: Any, **options: Any) -> Target:
     """The target that is meant.
 
-    A `Target` is taken as it is. A `Recording`, `Trials` or several recordings of one condition give theirs
+    `given`: a `Target` is taken as it is. A `Recording`, `Trials` or several recordings of one condition give theirs
     (`Trials.target`), in the windows that they have. The path of a recording, or several of trials, is read, and the steady
     part of each found (`Recording.steady`). Another path, or the name of a bundled target, is read as a spectrum.
 
@@ -61,7 +61,7 @@ def _remedy(given: Any) -> str:
 
 
 def is_recording(path: str | os.PathLike[str]) -> bool:
-    """Whether a file holds a recording rather than a spectrum: by its ending, a .csv by its header and number of rows."""
+    """Whether the file at `path` holds a recording rather than a spectrum: by its ending, a .csv by its header and rows."""
     path = Path(path).expanduser()
     kind = path.suffix.lower()
     if kind != ".csv" or not path.is_file():

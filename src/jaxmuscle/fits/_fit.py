@@ -1,7 +1,7 @@
 """Fit of a task's parameters to a target spectrum, in linear response or by Monte Carlo."""
 
 from collections.abc import Callable, Iterable, Mapping
-from typing import Any
+from typing import Any, Literal
 
 import jax
 from jaxtyping import PRNGKeyArray
@@ -35,7 +35,7 @@ def fit(
     bounds: Mapping[str, tuple[float, float]] | None = None,
     priors: Mapping[str, float | None] | None = None,
     coefficient_of_variation: bool = True,
-    mean_force: tuple[float, float] | bool | None = None,
+    mean_force: tuple[float, float] | Literal[False] | None = None,
     max_steps: int = 40,
     dt: float = DT,
     check_seeds: int | None = None,

@@ -18,6 +18,7 @@ from jaxmuscle._common.arrays import with_nulls
 from jaxmuscle._common.environment import versions
 from jaxmuscle._common.files import write_json, write_text
 from jaxmuscle._common.progress import Tell, told
+from jaxmuscle._common.tables import frame
 from jaxmuscle._common.text import WIDTH, choices, folded
 from jaxmuscle.data._study_table import READING, Cell, cells_of_study, read_study
 from jaxmuscle.model._parameters import PARAMETERS
@@ -100,9 +101,7 @@ class StudyResult(eqx.Module):
 
     def to_dataframe(self) -> "pandas.DataFrame":
         """The rows of `table`."""
-        import pandas
-
-        return pandas.DataFrame(self.table())
+        return frame(self.table())
 
     def differences(self) -> tuple[Difference, ...]:
         """Every comparison of `quantities` with at least two people on each side.
@@ -178,12 +177,11 @@ class StudyResult(eqx.Module):
 
     def _write(self, folder: Path) -> None:
         import matplotlib.pyplot as plt
-        import pandas
 
         tables = {"people.csv": self.table(), "differences.csv": [_row(d) for d in self.differences()]}
         for name, rows in tables.items():
             if rows:
-                write_text(folder / name, pandas.DataFrame(rows).to_csv(index=False, float_format="%.8g"))
+                write_text(folder / name, frame(rows).to_csv(index=False, float_format="%.8g"))
         write_json(folder / "study.json", to_table(self))
         write_text(folder / "methods.txt", textwrap.fill(self.methods(), WIDTH) + "\n")
         figures: dict[str, Any] = {"spectra.png": self.plot()}

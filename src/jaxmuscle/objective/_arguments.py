@@ -104,7 +104,7 @@ class FitOptions:
     bounds: Mapping[str, tuple[float, float]] | None = None
     priors: Mapping[str, float | None] | None = None
     coefficient_of_variation: bool = True
-    mean_force: tuple[float, float] | bool | None = None
+    mean_force: tuple[float, float] | Literal[False] | None = None
     also_free: tuple[str, ...] = ()
     max_steps: int = 40
     dt: float = DT
