@@ -261,9 +261,10 @@ def test_a_fit_has_the_measured_mean(strong):
     mean, error = result.derived["mean"].value, result.derived["mean"].stderr
     assert abs(mean - measured) < 2 * error < 0.05 * measured
     assert "P_w" in result.free and result.settings["mean_force"] is not None and not result.per_newton
-    assert result.task.muscle.mass_w > 5 * jm.Isometric().muscle.mass_w if hasattr(result.task.muscle, "mass_w") else True
     assert result.task["m_w"] > 5 * jm.Isometric()["m_w"]
     target = jm.Trials(found).target()
+    assert result.settings["carried"] == pytest.approx(result.task["m_w"] / jm.Isometric()["m_w"])
+    assert "carried to the measured mean force" in " ".join(str(result).split())
     without = jm.fit(jm.Isometric(), target, seeds=0, check_seeds=0, starts=16, mean_force=False)
     assert without.per_newton and "P_w" not in without.free
     # Another scale of force is the same spectrum: P_w is one more freedom, which a mean takes away again.
@@ -279,3 +280,17 @@ def test_profile_and_reopening_keep_the_mean(strong):
     ((low, high),) = found.intervals
     assert low < result.derived["mean"].value < high
     assert (high - low) / 2 == pytest.approx(1.96 * result.derived["mean"].stderr, rel=0.2)
+
+
+@pytest.mark.slow
+def test_a_joint_fit_at_two_forces():
+    """One muscle at two drives: stiffness is shared, every P_w follows its own mean."""
+    weak = jm.at_force(jm.Isometric(), 20.0)
+    found = {"weak": people(weak, 3, 12), "strong": people(weak.replace(P_w=1.5 * weak["P_w"]), 3, 13)}
+    result = jm.fit_joint(found, starts=8, seeds=0)
+    assert {"P_w@weak", "P_w@strong"} <= set(result.free) and "k_w" in result.free
+    for name, recordings in found.items():
+        measured = np.mean([np.mean(r.samples) for r in recordings])
+        mean = result[f"mean@{name}"]
+        assert abs(mean.value - measured) < 2 * mean.stderr < 0.05 * measured
+    assert result["P_w@strong"].value > result["P_w@weak"].value

@@ -90,8 +90,8 @@ def fit_joint(
     models = _models(loaded, tasks or {}, noise, dict(fix or {}))
     carried: tuple[str, ...] = ()
     if mean_force is None and not tasks and "P_w" not in map(base_of, fix or ()):
-        models, mean_force = _at_means(models, loaded)
-        carried = tuple(mean_force)
+        models, mean_force, factor = _at_means(models, loaded)
+        carried, options = tuple(mean_force), dataclasses.replace(options, carried=factor)
     with told(progress, f"fitting {', '.join(loaded)}") as tell, jax.enable_x64(True):
         options = dataclasses.replace(options, progress=tell)
         return search(planned_jointly(models, loaded, options, separate, proportional, mean_force, carried))
@@ -114,7 +114,7 @@ def planned_jointly(
     bounds, priors, means = dict(options.bounds or {}), dict(options.priors or {}), dict(mean_force or {})
     check_shared(tasks, separate, proportional)
     local = _local_free(
-        tasks, targets, None if options.free is None else tuple(options.free), options.fix or (), options.also_free
+        tasks, targets, None if options.free is None else tuple(options.free), options.fix or (), tuple(carried)
     )
     names = joint_names(local, tasks, separate)
     known = list(dict.fromkeys(joint for of in names.values() for joint in of.values()))
@@ -188,18 +188,18 @@ def _local_free(
     return found
 
 
-def _at_means(tasks: Tasks, targets: dict[str, Target]) -> tuple[Tasks, dict[str, tuple[float, float]]]:
-    """All tasks carried by one number to the first mean force that a target states, each P_w to its own; these means."""
+def _at_means(tasks: Tasks, targets: dict[str, Target]) -> tuple[Tasks, dict[str, tuple[float, float]], float | None]:
+    """All tasks carried by one number to the first mean force that a target states, each P_w to its own; means, number."""
     stated = {
         name: t.mean_force for name, t in targets.items() if t.mean_force is not None and tasks[name].output_unit == "N"
     }
     if not stated or not all(is_scalable(task.muscle) for task in tasks.values()):
-        return tasks, {}
+        return tasks, {}, None
     first, (mean, _) = next(iter(stated.items()))
     factor = float(at_force(tasks[first], mean)["P_w"]) / float(tasks[first]["P_w"])
     moved = {name: times_force(task, factor) for name, task in tasks.items()}
     own = {name: moved[name].replace(P_w=float(moved[name]["P_w"]) * value / mean) for name, (value, _) in stated.items()}
-    return moved | own, stated
+    return moved | own, stated, factor
 
 
 def _check_known(argument: str, given: Mapping[str, Any], known: list[str]) -> None:

@@ -90,7 +90,8 @@ def _check_names(argument: str, names: Iterable[str], known: Iterable[str]) -> N
 class FitOptions:
     """How a fit is done: what `fit` and `fit_joint` are asked for, by the names of their arguments.
 
-    `also_free`: what is free besides `free`, whatever that is.
+    `also_free`: what is free besides `free`, whatever that is; `carried`, by which number the task was multiplied to come to
+    a measured mean force.
     """
 
     free: Iterable[str] | None = None
@@ -106,6 +107,7 @@ class FitOptions:
     coefficient_of_variation: bool = True
     mean_force: tuple[float, float] | Literal[False] | None = None
     also_free: tuple[str, ...] = ()
+    carried: float | None = None
     max_steps: int = 40
     dt: float = DT
     rungs: int | None = None
@@ -138,7 +140,9 @@ def at_mean(task: AbstractTask, target: Target, options: FitOptions) -> tuple[Ab
     if stated is None or level is None or level in (options.fix or {}):
         return task, options
     free = (*options.also_free, level)
-    return at_force(task, stated[0]), dataclasses.replace(options, mean_force=stated, also_free=free)
+    moved = at_force(task, stated[0])
+    factor = float(moved["m_w"]) / float(task["m_w"])
+    return moved, dataclasses.replace(options, mean_force=stated, also_free=free, carried=factor)
 
 
 class Plan(NamedTuple):
@@ -187,7 +191,7 @@ def planned(task: AbstractTask, target: Target, options: FitOptions) -> Plan:
     settings = {
         **settings_of(problem, bounds), **counts, "max_steps": options.max_steps, "dt": options.dt,
         "coefficient_of_variation": variation is not None,
-        "mean_force": None if mean is None else list(mean),
+        "mean_force": None if mean is None else list(mean), "carried": options.carried,
         "spectrum": target.settings.to_dict(), "steps_per_sample": problem.steps_per_sample,
     }  # fmt: skip
     return Plan(problem, counts["starts"], options.max_steps, counts["check_seeds"], settings, options.seed)
