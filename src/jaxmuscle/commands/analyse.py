@@ -20,10 +20,14 @@ def analyse(
     window: Window = None,
     spectrum: Annotated[
         SpectrumName,
-        typer.Option(help="slow: bins of 0.1 Hz, for what is below 1 Hz; multitaper: the same for short recordings."),
+        typer.Option(
+            help="standard: bins of 0.39 Hz. slow: of 0.1 Hz, for what is below 1 Hz. multitaper: the same for recordings "
+            "below 30 s. pwelch: MATLAB's."
+        ),
     ] = SpectrumName.standard,
     mvc: Annotated[
-        float | None, typer.Option(metavar="FORCE", help="Maximal voluntary contraction, in the recording's unit.")
+        float | None,
+        typer.Option(metavar="FORCE", help="Maximal voluntary contraction in the recording's unit, for the level."),
     ] = None,
     output: Output = Path("out"),
     save_target: Annotated[Path | None, typer.Option(metavar="FILE", help="Save the target for `jaxmuscle fit`.")] = None,
@@ -31,9 +35,10 @@ def analyse(
     as_json: Json = False,
     reading: dict[str, Any],
 ) -> None:
-    """Analyse a recording, or the trials of one condition: level, variability, regularity, spectrum.
+    """Look at a recording, or at the trials of one person in one condition: level, variability, regularity, spectrum.
 
-    Writes DIR/analysis.json, DIR/spectrum.csv and DIR/analysis.png. The spectra of several trials are averaged.
+    The steady part of each is found by itself, unless --window gives it. The spectra of several trials are averaged. Writes
+    DIR/analysis.json, DIR/spectrum.csv and DIR/analysis.png.
 
     Examples:
 

@@ -47,13 +47,15 @@ from .recordings import read_trials, reads_recordings
 def fit(
     target: Annotated[
         list[str],
-        typer.Argument(help="Bundled target (see `jaxmuscle targets`), spectra (.toml, .csv, .json, .tar), or recordings."),
+        typer.Argument(
+            help="A bundled spectrum (see `jaxmuscle targets`), your spectra (.toml, .csv, .json, .tar), or recordings."
+        ),
     ],
     *,
     window: Window = None,
     task: TargetTask = None,
     method: Annotated[
-        MethodName, typer.Option(help="Spectrum in linear response, then corrected; or simulated.")
+        MethodName, typer.Option(help="linear: spectrum in closed form, then corrected. montecarlo: simulated.")
     ] = MethodName.linear,
     noise: Noise = None,
     rungs: Annotated[
@@ -61,17 +63,18 @@ def fit(
         typer.Option(
             min=0,
             max=3,
-            help="Richer models that may be tried: activation, tremor, a second one. Of several targets: what all get.",
+            help="Richest model that may be tried: 0 base, 1 activation, 2 tremor, 3 a second resonance. Of several "
+            "spectra: the model that all get.",
         ),
     ] = None,
-    residual: Annotated[ResidualName, typer.Option(help="What is compared.")] = ResidualName.log,
+    residual: Annotated[ResidualName, typer.Option(help="How powers are compared.")] = ResidualName.log,
     free: Free = None,
     fix: Fix = None,
     starts: Annotated[
         int | None, typer.Option(min=1, help="Starting points; 100, or 8 where there is no linear response.")
     ] = None,
     seeds: Annotated[
-        int | None, typer.Option(min=1, help="Noise paths; 32, or 48 where there is no linear response.")
+        int | None, typer.Option(min=1, help="Simulated noise paths; 32, or 48 where there is no linear response.")
     ] = None,
     seed: Seed = 0,
     segments: Segments = None,
@@ -79,27 +82,34 @@ def fit(
     dataset: Annotated[str | None, typer.Option(metavar="NAME", help="Which dataset of a digitised figure.")] = None,
     axis: Annotated[
         str | None,
-        typer.Option(help="log-log: a digitised figure's points are log10 of Hz and power. Of a point: x, y, z, principal."),
+        typer.Option(
+            help="log-log, if a digitised figure's points are log10 of Hz and power. Of a point: x, y, z, principal."
+        ),
     ] = None,
     groups: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="CSV with the columns target, group (several targets).")
+        Path | None, typer.Option(metavar="FILE", help="CSV with the columns target, group: compare groups of spectra.")
     ] = None,
     quick: Annotated[
-        bool, typer.Option("--quick", help="Leave out simulated check, profile of the harmonic, p-value and figure.")
+        bool, typer.Option("--quick", help="Leave out the simulated check, the harmonic's profile and p-value, the figure.")
     ] = False,
     output: Output = Path("out"),
     force: Force = False,
     as_json: Json = False,
     reading: dict[str, Any],
 ) -> None:
-    """Fit the muscle to a target spectrum, to recordings, or to the spectra of many people together.
+    """Fit the muscle to a force spectrum, to the recordings of one person, or to the spectra of many people.
 
-    Recordings are the trials of one person in one condition: their spectra are averaged. Options such as --column say how
-    they are read. Several spectra are those of several people.
+    Recordings are trials of one person in one condition. Their spectra are averaged. Options such as --column say how they
+    are read.
 
-    Prints a table as soon as the search has ended, then what the checks on simulated seeds add. Writes DIR/fit.json,
-    DIR/fit.png and DIR/spectrum.csv. Several targets: DIR/TARGET/... and DIR/cohort.csv, cohort.png (and differences.csv
-    with groups); fitted in linear response, without its last checks.
+    Several spectra are those of several people. They are fitted together in linear response, without the checks on
+    simulated seeds.
+
+    Of one spectrum or person: prints a table as soon as the search has ended, then what the checks add. Writes DIR/fit.json,
+    DIR/fit.png and DIR/spectrum.csv.
+
+    Of several spectra: writes a folder DIR/TARGET for each, DIR/cohort.csv and DIR/cohort.png; with --groups also
+    DIR/differences.csv.
 
     Examples:
 

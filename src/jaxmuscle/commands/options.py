@@ -54,19 +54,25 @@ TargetTask = Annotated[TaskName | None, typer.Option(help="Default: follows from
 Noise = Annotated[
     NoiseName | None, typer.Option(help="Colour of the noise (band-limited); if it is given, no richer model is tried.")
 ]
-Free = Annotated[str | None, typer.Option(metavar="NAMES", help="Comma-separated; replaces the default set.")]
+Free = Annotated[
+    str | None, typer.Option(metavar="NAMES", help="Parameters to fit instead of the usual ones, comma-separated.")
+]
 Fix = Annotated[list[str] | None, typer.Option(metavar="NAME=VALUE", help="Set a parameter and keep it; repeatable.")]
-Segments = Annotated[int | None, typer.Option(min=1, help="Welch segments behind the target.")]
+Segments = Annotated[int | None, typer.Option(min=1, help="How many Welch segments were averaged.")]
 Quantity = Annotated[str | None, typer.Option(help="force, torque, displacement or acceleration.")]
-Window = Annotated[str | None, typer.Option(metavar="A:B", help="Steady part in s, or `all`; found by itself if left out.")]
+Window = Annotated[
+    str | None, typer.Option(metavar="A:B", help="Part to analyse [s], or `all`; by default the steady part.")
+]
 Recordings = Annotated[
     list[str], typer.Argument(metavar="RECORDING...", help="Text, .xlsx, .mat, .npy, .npz, .c3d, .edf, ... files of trials.")
 ]
-_Name = Annotated[str | None, typer.Option(metavar="NAME", help="Column, point, Data:74 (counted from 0), or all: trials.")]
+_Name = Annotated[
+    str | None, typer.Option(metavar="NAME", help="Column or point. Data:74 counts from 0. all: a trial in each.")
+]
 _Rate = Annotated[float | None, typer.Option(metavar="HZ", help="Sampling rate, if the file does not state it.")]
 _Units = Annotated[str | None, typer.Option(metavar="U", help="N, Nm, mm, m/s^2, % MVC, ...; by default the file's.")]
-_Reference = Annotated[str | None, typer.Option(metavar="NAME", help="Column or point to subtract.")]
-_Time = Annotated[str | None, typer.Option(metavar="NAME", help="Column of the time, if it is not found by itself.")]
+_Reference = Annotated[str | None, typer.Option(metavar="NAME", help="Column or point that is subtracted.")]
+_Time = Annotated[str | None, typer.Option(metavar="NAME", help="Column that holds the time, if it is not found.")]
 READING: dict[str, tuple[Any, Any]] = {  # how a recording is read: annotation and default of each option
     "column": (_Name, None),
     "rate": (_Rate, None),

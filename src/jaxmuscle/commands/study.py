@@ -8,22 +8,22 @@ import typer
 import jaxmuscle as jm
 
 from .console import CONVERGED, NOT_CONVERGED, err, out, plain, record, reporting, show, writable
-from .options import Force, Json, Noise, Output, Seed, names_in
+from .options import Force, Json, NoiseName, Output, Seed, names_in
 from .recordings import edges_of
 
 
 def study(
     table: Annotated[Path, typer.Argument(help="study.csv or study.toml.")],
-    rung: Annotated[str | None, typer.Option(help="Model of all people, 0 to 3 (2), or auto (lowest AIC).")] = None,
-    noise: Noise = None,
+    rung: Annotated[str | None, typer.Option(help="Model of all people: 0 to 3 (default 2), or auto: lowest AIC.")] = None,
+    noise: Annotated[NoiseName | None, typer.Option(help="Colour of the noise on stiffness (band-limited).")] = None,
     column: Annotated[str | None, typer.Option(help="Which column of the files, where the table does not say it.")] = None,
     rate: Annotated[float | None, typer.Option(help="Sampling rate [Hz] where neither file nor table state it.")] = None,
     units: Annotated[str | None, typer.Option(help="Unit of the recordings where the table does not say it.")] = None,
     window: Annotated[
         str | None, typer.Option(metavar="A:B", help="Part to analyse [s]; by default the steady part.")
     ] = None,
-    quantities: Annotated[str | None, typer.Option(metavar="NAMES", help="Comma-separated; what is compared.")] = None,
-    alpha: Annotated[float | None, typer.Option(help="Level of the tests (0.05); intervals hold 1 - alpha.")] = None,
+    quantities: Annotated[str | None, typer.Option(metavar="NAMES", help="What is compared, comma-separated.")] = None,
+    alpha: Annotated[float | None, typer.Option(help="Level of the tests (0.05); intervals: 1 - alpha.")] = None,
     correction: Annotated[str | None, typer.Option(help="For many comparisons: holm (default), fdr or none.")] = None,
     seed: Seed = 0,
     output: Output = Path("out"),
@@ -32,8 +32,9 @@ def study(
 ) -> None:
     """Compare groups and conditions: fit all recordings of a study with one model, write tables, figures and methods.
 
-    The table has a line for each recording: file, person, and as far as there are any group, condition, trial. Writes
-    DIR/people.csv, differences.csv, study.json, spectra.png, quantities.png and methods.txt, all at the end.
+    The table has a line for each recording, with the columns file and person; also group, condition and trial, if you have
+    these. The trials of a person in a condition are averaged. Writes DIR/people.csv, differences.csv, study.json,
+    spectra.png, quantities.png and methods.txt, all at the end.
 
     Examples:
 

@@ -161,15 +161,16 @@ def steadiness(recordings: Recording | Iterable[Recording]) -> Steadiness:
     | `dfa_exponent` | slope of detrended fluctuations, windows from 0.04 s to a tenth of the recording, order 1 |
     | `peak_frequency` | of the highest hill from 6 to 12 Hz [Hz]; NaN if there is none |
 
-    **Power by band** is the sum of `jaxmuscle.spectra.variance_spectrum` over low ≤ f < high. It takes the whole window at
-    once, resolves 1/(2T), and loses nothing: the seven powers add up to σ². A drift is in the lowest band. The shares
-    of a fit (`band_0_0.5`) are of the 30 bins from 0.39 to 11.72 Hz only, and so are larger above 0.5 Hz.
+    **Power by band** is the sum of `jaxmuscle.spectra.variance_spectrum` over low ≤ f < high. It takes the whole window, of
+    length T, at once, resolves 1/(2T), and loses nothing: the seven powers add up to σ². A drift is in the lowest band. The
+    shares of a fit (`band_0_0.5`) are of the 30 bins from 0.39 to 11.72 Hz only, and so are larger above 0.5 Hz.
 
     **The peak** is a local maximum of the Welch spectrum (2.56 s, bins of 0.39 Hz), the vertex of the parabola through the
     log power of its seven nearest bins. It counts if its log power stands 4/√segments above the higher of the valleys beside
-    it; of simulated recordings without a peak up to 4 % show one then. Of several trials, it is that of their mean spectrum.
+    it. Of simulated recordings without a peak, up to 4 % then show one. The peak of several trials is that of their mean
+    spectrum.
 
-    **Several trials** count alike: a value is the mean of the trials' values.
+    **Several trials** count alike: any other value is the mean of the trials' values.
 
     **Standard errors**, by the number of trials:
 
@@ -181,7 +182,7 @@ def steadiness(recordings: Recording | Iterable[Recording]) -> Steadiness:
     - One or two, "parts" (entropies, DFA exponent): the standard deviation of the values of the four quarters over 2;
       "segments" (peak): the jackknife over Welch segments.
 
-    In how many of simulated recordings these errors held the expected value: `docs/recordings.md`.
+    How often these errors held the expected value in simulated recordings stands in `docs/recordings.md`.
 
     **Arguments:** `recordings`, one or several trials of one condition of one person, in one unit.
 

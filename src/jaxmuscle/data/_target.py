@@ -30,7 +30,7 @@ UNUSUAL = 1.25  # dispersion from which trials are said to differ
 
 
 class Target(eqx.Module):
-    """A proportional power spectrum p_k = P_k / Σ_j P_j on the bins k that are covered, and its origin.
+    """What a fit is given: a proportional power spectrum p_k = P_k / Σ_j P_j on the bins k that are covered, and its origin.
 
     **Arguments:**
 
@@ -41,16 +41,17 @@ class Target(eqx.Module):
     - `provenance`, `source`: how and from where the numbers were obtained.
     - `reason`: what a reconstruction assumes.
     - `sigma`: standard deviation of p_k, scaled together with it.
-    - `segments`: Welch segments K of each trial averaged.
-    - `coefficient_of_variation`: standard deviation over mean of each trial, a fraction; of the force as the spectrum sees
-      it, low-passed as `settings` say. An acceleration has none, since its mean is zero.
-    - `mvc_fraction`: mean level as a fraction of the maximum voluntary contraction.
-    - `mean`, `unit`: mean force or torque of each trial, and in what. One in newtons fixes the scale of force in a fit.
+    - `segments`: number K of Welch segments of each trial. They say how much the bins scatter.
+    - `coefficient_of_variation`: standard deviation over mean of each trial, a fraction. It is that of the force as the
+      spectrum sees it, low-passed as `settings` say. An acceleration has none, since its mean is zero.
+    - `mvc_fraction`: mean level as a fraction of the maximal voluntary contraction.
+    - `mean`, `unit`: mean force or torque of each trial, and its unit. A mean force in N, mN or kN fixes the scale of force
+      in a fit.
     - `trial_power`: spectrum of each trial [unit²/Hz], shape `(trials, bins)`; `proportional_power` is their mean, weighted
       with `segments`.
-    - `dispersion`: how many times more than their segments explain the trials differ in shape, and the standard error of
-      that. Above 1 it widens every error. Follows from `trial_power` where that is given (`dispersion_of`).
-    - `settings`: how the spectrum was estimated, and thus how the model's is.
+    - `dispersion`: how many times more the mean of the trials scatters than their segments explain, and the standard error
+      of this number. Above 1 it widens every error. If `trial_power` is given, it follows from that (`dispersion_of`).
+    - `settings`: how the spectrum was estimated. The model's spectrum is made in the same way.
     - `notices`: what was done to the numbers, in sentences.
 
     **Raises:** `TargetError`, a `ValueError`, naming the argument, its value and the remedy.

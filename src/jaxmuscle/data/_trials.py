@@ -19,7 +19,10 @@ from ._target import Target
 
 
 class Trials(Sequence[Recording]):
-    """Recordings of one person in one condition: a sequence of `Recording`s that gives one `Target`.
+    """Trials of one person in one condition: a sequence of `Recording`s, which together give one `Target`.
+
+        trials = jm.load_recordings(["trial1.csv", "trial2.csv"]).steady()
+        result = jm.fit(jm.Isometric(), trials)
 
     **Arguments:** `recordings`, one or more of the same unit. Their rates, lengths and windows may differ.
 
@@ -73,12 +76,13 @@ class Trials(Sequence[Recording]):
         mvc: float | int | None = None,
         settings: SpectrumSettings | str | None = None,
     ) -> Target:
-        """One target: the trials' absolute spectra averaged, weighted with their Welch segments, which add up.
+        """One target: the absolute spectra P_i of the trials averaged, weighted with their Welch segments K_i, which add up.
 
             p_k ∝ Σ_i K_i P_ik / Σ_i K_i
 
-        It states segments, mean and, for a force or torque, the coefficient of variation of every trial; and keeps the
-        trials' spectra, whose scatter gives the dispersion (`Target.dispersion`).
+        The target states the segments of every trial; of a force or torque also its mean and coefficient of variation. It
+        keeps the spectra of several trials. Their scatter gives the dispersion: how much more the trials differ than their
+        segments explain (`Target.dispersion`).
 
         **Arguments:** `name`, or what the trials' names have in common; `quantity`, or that of the unit; `provenance`; `mvc`
         [`unit`], the maximal voluntary contraction, for the level (recordings in % MVC need none); `settings`, by default
@@ -116,8 +120,9 @@ def load_recordings(
 
         target = jm.load_recordings(["trial1.csv", "trial2.csv"]).steady().target("anna")
 
-    **Arguments:** `paths`, several files, or one file that has a column for each trial; `columns`, which of that file's
-    columns are trials (all but the time by default); `options` as in `load_recording`, the same for all files.
+    **Arguments:** `paths`, a list of files, or the path of one file that has a column for each trial; `columns`, which
+    columns of this one file are trials (by default all with numbers but the time); `options` as in `load_recording`, the
+    same for all files.
 
     **Returns:** `Trials`, in the order given. **Raises:** `ValueError` as `load_recording` does, and for different units.
     """

@@ -262,19 +262,24 @@ def run_study(
 
     **Arguments:**
 
-    - `study`: a table (.csv, .tsv, .txt) with the columns file, person and, as far as there are any, group, condition,
-      trial, column, rate, units, window_start, window_stop, files relative to it; or a .toml with `table = "study.csv"` or
-      `[[recordings]]` of the same fields, and any of the options below up to `correction`; or rows, as dictionaries.
-    - `rung`: the model of all (`on_rung`), 0 to 3, by default 2, activation and tremor; "auto" takes the one whose AIC,
-      summed over all targets, is lowest, and takes three or four times as long.
+    - `study`: one of three things. A table (.csv, .tsv, .txt) with a line for each recording. It has the columns file
+      (relative to the table) and person; it may have group, condition, trial, column, rate, units, window_start,
+      window_stop. Or a .toml with `table = "study.csv"` or `[[recordings]]` of the same fields, and any of the options
+      below up to `correction`. Or rows, as dictionaries.
+    - `rung`: the model of all people (`on_rung`), 0 to 3; by default 2, with activation and tremor. "auto" fits several and
+      takes the one whose AIC, summed over all targets, is lowest; that is three or four times as long.
     - `window` (start, stop) [s], `column`, `rate` [Hz], `units`: how files are read where a row does not say it.
     - `noise`: as in `fit`; `starts` of each fit; `key` of its random numbers.
-    - `quantities`: what is reported and compared, by default the derived quantities. Fewer mean less correction.
-    - `alpha`: 0.05 by default; intervals hold 1 - alpha.
-    - `correction`: for many comparisons, "holm" (default), "fdr" or "none"; a family is all comparisons of one kind.
+    - `quantities`: what is reported and compared; by default the derived quantities. The fewer, the less the correction
+      costs.
+    - `alpha`: level of the tests, by default 0.05. Intervals hold 1 - alpha.
+    - `correction` for many comparisons: "holm" (default), "fdr" or "none". All comparisons of one kind (groups, conditions,
+      interaction) are corrected together.
     - `progress`: True or a function of (text, share).
 
-    What is given here goes before what the file says. **Returns:** a `StudyResult`.
+    An option that is given here replaces that of the .toml; what a row says about its own file stays.
+
+    **Returns:** a `StudyResult`.
 
     **Raises:** `ValueError` naming file, line and column, or the argument, and the remedy.
     """
