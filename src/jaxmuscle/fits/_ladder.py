@@ -26,6 +26,7 @@ from ._harmonic_evidence import SIGNIFICANT, p_value
 
 STARTS = 32
 ALIKE = 2.0
+TREMOR = 2  # the rung whose rhythm is no line
 HEAD = f"{'models tried, up to one that describes the data':<47}{'chi2/bin':>9}{'p':>9}{'AIC':>9}"
 
 
@@ -87,6 +88,9 @@ def climb(first: Plan, models: Models, descend: Descend, keep: Callable[[Climbed
     tried: list[Climbed] = []
     best: Climbed | None = None
     for number in range(models.top + 1):
+        described = best is not None and best.rung.p >= ADEQUATE
+        if described and number < TREMOR:
+            continue
         plan = models.plan_of(on_rung(models.base, number)) if number else first
         plan.problem.tell(f"model {number}: {RUNGS[number]}", 0.02)
         stages: list[Stage] = []
@@ -96,11 +100,10 @@ def climb(first: Plan, models: Models, descend: Descend, keep: Callable[[Climbed
         ended = Endpoint.of(plan.problem, stages[-1])
         found = Climbed(plan, stages, known, ended, rung_of(ended, number))
         tried.append(found)
-        described = best is not None and best.rung.p >= ADEQUATE
         if best is None or found.rung.aic < best.rung.aic - ALIKE * described:
             best = found
             keep(found)
-        if described or (best.rung.p >= ADEQUATE and not (number < 2 <= models.top and _has_line(best))):
+        if described or (best.rung.p >= ADEQUATE and not (number < TREMOR <= models.top and _has_line(best))):
             break
     return tuple(each.rung._replace(chosen=each is best) for each in tried)
 
