@@ -93,6 +93,15 @@ for i, name in enumerate(["ann", "ben", "eve", "jim", "kim", "tom"]):
 cohort = jm.fit_cohort(list(people.values()), groups={name: "ab"[i % 2] for i, name in enumerate(people)})
 pair = {name: jm.Isometric().replace(P_w=5.0 * people[name].mvc_fraction / 0.26) for name in ("ann", "eve")}
 """
+STUDY = """
+rows = []
+for i, name in enumerate(people):
+    one = jm.at_level(jm.Isometric().replace(noise_K_w=0.12 + 0.04 * (i % 2)), 0.3, reference=0.26)
+    for j, force in enumerate(np.asarray(jm.ensemble(jm.settled(one), jax.random.key(i), seeds=3, duration=25.0).output)):
+        np.save(f"{name}-{j}.npy", force)
+        rows.append({"file": f"{name}-{j}.npy", "person": name, "group": "ab"[i % 2], "trial": str(j)})
+study = jm.run_study(rows, rate=100.0, units="N m", window=(5.0, 25.0), rung=0)
+"""
 SECTIONS = (
     Section("A fit", FIT, (
         Shown("fit.png", "result.plot()", "A fit; grey rows are not determined", "tutorial.md#4-read-it"),
@@ -123,6 +132,8 @@ SECTIONS = (
     )),
     Section("Recordings, people, several measurements", PEOPLE, (
         Shown("gallery/recording.png", "recording.steady().plot()", "A recording and its steady window", "recordings.md"),
+        Shown("gallery/trials.png", "jm.Trials(trials).plot()", "Five trials and their mean spectrum",
+              "recordings.md#several-trials-of-one-person"),
         Shown("gallery/steadiness.png", "jm.steadiness(trials).plot()", "How steady five trials are",
               "recordings.md#steadiness"),
         Shown("gallery/cohort.png", "cohort.plot()", "What six people's spectra determine", "fitting.md#many-targets"),
@@ -130,6 +141,9 @@ SECTIONS = (
         Shown("gallery/levels.png", 'cohort.plot(by="level")', "The same by level", "fitting.md#many-targets"),
         Shown("gallery/joint.png", "jm.fit_joint({name: people[name] for name in pair}, tasks=pair).plot()",
               "Two measurements fitted together", "identifiability.md#a-joint-fit"),
+    )),
+    Section("A study", STUDY, (
+        Shown("gallery/study.png", "study.plot()", "Spectra of people and of groups", "study.md"),
     )),
     Section("The paper's figures", '\njm.reproduce("paper")\n', tuple(
         Shown(f"gallery/paper-{name}.png", "", words, "reproduce.md") for name, words in PAPER.items()

@@ -280,7 +280,7 @@ def result(**changes):
         "settings": {"check_seeds": 64},
     }
     found = types.SimpleNamespace(**(fields | changes))
-    found.only = found
+    found.only, found.as_shown = found, dict
     found.parts = {found.target.name: found}
     return found
 

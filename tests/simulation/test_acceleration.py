@@ -31,8 +31,9 @@ def test_it_is_the_second_difference_of_the_simulated_motion(x64):
 def test_plain_monte_carlo_has_the_expected_spectrum(x64):
     """Of the nonlinear model, tremor and harmonic included; a settled task has forgotten its start by 1 s to e^-7."""
     window = (1.0, 6.12)
-    task = jm.on_rung(jm.PrescribedForce(5.0, 1.0, observe="acceleration"), 2, harmonic=True)
-    task = jm.settled(task.replace(resonance_amplitude=0.05))
+    base = jm.PrescribedForce(5.0, 1.0, observe="acceleration")
+    task = jm.on_rung(base, 2).replace(resonance_amplitude=0.05, harmonic_amplitude=base["harmonic_amplitude"])
+    task = jm.settled(task)
     # Three segments of 400 seeds leave 3 %; the step changes a bin by 0.1 % at most.
     runs = jm.ensemble(task, KEY, seeds=400, duration=window[1], dt=1e-3, control=False)
     power = np.asarray(runs.spectrum(window=window).power)

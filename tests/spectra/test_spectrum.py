@@ -191,7 +191,7 @@ def test_degrees_of_freedom_of_the_design():
     for k in (1, 2, 6, 40):
         expected = 2 * k / (1 + 2 * (1 - 1 / k) / 36)
         assert SpectrumSettings().degrees_of_freedom(k) == pytest.approx(expected, rel=1e-12)
-    assert SpectrumSettings(overlap=0.0).degrees_of_freedom(7) == 14
+    assert SpectrumSettings(overlap=0.0).degrees_of_freedom(7) == pytest.approx(14, rel=1e-12)
 
 
 @pytest.mark.parametrize("window, overlap", [("hann", 0.5), ("hann", 0.75), ("hamming", 0.5), ("boxcar", 0.5)])

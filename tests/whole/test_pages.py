@@ -260,7 +260,7 @@ def test_the_gallery_is_drawn_by_its_code_with_units_and_in_given_axes(readme, m
     for name in ("posterior", "identifiability", "compare_noise", "goodness", "bootstrap"):
         monkeypatch.setattr(jm, name, lambda *_, found=readme["returned"][name], **__: found)
     names = dict(readme)
-    for section in GALLERY.SECTIONS[:-1]:
+    for section in GALLERY.SECTIONS[:-2]:  # the paper's figures and a study, which fits/test_study.py does
         exec(section.setup, names)
         for figure in section.figures:
             made = eval(figure.code, names)
@@ -271,6 +271,7 @@ def test_the_gallery_is_drawn_by_its_code_with_units_and_in_given_axes(readme, m
         ("fit", names["result"]), ("simulation", names["runs"]), ("posterior", names["found"]), ("chains", names["found"]),
         ("comparison", jm.compare_noise()), ("identifiability", jm.identifiability()), ("goodness", jm.goodness()),
         ("bootstrap", jm.bootstrap()), ("cohort", names["cohort"]), ("recording", names["recording"]),
+        ("trials", jm.Trials(names["trials"])),
     ):  # fmt: skip
         figure, (mine, place) = plt.subplots(1, 2, figsize=(20.0, 12.0), layout="constrained")
         part = getattr(jm.plot, draw)(result, ax=place)

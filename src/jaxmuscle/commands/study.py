@@ -72,5 +72,6 @@ def study(
         found.save(output)
         record(output / "study.json")
         show(found, success=found.success)
-        out.print(f"Written: {output}/{', '.join(sorted(path.name for path in output.iterdir()))}", highlight=False)
+        files = ", ".join(sorted(path.name for path in output.iterdir()))
+        out.print(f"Written: {output}/{files}", highlight=False, soft_wrap=True)
     raise typer.Exit(CONVERGED if found.success else NOT_CONVERGED)

@@ -125,7 +125,8 @@ def search_together(plans: list[Plan], tell: Callable[[str, float], None], numbe
         unused = plan.settings | {"seeds": 0, "check_seeds": 0}
         finite = np.isfinite(stages[-1].minima.cost[stages[-1].minima.best])
         ended = Endpoint.of(plan.problem, stages[-1]) if finite else None
-        rungs = () if ended is None or ended.adequacy is None else (rung_of(ended, number)._replace(chosen=True),)
+        judged = ended is not None and ended.adequacy is not None and len(plan.problem.parts) == 1
+        rungs = (rung_of(ended, number)._replace(chosen=True),) if ended is not None and judged else ()
         results.append(report_fit(plan._replace(settings=unused, check_seeds=0), stages, rungs, ended=ended))
         tell(f"reporting {plan.problem.title}", 0.8 + 0.2 * len(results) / len(plans))
     return results
