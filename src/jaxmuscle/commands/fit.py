@@ -154,7 +154,9 @@ def fit(
             options |= {"rung": rungs or 0}
             raise typer.Exit(fit_together(target, read, task, groups, output, options, force=force))
         if groups is not None:
-            raise ValueError("--groups needs several targets")
+            raise ValueError(
+                "--groups needs several targets; recordings of several people are a study: see `jaxmuscle study`"
+            )
         options |= {"method": str(method), "seeds": seeds, "rungs": rungs}
         options |= {"check_seeds": 0} if quick else {}
         if any(recorded):

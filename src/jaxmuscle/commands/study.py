@@ -20,7 +20,7 @@ def study(
     rate: Annotated[float | None, typer.Option(help="Sampling rate [Hz] where neither file nor table state it.")] = None,
     units: Annotated[str | None, typer.Option(help="Unit of the recordings where the table does not say it.")] = None,
     window: Annotated[
-        str | None, typer.Option(metavar="A:B", help="Part to analyse [s]; by default the steady part.")
+        str | None, typer.Option(metavar="A:B", help="Part to analyse [s], or all; by default the steady part.")
     ] = None,
     quantities: Annotated[str | None, typer.Option(metavar="NAMES", help="What is compared, comma-separated.")] = None,
     alpha: Annotated[float | None, typer.Option(help="Level of the tests (0.05); intervals: 1 - alpha.")] = None,

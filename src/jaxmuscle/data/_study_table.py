@@ -93,7 +93,9 @@ def cells_of_study(rows: Iterable[Row], defaults: Mapping[str, Any]) -> list[Cel
         reading = {**defaults, **row.reading}
         window = reading.pop("window", None)
         try:
-            together[row.person, row.group, row.condition].append(load_recording(row.file, **reading).steady(window))
+            recording = load_recording(row.file, **reading)
+            trials = together[row.person, row.group, row.condition]
+            trials.append(recording if window == "all" else recording.steady(window))
         except ValueError as error:
             raise ValueError(f"{row.place}: {error}") from None
     found = []

@@ -16,7 +16,9 @@ CORRECTIONS = ("holm", "fdr", "none")
 
 
 class Difference(eqx.Module):
-    """Mean of `quantity` in group `b` minus that in group `a`, the `difference`, with its 95 % interval (`low`, `high`).
+    """Mean of `quantity` in group `b` minus that in group `a`, the `difference`, with its interval (`low`, `high`).
+
+    The interval holds 95 %, or 1 - alpha in a study.
 
     All in `unit`; `members` is how many the groups have; `p`, how often chance alone would give as much.
     `basis` says what interval and p stand on: "people", the spread within the groups (Welch's t; the fits' own errors are

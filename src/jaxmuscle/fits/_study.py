@@ -239,7 +239,7 @@ def run_study(
     study: "str | os.PathLike[str] | Iterable[Mapping[str, Any]]",
     *,
     rung: int | str | None = None,
-    window: tuple[float, float] | None = None,
+    window: tuple[float, float] | str | None = None,
     column: str | int | None = None,
     rate: float | None = None,
     units: str | None = None,
@@ -268,7 +268,8 @@ def run_study(
       below up to `correction`. Or rows, as dictionaries.
     - `rung`: the model of all people (`on_rung`), 0 to 3; by default 2, with activation and tremor. "auto" fits several and
       takes the one whose AIC, summed over all targets, is lowest; that is three or four times as long.
-    - `window` (start, stop) [s], `column`, `rate` [Hz], `units`: how files are read where a row does not say it.
+    - `window` (start, stop) [s] or "all" (by default the steady part), `column`, `rate` [Hz], `units`: how files are read
+      where a row does not say it.
     - `noise`: as in `fit`; `starts` of each fit; `key` of its random numbers.
     - `quantities`: what is reported and compared; by default the derived quantities. The fewer, the less the correction
       costs.
@@ -287,8 +288,9 @@ def run_study(
     given = {"rung": rung, "window": window, "column": column, "rate": rate, "units": units, "noise": noise,
              "quantities": quantities, "alpha": alpha, "correction": correction}  # fmt: skip
     options = USUAL | table.options | {name: value for name, value in given.items() if value is not None}
+    options = _checked(options)
     reading = {name: options.pop(name) for name in READING if name in options}
-    options = _checked(options) | {"starts": starts, "key": key}
+    options = options | {"starts": starts, "key": key}
     with told(progress, f"study of {len({row.person for row in table.rows})} people") as tell:
         tell("reading recordings", 0.0)
         cells = cells_of_study(table.rows, reading)
@@ -301,6 +303,8 @@ def _checked(options: dict[str, Any]) -> dict[str, Any]:
     rung, alpha, names = (options[name] for name in ("rung", "alpha", "quantities"))
     if rung != AUTO and (isinstance(rung, bool) or rung not in range(len(RUNGS))):
         raise ValueError(f'rung = {rung!r}: give a rung of the ladder, 0 to {len(RUNGS) - 1}, or "auto"')
+    if isinstance(options.get("window"), str) and options["window"] != "all":
+        raise ValueError(f'window = {options["window"]!r}: give (start, stop) in s, or "all"')
     if isinstance(alpha, bool | str) or not 0 < alpha < 1:
         raise ValueError(f"alpha = {alpha!r}: give a share between 0 and 1, as 0.05")
     if options["correction"] not in CORRECTIONS:

@@ -94,7 +94,8 @@ def methods_paragraph(study: "StudyResult") -> str:
     window = study.options["reading"].get("window")
     judged = [result.adequate for result in study.cohort.results.values() if result.adequate is not None]
     rates = [rate for cell in study.cells for rate in cell.rates]
-    part = "the steady part of each recording" if window is None else f"{window[0]:g} s to {window[1]:g} s"
+    named = {None: "the steady part of each recording", "all": "each recording as a whole"}
+    part = f"{window[0]:g} s to {window[1]:g} s" if isinstance(window, tuple | list) else named[window]
     low_pass = "not low-pass filtered" if s.filter_cutoff is None else (
         f"low-pass filtered (Butterworth, order {s.filter_order}, {s.filter_cutoff:g} Hz, "
         f"{'forwards and backwards' if s.filter_direction == 'both' else 'forwards'})")  # fmt: skip
