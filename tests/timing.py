@@ -24,8 +24,8 @@ EVENTS = {
 LONGEST_FIRST = (
     "test_pages", "test_fit", "test_hill", "test_expected", "test_joint", "test_trials", "test_goodness", "test_ensemble",
     "test_several", "test_compare", "test_posterior", "test_study", "test_control", "test_slow", "test_adequacy",
-    "test_ladder", "test_rungs", "test_gradients", "test_drive", "test_tremor", "test_pink", "test_simulate", "test_reproduce",
-    "test_scaling", "test_identify", "test_likelihood", "test_cli",
+    "test_ladder", "test_rungs", "test_gradients", "test_drive", "test_tremor", "test_pink", "test_simulate",
+    "test_reproduce", "test_scaling", "test_identify", "test_likelihood", "test_cli",
 )  # fmt: skip
 COUNTS = {"compile": "compiled", "load": "loaded"}
 HEADING = f"{'seconds':>32} " + "".join(f"{column:>9}" for column in (*PHASES, *COUNTS.values()))
