@@ -48,8 +48,9 @@ def trials(trials: Any, settings: Any = None, ax: Axes | None = None) -> Figure 
             parse_math=False,
         )
         panel.margins(x=0)
-    _label(rows[-1], "Time in the window (s)", "")
-    traces.supylabel(f"{(trials[0].quantity or 'signal').capitalize()} ({trials[0].unit})", fontsize=8.0)
+        _label(panel, "", trials[0].unit)
+    rows[-1].set_xlabel("Time in the window (s)")
+    traces.supylabel((trials[0].quantity or "signal").capitalize(), fontsize=8.0)
     mean, each = trials.spectrum(settings), [one.spectrum(settings) for one in trials]
     for panel, log in zip(spectra.subplots(2, 1), (False, True), strict=True):
         for one in each:
