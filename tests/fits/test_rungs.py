@@ -111,6 +111,15 @@ def test_a_tremor_is_climbed_to_and_found():
 
 
 @pytest.mark.slow
+def test_a_significant_line_is_tried_against_the_tremor():
+    """A short recording of a tremor: the base model describes it, with a line. Rung 1 has it, too, so rung 2 is tried."""
+    result = jm.fit(TASK, drawn(expected(with_tremor()), 12, 0), **QUICK)
+    first, tremor = result.ladder
+    assert (first.number, tremor.number) == (0, 2) and first.p > 0.1
+    assert first.chosen == (tremor.aic > first.aic - 2)
+
+
+@pytest.mark.slow
 def test_a_chosen_model_or_noise_is_not_climbed_from():
     target = drawn(expected(with_tremor()), 90, 1)
     for asked in ({"noise": "band-limited"}, {"free": ("c_w", "noise_K_w", "noise_K_z")}, {"rungs": 0}):
