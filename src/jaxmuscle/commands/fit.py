@@ -162,17 +162,16 @@ def fit(
         if any(recorded):
             if segments is not None or dataset is not None:
                 raise ValueError("--segments and --dataset belong to spectra; these are recordings")
-            writable(output, "fit.json", force=force)
             aim = aimed(read_trials(target, reading, window).target(quantity=quantity), task)
         else:
             aim = aim_of(target[0], task, read)
-        converged = _fit_one(*aim, output, options, quick=quick, force=force)
+        writable(output, "fit.json", force=force)
+        converged = _fit_one(*aim, output, options, quick=quick)
     raise typer.Exit(CONVERGED if converged else NOT_CONVERGED)
 
 
-def _fit_one(target: Any, model: Any, folder: Path, options: dict[str, Any], *, quick: bool, force: bool) -> bool:
+def _fit_one(target: Any, model: Any, folder: Path, options: dict[str, Any], *, quick: bool) -> bool:
     """The table as soon as the search has ended, then what the checks add; Ctrl-C in these keeps the fit."""
-    writable(folder, "fit.json", force=force)
     printed = []
 
     def answer(result: Any) -> None:

@@ -31,9 +31,7 @@ def as_target(given: Any, **options: Any) -> Target:
     """
     if isinstance(given, Target):
         return given
-    if isinstance(given, Recording):
-        return given.target()
-    if isinstance(given, Trials):
+    if isinstance(given, Recording | Trials):
         return given.target()
     if isinstance(given, str | os.PathLike):
         if not is_recording(given):

@@ -18,7 +18,7 @@ from jaxmuscle.spectra._settings import SpectrumSettings, require
 from jaxmuscle.spectra._welch import Spectrum, lowpass, spectrum_of
 
 from ._pooled import pooled_target
-from ._recording_choice import recording_of
+from ._recording_choice import Reading, recording_of
 from ._recording_labs import frame_table
 from ._recording_quality import RecordingSummary, checked, clipping, plateau
 from ._target import Target
@@ -102,8 +102,7 @@ class Recording(eqx.Module):
 
         **Raises:** `ValueError` naming column, row or argument, and the remedy.
         """
-        return recording_of(cls, frame_table(frame), column=column, rate=rate, units=units, axis=axis, reference=reference,
-                            time=time, max_gap=max_gap, name=name)  # fmt: skip
+        return recording_of(cls, frame_table(frame), Reading(column, rate, units, axis, reference, time, max_gap), name)
 
     def _checked(self, window: Any) -> tuple[float, float]:
         try:

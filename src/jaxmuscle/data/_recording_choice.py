@@ -22,20 +22,21 @@ class _Choice(NamedTuple):
     columns: list[str]
 
 
-def recording_of(
-    make: Callable[..., Any],
-    table: Table,
-    *,
-    column: str | int | None = None,
-    rate: float | int | None = None,
-    units: str | None = None,
-    axis: str | None = None,
-    reference: str | int | None = None,
-    time: str | int | None = None,
-    max_gap: float | int = 0.2,
-    name: str | None = None,
-) -> Any:
-    """What `make`, the class of a recording, makes of a column; arguments as in `load_recording`."""
+class Reading(NamedTuple):
+    """How a recording is found in a table: the arguments of `load_recording`."""
+
+    column: str | int | None = None
+    rate: float | int | None = None
+    units: str | None = None
+    axis: str | None = None
+    reference: str | int | None = None
+    time: str | int | None = None
+    max_gap: float | int = 0.2
+
+
+def recording_of(make: Callable[..., Any], table: Table, reading: Reading, name: str | None = None) -> Any:
+    """What `make`, the class of a recording, makes of a column, called `name` or as its file."""
+    column, rate, units, axis, reference, time, max_gap = reading
     require(axis in (None, *AXES, "principal"), "axis", axis, "choose one of x, y, z, principal")
     require(isinstance(max_gap, int | float) and 0 <= max_gap < math.inf, "max_gap", max_gap, "give a time in s")
     times = clock(table, time)

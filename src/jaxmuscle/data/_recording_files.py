@@ -10,7 +10,7 @@ from typing import Any
 from jaxmuscle.spectra._settings import require
 
 from ._recording import Recording
-from ._recording_choice import recording_of, signals
+from ._recording_choice import Reading, recording_of, signals
 from ._recording_csv import read_csv
 from ._recording_formats import read_c3d, read_mat, read_npy, read_npz
 from ._recording_labs import read_acq, read_edf, read_smr, read_tdms, read_xlsx
@@ -62,8 +62,7 @@ def load_recording(
     **Raises:** `ValueError` naming file, line or argument, and the remedy; `ImportError` that says what to install.
     """
     table = _read(path, skip_rows)
-    return recording_of(Recording, table, column=column, rate=rate, units=units, axis=axis, reference=reference, time=time,
-                        max_gap=max_gap)  # fmt: skip
+    return recording_of(Recording, table, Reading(column, rate, units, axis, reference, time, max_gap))
 
 
 def load_columns(
@@ -82,7 +81,7 @@ def load_columns(
     names = signals(table, time) if columns is None else [find(table, column, "columns") for column in columns]
     require(len(names) > 0, "columns", columns, "give the names of the columns that are recordings")
     stem = Path(table.file).stem
-    return [recording_of(Recording, table, column=name, time=time, name=f"{stem} {name}", **options) for name in names]
+    return [recording_of(Recording, table, Reading(name, time=time, **options), f"{stem} {name}") for name in names]
 
 
 def _read(path: str | os.PathLike[str], skip_rows: int) -> Table:
