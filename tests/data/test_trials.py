@@ -237,6 +237,7 @@ def test_drawn_with_its_trials():
     ax = trials(np.random.default_rng(10), 3).target().plot()
     labels = [text.get_text() for text in ax.get_legend().get_texts()]
     assert "3 trials" in labels and len(ax.lines) == 4
+    assert ax.lines[0].get_marker() == "o"  # the mean comes first: the figure of a fit calls that line the target
     plt.close(ax.figure)
 
 

@@ -189,7 +189,11 @@ class Recording(eqx.Module):
                 )
             window = (self.start + found[0] / even.rate, min(self.start + found[1] / even.rate, self.stop))
             whole = found == (0, even.whole.size)
-            words = "no ramp found, all of it" if whole else f"{window[0]:.2f} s to {window[1]:.2f} s, found by itself"
+            words = (
+                "no ramp found, so all of the recording is used"
+                if whole
+                else f"{window[0]:.2f} s to {window[1]:.2f} s, found by itself"
+            )
             notices = (*notices, f"steady part: {words}")
         part = self._with(self.whole, self.rate, window, notices)
         held, needed = part.segments(), RECORDED.length + (SEGMENTS - 1) * RECORDED.step
