@@ -213,6 +213,14 @@ def test_a_recording_read_as_a_spectrum_says_so(tmp_path):
         jm.load_target(path)
 
 
+def test_a_recording_of_an_array():
+    both = np.column_stack([signal(np.random.default_rng(seed)) for seed in (1, 2)])
+    np.testing.assert_array_equal(jm.Recording.from_array(both, RATE, column=1, unit="mN").samples, both[:, 1])
+    np.testing.assert_array_equal(jm.Recording.from_array(both[:, 0], RATE).samples, both[:, 0])
+    with pytest.raises(ValueError, match="give a number from 0 to 1"):
+        jm.Recording.from_array(both, RATE, column=2)
+
+
 WRONG = {
     "array": (np.ones(100), r"knows its rate: jaxmuscle.Recording\(samples, rate\)"),
     "number": (3, "this is a int; give a Target"),

@@ -104,6 +104,21 @@ class Recording(eqx.Module):
         """
         return recording_of(cls, frame_table(frame), Reading(column, rate, units, axis, reference, time, max_gap), name)
 
+    @classmethod
+    def from_array(cls, samples: Any, rate: float | int, *, column: int = 0, **fields: Any) -> "Recording":
+        """A recording from an array: one signal, or a column of several.
+
+        **Arguments:** `samples`, shape `(times,)` or `(times, columns)`; `rate` [Hz]; `column`, counted from 0; `fields` as
+        in `Recording` (unit, name, ...).
+
+        **Raises:** `ValueError` for a column that is not there, and as `Recording` does.
+        """
+        array = np.asarray(samples)
+        if array.ndim != 2:
+            return cls(array, rate, **fields)
+        require(0 <= column < array.shape[1], "column", column, f"give a number from 0 to {array.shape[1] - 1}")
+        return cls(array[:, column], rate, **fields)
+
     def _checked(self, window: Any) -> tuple[float, float]:
         try:
             a, b = (float(edge) for edge in window)
