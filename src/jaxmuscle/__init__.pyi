@@ -45,6 +45,7 @@ from .model._rungs import on_rung as on_rung
 from .model._signals import Harmonic as Harmonic
 from .model._tasks import Isometric as Isometric
 from .model._tasks import PrescribedForce as PrescribedForce
+from .model._tasks import PrescribedLength as PrescribedLength
 from .model._tasks import PrescribedMotion as PrescribedMotion
 from .model._white_noise import BandLimitedNoise as BandLimitedNoise
 from .model._white_noise import OrnsteinUhlenbeckNoise as OrnsteinUhlenbeckNoise
@@ -54,6 +55,7 @@ from .objective._likelihood import log_likelihood as log_likelihood
 from .paper._reproduce import reproduce as reproduce
 from .response._characteristics import static_characteristics as static_characteristics
 from .response._expected_spectrum import expected_spectrum as expected_spectrum
+from .response._input_response import dynamic_stiffness as dynamic_stiffness
 from .response._linearised import settled as settled
 from .response._scaling import at_force as at_force
 from .response._scaling import at_level as at_level

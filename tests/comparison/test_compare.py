@@ -21,7 +21,7 @@ from jaxmuscle.commands.main import app
 from jaxmuscle.comparison import _compare
 from jaxmuscle.comparison._comparison import COLUMNS, Evidence, decided
 from jaxmuscle.comparison._evidence import Candidate, Folds, effective_numbers, without_harmonic
-from jaxmuscle.model._tasks import with_noise
+from jaxmuscle.model._noises import with_noise
 from jaxmuscle.objective._arguments import FitOptions, planned
 from jaxmuscle.objective._likelihood import log_density, log_likelihood, measured_bins
 

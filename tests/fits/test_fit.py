@@ -19,7 +19,7 @@ from jaxmuscle._common.arrays import as_arrays
 from jaxmuscle.fits import _search
 from jaxmuscle.fits._checks import AMBIGUOUS, Stage, rivals
 from jaxmuscle.model._parameters import DEFAULT_FREE, PARAMETERS
-from jaxmuscle.model._tasks import with_noise
+from jaxmuscle.model._noises import with_noise
 from jaxmuscle.objective._arguments import DT, RESIDUALS, free_names
 from jaxmuscle.objective._consequences import BATCH, _of_rows, consequences, derived, expand
 from jaxmuscle.objective._coordinates import Coordinates

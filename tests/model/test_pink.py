@@ -14,7 +14,7 @@ import jaxmuscle as jm
 from jaxmuscle._common.arrays import as_arrays
 from jaxmuscle.commands.options import NoiseName
 from jaxmuscle.model import _pink_noise as _pink
-from jaxmuscle.model._tasks import NOISES
+from jaxmuscle.model._noises import NOISES
 from jaxmuscle.response._linearised import linearise
 
 KEY = jax.random.key(23)

@@ -36,6 +36,7 @@ class TaskName(StrEnum):
     isometric = "isometric"
     motion = "prescribed-motion"
     force = "prescribed-force"
+    length = "prescribed-length"
 
 
 class Observed(StrEnum):

@@ -13,9 +13,10 @@ from jaxmuscle._common.progress import told
 from jaxmuscle._common.text import choices
 from jaxmuscle.data._target import Target
 from jaxmuscle.fits._adequacy import Endpoint
+from jaxmuscle.model._noises import NOISES, with_noise
 from jaxmuscle.model._parameters import HARMONIC, PARAMETERS
 from jaxmuscle.model._rungs import on_rung
-from jaxmuscle.model._tasks import NOISES, AbstractTask, with_noise
+from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.objective._arguments import FitOptions, planned
 from jaxmuscle.objective._consequences import expand
 from jaxmuscle.objective._coordinates import task_at

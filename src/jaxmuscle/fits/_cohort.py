@@ -16,8 +16,9 @@ from jaxmuscle._common.tables import frame
 from jaxmuscle.data._as_target import as_target
 from jaxmuscle.data._target import Target
 from jaxmuscle.model._noise import AbstractNoise
+from jaxmuscle.model._noises import with_noise
 from jaxmuscle.model._rungs import on_rung
-from jaxmuscle.model._tasks import AbstractTask, with_noise
+from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.objective._arguments import FitOptions, Plan, at_mean, planned, task_for
 from jaxmuscle.spectra._bin_law import trial_samples
 

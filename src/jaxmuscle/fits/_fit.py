@@ -10,8 +10,9 @@ from jaxmuscle._common.progress import told
 from jaxmuscle.data._as_target import as_target
 from jaxmuscle.data._target import Target
 from jaxmuscle.model._noise import AbstractNoise
+from jaxmuscle.model._noises import with_noise
 from jaxmuscle.model._rungs import RUNGS, is_base
-from jaxmuscle.model._tasks import AbstractTask, with_noise
+from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.model._white_noise import BandLimitedNoise
 from jaxmuscle.objective._arguments import DT, FitOptions, at_mean, planned
 

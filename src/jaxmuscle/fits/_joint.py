@@ -12,7 +12,8 @@ from jaxmuscle._common.text import choices
 from jaxmuscle.data._as_target import as_target
 from jaxmuscle.data._target import Target
 from jaxmuscle.model._noise import AbstractNoise
-from jaxmuscle.model._tasks import AbstractTask, with_noise
+from jaxmuscle.model._noises import with_noise
+from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.objective._arguments import (
     FitOptions,
     Plan,

@@ -10,7 +10,8 @@ from jaxmuscle._common.environment import versions
 from jaxmuscle._common.errors import SimulationError
 from jaxmuscle._common.keys import fold_in
 from jaxmuscle.ensembles._ensemble import ensemble
-from jaxmuscle.model._tasks import AbstractTask, with_active_noise
+from jaxmuscle.model._noises import with_active_noise
+from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.objective._arguments import Plan, base_of
 from jaxmuscle.objective._consequences import BANDS, jackknife, observed
 from jaxmuscle.objective._covariance import Identifiability, common_scales, known_products

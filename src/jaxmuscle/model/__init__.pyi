@@ -27,6 +27,7 @@ from ._tasks import TASKS as TASKS
 from ._tasks import AbstractTask as AbstractTask
 from ._tasks import Isometric as Isometric
 from ._tasks import PrescribedForce as PrescribedForce
+from ._tasks import PrescribedLength as PrescribedLength
 from ._tasks import PrescribedMotion as PrescribedMotion
 from ._white_noise import BandLimitedNoise as BandLimitedNoise
 from ._white_noise import OrnsteinUhlenbeckNoise as OrnsteinUhlenbeckNoise

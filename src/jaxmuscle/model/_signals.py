@@ -213,6 +213,11 @@ def as_signal(value: AbstractSignal | Scalar) -> AbstractSignal:
     return value if isinstance(value, AbstractSignal) else SmoothStep(value)
 
 
+def as_held(value: AbstractSignal | Scalar) -> AbstractSignal:
+    """A signal as it is; a number as that level from the start."""
+    return value if isinstance(value, AbstractSignal) else Constant(value)
+
+
 def derivatives(signal: Callable[[Scalar], Scalar], t: Scalar, order: int) -> tuple[Scalar, ...]:
     """The signal and its time derivatives up to `order`."""
     t = jnp.asarray(t)

@@ -2,7 +2,6 @@
 
 import abc
 import dataclasses
-from collections.abc import Mapping
 from typing import Any, ClassVar, Literal, get_args
 
 import equinox as eqx
@@ -20,17 +19,9 @@ from ._activation import ACTIVE, Activation
 from ._muscle import AbstractMuscle, Muscle, Perturbation
 from ._noise import AbstractNoise, NoiseSum
 from ._parameters import CHANNELS, INPUTS, default, get_parameter, paths_of, set_parameters
-from ._pink_noise import PinkNoise
 from ._resonant_noise import ResonantNoise
-from ._signals import AbstractSignal, Harmonic, as_signal, derivatives
-from ._white_noise import BandLimitedNoise, OrnsteinUhlenbeckNoise, WhiteNoise
-
-NOISES: dict[str, type[AbstractNoise]] = {
-    "white": WhiteNoise,
-    "band-limited": BandLimitedNoise,
-    "ornstein-uhlenbeck": OrnsteinUhlenbeckNoise,
-    "pink": PinkNoise,
-}
+from ._signals import AbstractSignal, Harmonic, as_held, as_signal, derivatives
+from ._white_noise import BandLimitedNoise
 
 State = Float[Array, " states"]
 Observed = Literal["displacement", "acceleration"]
@@ -144,34 +135,6 @@ class AbstractTask(eqx.Module):
         base = self.muscle.base()
         stiffness = np.array([1.0, 1.0, 0.0, 0.0, 0.0], dtype=jnp.result_type(float))
         return jnp.append(base, jnp.zeros((), base.dtype)) * stiffness
-
-
-def with_noise(
-    task: AbstractTask, noise: str | AbstractNoise | None, fix: Mapping[str, float] | None = None
-) -> AbstractTask:
-    """The task with another noise, at its default amplitudes except those that `fix` names; by name it keeps its tremor."""
-    if noise is None:
-        return task
-    if isinstance(noise, AbstractNoise):
-        return task.with_parts(noise=noise)
-    if noise not in NOISES:
-        raise ValueError(f"noise = {noise!r}: {choices(noise, NOISES)}")
-    kind: Any = NOISES[noise]
-    made = kind().per_channel()
-    values = {f"noise_{c}": float(made.amplitude[i]) for i, c in enumerate(CHANNELS)} | dict(fix or {})
-    fixed = [values[f"noise_{c}"] for c in CHANNELS]
-    made = eqx.tree_at(lambda n: n.amplitude, made, np.array(fixed))
-    tremor = [part for part in task.noise.components if isinstance(part, ResonantNoise)]
-    return task.with_parts(noise=NoiseSum((made, *tremor)) if tremor else made)
-
-
-def with_active_noise(task: AbstractTask) -> AbstractTask:
-    """The task with noise on the active tissue and the drive only."""
-    parts = []
-    for noise in task.noise.components:
-        kept = noise.amplitude * np.isin(noise.acts_on, ACTIVE).astype(jnp.result_type(noise.amplitude))
-        parts.append(eqx.tree_at(lambda n: n.amplitude, noise, kept))
-    return task.with_parts(noise=NoiseSum(tuple(parts)) if isinstance(task.noise, NoiseSum) else parts[0])
 
 
 def _check_task(task: AbstractTask) -> None:
@@ -303,19 +266,24 @@ class PrescribedForce(AbstractTask):
         return y[2] if self.observe == "displacement" else self.vector_field(t, y, u)[3]
 
 
-class Isometric(AbstractTask):
-    """The experiments of [30] and [12]: the insertion is held at x_z, a sensor there reads F_ext.
+class PrescribedLength(AbstractTask):
+    """The perturbation experiment: a motor moves the insertion as prescribed, a sensor there reads F_ext.
 
-    State (x_w, x_w'), equation (1a) with x_z fixed; output `F_ext = C_z x_w' + K_z (x_w - x_z)`, the negative passive
-    force.
+    State (x_w, x_w'), equation (1a) with x_z(t) given; output, by (1b),
 
-    **Arguments:** `P_w` [N], a number (a smooth step from zero) or a signal; `x_z` [m], a number; the common fields.
+        F_ext = -(passive_force(x_w, x_w', x_z, x_z', u) + m_z x_z'')
 
-    **Raises:** `ValueError` for white noise on K_z or C_z, which F_ext contains directly.
+    x_z counts in the direction of the muscle's pull: where it rises, the muscle shortens. `dynamic_stiffness` is the
+    linear response of -F_ext to it.
+
+    **Arguments:** `P_w` [N], a number (a smooth step from zero) or a signal; `x_z` [m], a number (held from the start) or
+    a signal with two continuous derivatives; the common fields.
+
+    **Raises:** `ValueError` for white noise on K_z or C_z, which F_ext contains directly, and for an x_z that is not smooth.
     """
 
     P_w: AbstractSignal = eqx.field(converter=as_signal, default=default("P_w"))
-    x_z: Scalar = default("x_z")
+    x_z: AbstractSignal = eqx.field(converter=as_held, default=default("x_z"))
     state_names: ClassVar[tuple[str, ...]] = ("x_w", "v_w")
     state_units: ClassVar[tuple[str, ...]] = ("m", "m/s")
     output_name: ClassVar[str] = "F_ext"
@@ -324,17 +292,43 @@ class Isometric(AbstractTask):
 
     def __check_init__(self):
         _check_task(self)
+        if isinstance(self.x_z, AbstractSignal):
+            _check_smooth(self, "x_z", 2)
 
-    def _passive(self, y: State, u: Perturbation) -> Scalar:
-        return self.muscle.passive_force(y[0], y[1], jnp.asarray(self.x_z), jnp.zeros_like(y[1]), u)
+    def insertion(self, t: Scalar) -> tuple[Scalar, Scalar, Scalar]:
+        """Where the insertion is at time t [s], its velocity and its acceleration."""
+        return derivatives(self.x_z, t, 2)  # pyright: ignore[reportReturnType]
+
+    def moved(self, t: Scalar, y: State, u: Perturbation, insertion: tuple[Scalar, Scalar, Scalar]) -> tuple[State, Scalar]:
+        """Time derivative of the state, and F_ext, with the insertion there."""
+        x_z, v_z, a_z = insertion
+        passive = self.muscle.passive_force(y[0], y[1], x_z, v_z, u)
+        drive = self.muscle.drive(self.P_w(t), u)
+        force = drive - self.muscle.active_force(y[0], y[1], u) + passive
+        return jnp.stack([y[1], force / self.muscle.m_w]), -(passive + self.muscle.m_z * a_z)
 
     def vector_field(self, t: Scalar, y: State, u: Perturbation) -> State:
-        drive = self.muscle.drive(self.P_w(t), u)
-        force = drive - self.muscle.active_force(y[0], y[1], u) + self._passive(y, u)
-        return jnp.stack([y[1], force / self.muscle.m_w])
+        return self.moved(t, y, u, self.insertion(t))[0]
 
     def output(self, t: Scalar, y: State, u: Perturbation, du: Perturbation) -> Scalar:
-        return -self._passive(y, u)
+        return self.moved(t, y, u, self.insertion(t))[1]
+
+
+class Isometric(PrescribedLength):
+    """The experiments of [30] and [12]: the insertion is held at x_z, a sensor there reads F_ext.
+
+    `PrescribedLength` with an insertion at rest: output `F_ext = C_z x_w' + K_z (x_w - x_z)`, the negative passive force.
+
+    **Arguments:** `P_w` [N], a number (a smooth step from zero) or a signal; `x_z` [m], a number; the common fields.
+
+    **Raises:** `ValueError` for white noise on K_z or C_z, which F_ext contains directly.
+    """
+
+    x_z: Scalar = default("x_z")  # pyright: ignore[reportIncompatibleVariableOverride]
+
+    def insertion(self, t: Scalar) -> tuple[Scalar, Scalar, Scalar]:
+        x_z = jnp.asarray(self.x_z)
+        return x_z, jnp.zeros_like(x_z), jnp.zeros_like(x_z)
 
 
 def _check_smooth_envelope(task: AbstractTask) -> None:
@@ -345,6 +339,7 @@ def _check_smooth_envelope(task: AbstractTask) -> None:
 
 TASKS: dict[str, type[AbstractTask]] = {
     "isometric": Isometric,
+    "prescribed-length": PrescribedLength,
     "prescribed-motion": PrescribedMotion,
     "prescribed-force": PrescribedForce,
 }

@@ -16,8 +16,9 @@ from jaxmuscle._common.text import choices
 from jaxmuscle.data._target import Target
 from jaxmuscle.model._muscle import Muscle
 from jaxmuscle.model._noise import AbstractNoise
+from jaxmuscle.model._noises import with_noise
 from jaxmuscle.model._parameters import PARAMETERS, USUALLY_FREE
-from jaxmuscle.model._tasks import AbstractTask, Isometric, Observed, PrescribedForce, with_noise
+from jaxmuscle.model._tasks import AbstractTask, Isometric, Observed, PrescribedForce
 from jaxmuscle.response._expected import check_line
 from jaxmuscle.response._linearised import has_response
 from jaxmuscle.response._scaling import FORCES, at_force, is_scalable

@@ -1,0 +1,53 @@
+"""All noises by name, and a task with another noise."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+
+from jaxmuscle._common.text import choices
+
+from ._activation import ACTIVE
+from ._noise import AbstractNoise, NoiseSum
+from ._parameters import CHANNELS
+from ._pink_noise import PinkNoise
+from ._resonant_noise import ResonantNoise
+from ._tasks import AbstractTask
+from ._white_noise import BandLimitedNoise, OrnsteinUhlenbeckNoise, WhiteNoise
+
+NOISES: dict[str, type[AbstractNoise]] = {
+    "white": WhiteNoise,
+    "band-limited": BandLimitedNoise,
+    "ornstein-uhlenbeck": OrnsteinUhlenbeckNoise,
+    "pink": PinkNoise,
+}
+
+
+def with_noise(
+    task: AbstractTask, noise: str | AbstractNoise | None, fix: Mapping[str, float] | None = None
+) -> AbstractTask:
+    """The task with another noise, at its default amplitudes except those that `fix` names; by name it keeps its tremor."""
+    if noise is None:
+        return task
+    if isinstance(noise, AbstractNoise):
+        return task.with_parts(noise=noise)
+    if noise not in NOISES:
+        raise ValueError(f"noise = {noise!r}: {choices(noise, NOISES)}")
+    kind: Any = NOISES[noise]
+    made = kind().per_channel()
+    values = {f"noise_{c}": float(made.amplitude[i]) for i, c in enumerate(CHANNELS)} | dict(fix or {})
+    fixed = [values[f"noise_{c}"] for c in CHANNELS]
+    made = eqx.tree_at(lambda n: n.amplitude, made, np.array(fixed))
+    tremor = [part for part in task.noise.components if isinstance(part, ResonantNoise)]
+    return task.with_parts(noise=NoiseSum((made, *tremor)) if tremor else made)
+
+
+def with_active_noise(task: AbstractTask) -> AbstractTask:
+    """The task with noise on the active tissue and the drive only."""
+    parts = []
+    for noise in task.noise.components:
+        kept = noise.amplitude * np.isin(noise.acts_on, ACTIVE).astype(jnp.result_type(noise.amplitude))
+        parts.append(eqx.tree_at(lambda n: n.amplitude, noise, kept))
+    return task.with_parts(noise=NoiseSum(tuple(parts)) if isinstance(task.noise, NoiseSum) else parts[0])
