@@ -18,6 +18,9 @@ from ._common.bundled import list_targets as list_targets
 from .checks._bootstrap import bootstrap as bootstrap
 from .checks._goodness import goodness as goodness
 from .comparison._compare import compare_noise as compare_noise
+from .data._frequency_response import FrequencyResponse as FrequencyResponse
+from .data._frequency_response_files import load_frequency_response as load_frequency_response
+from .data._perturbed import PerturbedRecording as PerturbedRecording
 from .data._recording import Recording as Recording
 from .data._recording_files import load_recording as load_recording
 from .data._steadiness import steadiness as steadiness
