@@ -7,6 +7,8 @@ from typing import Any
 
 from jaxmuscle._common.errors import TargetError
 
+from ._frequency_response import FrequencyResponse
+from ._perturbed import PerturbedRecording
 from ._recording import Recording
 from ._recording_files import KINDS
 from ._target import Target, load_target
@@ -31,8 +33,10 @@ def as_target(given: Any, **options: Any) -> Target:
     """
     if isinstance(given, Target):
         return given
-    if isinstance(given, Recording | Trials):
+    if isinstance(given, Recording | Trials | PerturbedRecording):
         return given.target()
+    if isinstance(given, FrequencyResponse):
+        return Target(given.name, None, source=given.source, stiffness=given, notices=given.notices)
     if isinstance(given, str | os.PathLike):
         if not is_recording(given):
             return load_target(given, **options)

@@ -118,6 +118,17 @@ class FrequencyResponse(eqx.Module):
         return cls(frequency, value, stderr, coherence, **fields)
 
     @property
+    def known(self) -> "FrequencyResponse":
+        """The response where its error is finite."""
+        kept = np.isfinite(self.stderr)
+        return self if np.all(kept) else self._with(kept)
+
+    def _with(self, kept: np.ndarray) -> "FrequencyResponse":
+        shared = None if self.coherence is None else self.coherence[kept]
+        fields = {"name": self.name, "source": self.source, "notices": self.notices}
+        return FrequencyResponse(self.frequency[kept], self.value[kept], self.stderr[kept], shared, **fields)
+
+    @property
     def gain(self) -> Float[np.ndarray, " bins"]:
         """`|H|` [N/m]."""
         return np.abs(self.value)

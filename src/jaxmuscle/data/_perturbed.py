@@ -1,13 +1,13 @@
 """Recordings of two channels: the insertion is moved, the force that answers is read."""
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, Literal
 
 import equinox as eqx
 import numpy as np
 import scipy
-from jaxtyping import Float
+from jaxtyping import Complex, Float
 
 from jaxmuscle import plot
 from jaxmuscle._common.text import folded, rounded
@@ -15,9 +15,11 @@ from jaxmuscle.spectra._cross_spectrum import Response, response_of
 from jaxmuscle.spectra._settings import SpectrumSettings, require
 
 from ._frequency_response import FrequencyResponse
+from ._perturbed_target import perturbed_target
 from ._recording import Recording, recorded_settings
 from ._second_order import SecondOrder, second_order_fit
 from ._steadiness import Measure
+from ._target import Target
 from ._units import scale_to_si
 
 Positive = Literal["lengthening", "shortening"]
@@ -199,6 +201,26 @@ class PerturbedRecording(eqx.Module):
         """
         found = self._second_order(settings, True)
         return float(found.value[3]), float(found.stderr[3])
+
+    def target(
+        self,
+        name: str | None = None,
+        *,
+        stiffness: Callable[[Float[np.ndarray, " frequencies"]], Complex[np.ndarray, " frequencies"]] | None = None,
+        provenance: str = "measured",
+        settings: SpectrumSettings | str | None = None,
+    ) -> Target:
+        """A `Target` of both: the dynamic stiffness, and the spectrum of the force that does not follow the displacement.
+
+        `jaxmuscle.fit(task, recording)` makes it with the response of the muscle that it fits. By default the response is
+        the nonparametric one (`frequency_response`), which takes some of the fluctuations with it.
+
+        **Arguments:** `stiffness`, the dynamic stiffness H [N/m] as a function of frequencies [Hz]: with a muscle's own,
+        `lambda f: jaxmuscle.dynamic_stiffness(task, f)`; others as in `Recording.target`.
+
+        **Raises:** `ValueError` for a window of less than 8 s besides 2 s of recording before and after it.
+        """
+        return perturbed_target((self,), stiffness, name, settings=settings, provenance=provenance)
 
     def plot(self, settings: SpectrumSettings | str | None = None, ax: Any = None) -> Any:
         """Draw both channels with the window, and gain, phase and coherence with their errors; returns the figure."""

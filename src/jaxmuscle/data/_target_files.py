@@ -30,7 +30,7 @@ from ._target_fields import (
 
 REQUIRED = ("name", "quantity", "provenance", "source", "frequency_hz", "proportional_power")
 METADATA = ("segments", "coefficient_of_variation", "mvc_fraction", "mean", "unit", "dispersion", "reason", "notices")
-KEYS = (*REQUIRED, "sigma", *METADATA, "trial_power", "settings")
+KEYS = (*REQUIRED, "sigma", *METADATA, "trial_power", "stiffness", "settings")
 
 
 class Raw(NamedTuple):
