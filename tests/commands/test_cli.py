@@ -18,10 +18,13 @@ from typer.testing import CliRunner
 
 import jaxmuscle as jm
 from jaxmuscle import paper
+from jaxmuscle._common.arrays import as_arrays
 from jaxmuscle._common.environment import keep_compiled_programs
 from jaxmuscle.commands.main import app
 from jaxmuscle.paper._claims import claims_json
 from jaxmuscle.paper._verdicts import Row
+from jaxmuscle.response._expected import expected_moments
+from jaxmuscle.spectra._settings import WINDOW
 
 GRID = 0.390625 * np.arange(1, 31)
 POWER = 1 / (1 + (GRID / 1.2) ** 2) + 0.01
@@ -174,6 +177,25 @@ def test_the_nearest_preset_is_named(tmp_path):
     for name in jm.list_presets():
         result = run("simulate", name[:-1], "--out", tmp_path / "out")
         assert result.exit_code == 2 and f"did you mean '{name}'" in result.stderr
+
+
+@pytest.mark.slow
+def test_a_preset_with_a_mean_force_is_simulated_at_it(tmp_path):
+    """The same random numbers: the force of every instant is multiplied by the ratio of the means."""
+    preset, found = tmp_path / "anna.toml", []
+    jm.save_preset(preset, jm.Isometric())
+    table = preset.read_text()
+    expected = float(expected_moments(as_arrays(jm.Isometric()), jm.SpectrumSettings(), WINDOW)[0].mean)
+    for stated in ("", 'mean = 4050\nunit = "mN"\n'):
+        preset.write_text(stated + table)
+        outcome = run("simulate", preset, "--seeds", 4, "--json", "--force", "--out", tmp_path / "out")
+        assert outcome.exit_code == 0
+        found.append(strict(outcome.stdout))
+    assert found[1]["mean"] / found[0]["mean"] == pytest.approx(4.05 / expected, rel=1e-4)  # single precision
+    assert found[1]["coefficient_of_variation"] == pytest.approx(found[0]["coefficient_of_variation"], rel=1e-3)
+    preset.write_text('mean = 30\nunit = "% MVC"\n' + table)
+    refused = run("simulate", preset, "--out", tmp_path / "other")
+    assert refused.exit_code == 2 and "anna.toml: unit = '% MVC': the parameters of a task are in newtons" in refused.stderr
 
 
 @pytest.mark.slow
