@@ -224,6 +224,18 @@ for arguments in (["targets"], ["presets"], ["--help"], ["fit", "--help"], ["sim
     subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="has no SIGPIPE")
+@pytest.mark.parametrize("arguments", [["targets"], ["targets", "--json"], ["fit", "--help"]])
+def test_an_output_that_nobody_reads_ends_the_command_in_silence(arguments):
+    """As in `jaxmuscle targets | head`; the shell calls it 141."""
+    command = [sys.executable, "-m", "jaxmuscle", *arguments]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+        assert process.stdout is not None and process.stderr is not None
+        process.stdout.close()
+        assert process.stderr.read() == b""
+        assert process.wait(60) == -signal.SIGPIPE
+
+
 def test_listings_name_everything():
     assert run("presets").exit_code == 0
     listed = run("targets").stdout
@@ -468,6 +480,17 @@ def test_a_cohort_as_json(tmp_path, monkeypatch):
     assert next(row["value"] for row in found["table"] if row["quantity"] == "c_w") == pytest.approx(50 / 3 / 2.5)
     assert jm.load_result(found["fits"]["a"]).success
     assert len(found["table"]) == len((tmp_path / "out" / "cohort.csv").read_text().splitlines()) - 1
+    assert (tmp_path / "out" / "differences.csv").exists()
+
+
+def test_a_cohort_leaves_nothing_of_an_earlier_one(tmp_path, monkeypatch):
+    """One without groups has no differences; what others wrote there stays."""
+    for name in ("differences.csv", "mine.csv"):
+        (tmp_path / name).write_text("of an earlier cohort")
+    monkeypatch.setattr(jm, "fit_cohort", lambda *_, **__: jm.fits.CohortResult({"a": failed_result()}, {}, {}))
+    assert run("fit", *[csv_file(tmp_path, name=f"{name}.csv") for name in "ab"], "--out", tmp_path).exit_code == 1
+    assert not (tmp_path / "differences.csv").exists()
+    assert (tmp_path / "mine.csv").read_text() == "of an earlier cohort"
 
 
 def test_the_paper_as_json(tmp_path, monkeypatch):
@@ -540,8 +563,10 @@ def test_an_interrupted_fit_writes_what_had_been_reached(tmp_path, monkeypatch):
         raise jm.fits.FitInterrupted(made_result(success=False, message="interrupted after 3 steps"))
 
     monkeypatch.setattr(jm, "fit", interrupted)
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "fit.png").write_text("of an earlier fit")
     outcome = run("fit", csv_file(tmp_path), "--out", tmp_path / "out")
-    assert outcome.exit_code == 130
+    assert outcome.exit_code == 130 and not (tmp_path / "out" / "fit.png").exists()
     assert f"what had been reached is in {tmp_path / 'out'}" in outcome.stderr
     assert not jm.load_result(tmp_path / "out" / "fit.json").success
     assert (tmp_path / "out" / "spectrum.csv").exists()

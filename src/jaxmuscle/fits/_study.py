@@ -16,7 +16,7 @@ import numpy as np
 from jaxmuscle import plot
 from jaxmuscle._common.arrays import with_nulls
 from jaxmuscle._common.environment import versions
-from jaxmuscle._common.files import write_json, write_text
+from jaxmuscle._common.files import remove, write_json, write_text
 from jaxmuscle._common.progress import Tell, told
 from jaxmuscle._common.tables import frame
 from jaxmuscle._common.text import WIDTH, choices, folded
@@ -170,8 +170,7 @@ class StudyResult(eqx.Module):
         with tempfile.TemporaryDirectory(prefix=".study-", dir=folder) as made:
             new = Path(made)
             self._write(new)
-            for name in FILES:
-                (folder / name).unlink(missing_ok=True)  # of an earlier study, which may have had more of them
+            remove(folder, *FILES)  # an earlier study may have had more of them
             for path in sorted(new.iterdir()):
                 os.replace(path, folder / path.name)
 
