@@ -19,7 +19,7 @@ from jaxmuscle.fits._adequacy import Adequacy
 from jaxmuscle.fits._ladder import Rung
 from jaxmuscle.fits._part import Start
 from jaxmuscle.fits._result import FORMAT
-from jaxmuscle.model._presets import task_from_table, task_to_table
+from jaxmuscle.model._task_tables import task_from_table, task_to_table
 
 POWER = 1 / (1 + np.arange(1, 31) ** 2)
 TARGET = jm.Target("made", POWER, segments=[6, 7], coefficient_of_variation=0.02, notices=["a notice"])
@@ -492,7 +492,7 @@ def test_a_table_that_is_no_table(tmp_path):
 
 
 def test_an_unknown_preset_names_the_nearest(monkeypatch):
-    from jaxmuscle.model import _presets as _preset
+    from jaxmuscle.response import _presets as _preset
 
     monkeypatch.setattr(_preset, "list_presets", lambda: ("zagrodny-hamilton", "zagrodny-slifkin"))
     with pytest.raises(PresetError, match=r"'zagrodny-slifki': did you mean 'zagrodny-slifkin'.*or give a path"):

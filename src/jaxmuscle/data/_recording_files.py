@@ -16,8 +16,8 @@ from ._recording_csv import read_csv
 from ._recording_formats import read_c3d, read_mat, read_npy, read_npz
 from ._recording_labs import read_acq, read_edf, read_smr, read_tdms, read_xlsx
 from ._recording_table import Table, find
+from ._text_tables import TEXT
 
-TEXT = (".csv", ".tsv", ".txt", ".dat", ".asc")
 ARRAYS = {".mat": read_mat, ".npy": read_npy, ".npz": read_npz}
 LABS = {".c3d": read_c3d, ".edf": read_edf, ".bdf": read_edf, ".tdms": read_tdms, ".acq": read_acq, ".smr": read_smr}
 KINDS = (*TEXT, ".xlsx", *ARRAYS, *LABS)

@@ -14,6 +14,7 @@ from jaxmuscle import plot
 from jaxmuscle._common.errors import TargetError
 from jaxmuscle._common.files import write_text
 from jaxmuscle._common.text import folded
+from jaxmuscle._common.units import NEWTONS
 from jaxmuscle.spectra._bin_law import bin_statistics, dispersion_of, trial_samples
 from jaxmuscle.spectra._settings import SpectrumSettings
 
@@ -24,7 +25,6 @@ from ._target_files import KEYS, on_grid, read_target
 
 # A sum this near to 1 is rounding of the printed numbers, not another scale.
 SUM_TOLERANCE = 1e-3
-NEWTONS = {"N": 1.0, "mN": 1e-3, "kN": 1e3}
 # Of the mean, where nothing says how far it may be from the person's; and the least, that of a good calibration.
 MEAN_ERROR, LEAST_MEAN_ERROR = 0.02, 0.002
 UNUSUAL = 1.25  # dispersion from which trials are said to differ

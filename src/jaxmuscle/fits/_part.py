@@ -10,7 +10,7 @@ from jaxmuscle._common.arrays import from_nulls, with_nulls
 from jaxmuscle._common.tables import frame
 from jaxmuscle._common.text import rounded
 from jaxmuscle.data._target import Target
-from jaxmuscle.model._presets import task_from_table, task_to_table
+from jaxmuscle.model._task_tables import task_from_table, task_to_table
 from jaxmuscle.model._tasks import TASKS, AbstractTask
 
 if TYPE_CHECKING:
