@@ -67,6 +67,7 @@ def made_result(**changes: Any) -> jm.fits.FitResult:
         "harmonic_p_value": 0.08,
         "check": {"seeds": 64, "largest_deviation": 0.002, "largest_deviation_se": 2.1, "largest_deviation_sd": 0.01},
         "further": {"coefficient_of_variation": -1.5},
+        "stiffness": None,
         "notices": ("a notice",),
         "seed": 3,
         "settings": {"free": ["k_w", "c_w"], "starts": 2, "bounds": {"k_w": [1.0, 2e6]}, "mean_force": None},
