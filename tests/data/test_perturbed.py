@@ -1,11 +1,16 @@
 """Recordings of force and displacement: the response and its errors, sign, delay, units, files, what is refused."""
 
+import json
+
 import numpy as np
+import pages
 import pytest
 import scipy.signal
 import scipy.stats
+from typer.testing import CliRunner
 
 import jaxmuscle as jm
+from jaxmuscle.commands.main import app
 from jaxmuscle.data._second_order import second_order_fit
 from jaxmuscle.spectra._cross_spectrum import response_of
 
@@ -310,3 +315,64 @@ def test_text_and_figure(file):
     figure = recording.plot()
     labels = [ax.get_ylabel() for ax in figure.axes]
     assert {"Force (N)", "Lengthening (mm)", "Gain (N/m)", "Phase (deg)", "Coherence γ²"} <= set(labels)
+
+
+def analyse(*arguments):
+    found = CliRunner().invoke(app, ["-q", "analyse", *map(str, arguments)])
+    return found.exit_code, " ".join(found.output.split())
+
+
+def test_the_command(file, tmp_path):
+    columns = "--force-column", "force_N", "--displacement", "displacement_mm", "--out", tmp_path
+    code, text = analyse(file, *columns)
+    assert code == 0, text
+    assert "H = K + iωB - ω²I" in text
+    assert "analysis.json, response.csv, analysis.png" in text
+    found = json.loads((tmp_path / "analysis.json").read_text())
+    response = jm.FrequencyResponse.from_table(found["response"])
+    held = jm.load_recording(file, force="force_N", displacement="displacement_mm").steady()
+    np.testing.assert_allclose(response.value, held.frequency_response().value, rtol=1e-10)
+    np.testing.assert_allclose(jm.load_frequency_response(tmp_path / "response.csv").value, response.value)
+    wanted = {name: (m.value, m.stderr, m.unit) for name, m in held.second_order().items()}
+    for name, numbers in wanted.items():
+        assert tuple(found["second_order"][name].values()) == pytest.approx(numbers)
+    assert found["second_order"]["delay"]["unit"] == "s"
+    code, text = analyse(file, *columns)
+    assert code == 2
+    assert "overwrite it with --force" in text
+    assert analyse(file, *columns, "--force", "--window", "5:55", "--positive", "lengthening")[0] == 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--force-column", "force_N"], "give --force-column and --displacement"),
+        (["--force-column", "force_N", "--displacement", "angle_deg"], "as --lever-arm 0.1"),
+        (
+            ["--force-column", "force_N", "--displacement", "plain"],
+            "give --displacement-units, as --displacement-units 'mm'",
+        ),
+        (["--force-column", "force_N", "--displacement", "displacement_mm", "--mvc", "100"], "belong to spectra"),
+        (["--force-column", "force_N", "--displacement", "displacement_mm", "--column", "plain"], "--column 'plain'"),
+    ],
+)
+def test_mistakes_at_the_command_line(arguments, words, file, tmp_path):
+    code, text = analyse(file, *arguments, "--out", tmp_path / "out")
+    assert code == 2
+    assert words in text
+
+
+def test_the_page(file, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "perturbed.csv").write_bytes(file.read_bytes())
+    page = (pages.ROOT / "docs" / "perturbed.md").read_text(encoding="utf-8")
+    rows = [
+        line.strip()
+        for line in page.splitlines()
+        if line.startswith(("    frequency_hz,", "    0.5,", "    1.0,", "    2.0,"))
+    ]
+    (tmp_path / "figure.csv").write_text("\n".join(rows))
+    names = pages.run("docs/perturbed.md")
+    assert names["published"].frequency.size == 3
+    np.testing.assert_allclose(jm.load_frequency_response("response.csv").value, names["response"].value)
+    assert (tmp_path / "perturbed.png").stat().st_size > 20_000
