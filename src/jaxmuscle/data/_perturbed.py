@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any, Literal
+from typing import Any
 
 import equinox as eqx
 import numpy as np
@@ -22,8 +22,7 @@ from ._steadiness import Measure
 from ._target import Target
 from ._units import scale_to_si
 
-Positive = Literal["lengthening", "shortening"]
-SURE = 2.0  # standard errors from which on the sign of the displacement is found
+SURE = 3.0  # standard errors from which on the sign of the displacement is found
 UNITS = ("N/m", "N s/m", "kg", "s")
 
 
@@ -84,7 +83,7 @@ class PerturbedRecording(eqx.Module):
         units: str = "N",
         displacement_units: str = "m",
         lever_arm: float | int | None = None,
-        positive: Positive | None = None,
+        positive: str | None = None,
         delay: float | int = 0.0,
         name: str = "recording",
         source: str = "given by the user",
@@ -284,7 +283,7 @@ def _response(force: Recording, displacement: Recording, settings: SpectrumSetti
     return response_of(given, force.filtered(settings), settings)
 
 
-def _sign(force: Recording, displacement: Recording, positive: Positive | None) -> tuple[float, list[str]]:
+def _sign(force: Recording, displacement: Recording, positive: str | None) -> tuple[float, list[str]]:
     """1 or -1, so that the displacement counts lengthening as positive, and a notice.
 
     The response is weighted with the input's power: Σ P_k Re H_k over the lower half of the excited band.
