@@ -78,6 +78,28 @@ def test_response_equals_scipy():
     np.testing.assert_allclose(found.coherence, scipy.signal.coherence(moved[0], force[0], **options)[1][bins], rtol=1e-10)
 
 
+def test_several_tapers_are_added_up():
+    moved, force, _ = drawn(1, 0.2)
+    settings = jm.SpectrumSettings.named("multitaper").replace(filter_cutoff=None)
+    found = recorded(moved[0], force[0]).frequency_response(settings)
+    tapers = scipy.signal.windows.dpss(1000, 2, 3)
+    bins = np.rint(found.frequency / settings.resolution).astype(int)
+    cross, power = (sum(scipy.signal.csd(moved[0], y, RATE, taper, 1000, 500, detrend="linear")[1][bins] for taper in tapers)
+                    for y in (force[0], moved[0]))  # fmt: skip
+    np.testing.assert_allclose(found.value, cross / power, rtol=1e-9)
+
+
+def test_errors_of_few_segments_are_not_too_small():
+    """Of four segments the response takes up one; without that the stated variance would be a quarter too small."""
+    x, noise = np.random.default_rng(4).standard_normal((2, 250, 640))
+    found = [response_of(*pair, jm.SpectrumSettings()) for pair in zip(x, noise, strict=True)]  # the response is 0
+    seen = np.array([np.mean(np.abs(r.value) ** 2) for r in found])
+    stated = np.array([np.mean(2 * r.stderr**2) for r in found])
+    spread = np.std(seen / seen.mean() - stated / stated.mean()) / np.sqrt(len(found))
+    assert seen.mean() / stated.mean() == pytest.approx(1, abs=CHANCE * spread)
+    assert CHANCE * spread < 0.25
+
+
 def test_one_standard_error_covers_what_it_should(responses):
     _, found, bins = responses
     error = np.array([((r.value - stiffness(r.frequency)) / r.stderr)[:bins] for r in found])
@@ -173,6 +195,9 @@ def test_sign():
     assert any("counts shortening as positive: its sign is turned" in notice for notice in turned.notices)
     np.testing.assert_array_equal(recorded(moved[0], force[0], positive="shortening").displacement.whole, -moved[0])
     np.testing.assert_array_equal(recorded(-moved[0], force[0], positive="lengthening").displacement.whole, -moved[0])
+    heavy = force[0] + (1.0 - INERTIA) * np.gradient(np.gradient(moved[0], 1 / RATE), 1 / RATE)  # above 6 Hz a mass
+    np.testing.assert_array_equal(recorded(moved[0], heavy).displacement.whole, moved[0])
+    assert any("mean force is negative" in notice for notice in recorded(moved[0], -force[0]).notices)
     unrelated = recorded(moved[0], force[0, ::-1])
     assert any("positive='lengthening' or 'shortening'" in notice for notice in unrelated.notices)
     short = recorded(moved[0, :300], force[0, :300])
