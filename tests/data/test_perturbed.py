@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 import jaxmuscle as jm
 from jaxmuscle.commands.main import app
 from jaxmuscle.data._second_order import second_order_fit
-from jaxmuscle.spectra._cross_spectrum import response_of
+from jaxmuscle.spectra._cross_spectrum import Response, response_of
 
 RATE, SECONDS, SEEDS = 100.0, 60.0, 40
 K, B, INERTIA = 1500.0, 25.0, 0.3
@@ -78,6 +78,28 @@ def test_response_equals_scipy():
     np.testing.assert_allclose(found.coherence, scipy.signal.coherence(moved[0], force[0], **options)[1][bins], rtol=1e-10)
 
 
+def test_several_tapers_are_added_up():
+    moved, force, _ = drawn(1, 0.2)
+    settings = jm.SpectrumSettings.named("multitaper").replace(filter_cutoff=None)
+    found = recorded(moved[0], force[0]).frequency_response(settings)
+    tapers = scipy.signal.windows.dpss(1000, 2, 3)
+    bins = np.rint(found.frequency / settings.resolution).astype(int)
+    cross, power = (sum(scipy.signal.csd(moved[0], y, RATE, taper, 1000, 500, detrend="linear")[1][bins] for taper in tapers)
+                    for y in (force[0], moved[0]))  # fmt: skip
+    np.testing.assert_allclose(found.value, cross / power, rtol=1e-9)
+
+
+def test_errors_of_few_segments_are_not_too_small():
+    """Of four segments the response takes up one; without that the stated variance would be a quarter too small."""
+    x, noise = np.random.default_rng(4).standard_normal((2, 250, 640))
+    found = [response_of(*pair, jm.SpectrumSettings()) for pair in zip(x, noise, strict=True)]  # the response is 0
+    seen = np.array([np.mean(np.abs(r.value) ** 2) for r in found])
+    stated = np.array([np.mean(2 * r.stderr**2) for r in found])
+    spread = np.std(seen / seen.mean() - stated / stated.mean()) / np.sqrt(len(found))
+    assert seen.mean() / stated.mean() == pytest.approx(1, abs=CHANCE * spread)
+    assert CHANCE * spread < 0.25
+
+
 def test_one_standard_error_covers_what_it_should(responses):
     _, found, bins = responses
     error = np.array([((r.value - stiffness(r.frequency)) / r.stderr)[:bins] for r in found])
@@ -141,6 +163,19 @@ def test_second_order_and_its_errors(responses):
     assert [m.unit for m in named.values()] == ["N/m", "N s/m", "kg"]
 
 
+def test_two_parts_in_series_are_not_of_second_order():
+    """The numbers of docs/perturbed.md: a misfit that chi² shows, and a delay that is none."""
+    f = jm.SpectrumSettings().frequency
+    s = 2j * np.pi * f
+    inner, outer = 0.5 * s**2 + 60 * s + 200, 5 * s + 200
+    exact = inner * outer / (inner + outer) + 0.5 * s**2
+    response = Response(f, exact, 0.02 * np.abs(exact), np.ones(f.size), np.eye(f.size) + 0j, np.ones(f.size))
+    fit = second_order_fit(response, True)
+    assert f"{fit.value[0]:.0f} {fit.stderr[0]:.0f}" == "144 4"
+    assert f"{1e3 * fit.value[3]:.1f} {1e3 * fit.stderr[3]:.1f}" == "-1.2 0.4"
+    assert second_order_fit(response, False).chi2 == pytest.approx(19, abs=0.5)
+
+
 def test_a_delay_is_found_and_taken_out():
     moved, force, _ = drawn(1, 0.03, rate=1000.0, seed=3)
     late = recorded(moved[0, 8:], force[0, :-8], 1000.0)
@@ -173,6 +208,9 @@ def test_sign():
     assert any("counts shortening as positive: its sign is turned" in notice for notice in turned.notices)
     np.testing.assert_array_equal(recorded(moved[0], force[0], positive="shortening").displacement.whole, -moved[0])
     np.testing.assert_array_equal(recorded(-moved[0], force[0], positive="lengthening").displacement.whole, -moved[0])
+    heavy = force[0] + (1.0 - INERTIA) * np.gradient(np.gradient(moved[0], 1 / RATE), 1 / RATE)  # above 6 Hz a mass
+    np.testing.assert_array_equal(recorded(moved[0], heavy).displacement.whole, moved[0])
+    assert any("mean force is negative" in notice for notice in recorded(moved[0], -force[0]).notices)
     unrelated = recorded(moved[0], force[0, ::-1])
     assert any("positive='lengthening' or 'shortening'" in notice for notice in unrelated.notices)
     short = recorded(moved[0, :300], force[0, :300])

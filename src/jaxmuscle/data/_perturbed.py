@@ -117,6 +117,8 @@ class PerturbedRecording(eqx.Module):
         require(
             pull.size == moved.size, "displacement", f"{moved.size} samples", f"the force has {pull.size}; give one length"
         )
+        more = ["the mean force is negative: count the muscle's pull as positive, or the stiffness has the wrong sign"]
+        notices = (*notices, *more * bool(np.mean(pull) < 0))
         pull, moved, begin, said = _shifted(scale * pull, reach * moved, float(rate), delay)
         fields: dict[str, Any] = {"name": name, "source": source, "start": float(start) + begin, "window": window}
         held, given = _recording("force", pull, rate, "N", fields), _recording("displacement", moved, rate, "m", fields)
