@@ -18,6 +18,9 @@ from ._common.bundled import list_targets as list_targets
 from .checks._bootstrap import bootstrap as bootstrap
 from .checks._goodness import goodness as goodness
 from .comparison._compare import compare_noise as compare_noise
+from .data._frequency_response import FrequencyResponse as FrequencyResponse
+from .data._frequency_response_files import load_frequency_response as load_frequency_response
+from .data._perturbed import PerturbedRecording as PerturbedRecording
 from .data._recording import Recording as Recording
 from .data._recording_files import load_recording as load_recording
 from .data._steadiness import steadiness as steadiness
@@ -38,8 +41,6 @@ from .model._muscle import Muscle as Muscle
 from .model._parameters import PARAMETERS as PARAMETERS
 from .model._partition import partition as partition
 from .model._pink_noise import PinkNoise as PinkNoise
-from .model._presets import load_preset as load_preset
-from .model._presets import save_preset as save_preset
 from .model._resonant_noise import ResonantNoise as ResonantNoise
 from .model._rungs import on_rung as on_rung
 from .model._signals import Harmonic as Harmonic
@@ -57,6 +58,8 @@ from .response._characteristics import static_characteristics as static_characte
 from .response._expected_spectrum import expected_spectrum as expected_spectrum
 from .response._input_response import dynamic_stiffness as dynamic_stiffness
 from .response._linearised import settled as settled
+from .response._presets import load_preset as load_preset
+from .response._presets import save_preset as save_preset
 from .response._scaling import at_force as at_force
 from .response._scaling import at_level as at_level
 from .response._scaling import scaled as scaled

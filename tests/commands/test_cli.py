@@ -18,10 +18,13 @@ from typer.testing import CliRunner
 
 import jaxmuscle as jm
 from jaxmuscle import paper
+from jaxmuscle._common.arrays import as_arrays
 from jaxmuscle._common.environment import keep_compiled_programs
 from jaxmuscle.commands.main import app
 from jaxmuscle.paper._claims import claims_json
 from jaxmuscle.paper._verdicts import Row
+from jaxmuscle.response._expected import expected_moments
+from jaxmuscle.spectra._settings import WINDOW
 
 GRID = 0.390625 * np.arange(1, 31)
 POWER = 1 / (1 + (GRID / 1.2) ** 2) + 0.01
@@ -177,6 +180,25 @@ def test_the_nearest_preset_is_named(tmp_path):
 
 
 @pytest.mark.slow
+def test_a_preset_with_a_mean_force_is_simulated_at_it(tmp_path):
+    """The same random numbers: the force of every instant is multiplied by the ratio of the means."""
+    preset, found = tmp_path / "anna.toml", []
+    jm.save_preset(preset, jm.Isometric())
+    table = preset.read_text()
+    expected = float(expected_moments(as_arrays(jm.Isometric()), jm.SpectrumSettings(), WINDOW)[0].mean)
+    for stated in ("", 'mean = 4050\nunit = "mN"\n'):
+        preset.write_text(stated + table)
+        outcome = run("simulate", preset, "--seeds", 4, "--json", "--force", "--out", tmp_path / "out")
+        assert outcome.exit_code == 0
+        found.append(strict(outcome.stdout))
+    assert found[1]["mean"] / found[0]["mean"] == pytest.approx(4.05 / expected, rel=1e-4)  # single precision
+    assert found[1]["coefficient_of_variation"] == pytest.approx(found[0]["coefficient_of_variation"], rel=1e-3)
+    preset.write_text('mean = 30\nunit = "% MVC"\n' + table)
+    refused = run("simulate", preset, "--out", tmp_path / "other")
+    assert refused.exit_code == 2 and "anna.toml: unit = '% MVC': the parameters of a task are in newtons" in refused.stderr
+
+
+@pytest.mark.slow
 def test_what_is_observed_of_a_motion(tmp_path):
     arguments = ["simulate", "zagrodny-slifkin", "--observe", "acceleration", "--seeds", 4, "--out", tmp_path]
     refused = run(*arguments)
@@ -200,6 +222,18 @@ for arguments in (["targets"], ["presets"], ["--help"], ["fit", "--help"], ["sim
     assert not slow, (arguments, slow)
 """
     subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="has no SIGPIPE")
+@pytest.mark.parametrize("arguments", [["targets"], ["targets", "--json"], ["fit", "--help"]])
+def test_an_output_that_nobody_reads_ends_the_command_in_silence(arguments):
+    """As in `jaxmuscle targets | head`; the shell calls it 141."""
+    command = [sys.executable, "-m", "jaxmuscle", *arguments]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+        assert process.stdout is not None and process.stderr is not None
+        process.stdout.close()
+        assert process.stderr.read() == b""
+        assert process.wait(60) == -signal.SIGPIPE
 
 
 def test_listings_name_everything():
@@ -446,6 +480,17 @@ def test_a_cohort_as_json(tmp_path, monkeypatch):
     assert next(row["value"] for row in found["table"] if row["quantity"] == "c_w") == pytest.approx(50 / 3 / 2.5)
     assert jm.load_result(found["fits"]["a"]).success
     assert len(found["table"]) == len((tmp_path / "out" / "cohort.csv").read_text().splitlines()) - 1
+    assert (tmp_path / "out" / "differences.csv").exists()
+
+
+def test_a_cohort_leaves_nothing_of_an_earlier_one(tmp_path, monkeypatch):
+    """One without groups has no differences; what others wrote there stays."""
+    for name in ("differences.csv", "mine.csv"):
+        (tmp_path / name).write_text("of an earlier cohort")
+    monkeypatch.setattr(jm, "fit_cohort", lambda *_, **__: jm.fits.CohortResult({"a": failed_result()}, {}, {}))
+    assert run("fit", *[csv_file(tmp_path, name=f"{name}.csv") for name in "ab"], "--out", tmp_path).exit_code == 1
+    assert not (tmp_path / "differences.csv").exists()
+    assert (tmp_path / "mine.csv").read_text() == "of an earlier cohort"
 
 
 def test_the_paper_as_json(tmp_path, monkeypatch):
@@ -518,8 +563,10 @@ def test_an_interrupted_fit_writes_what_had_been_reached(tmp_path, monkeypatch):
         raise jm.fits.FitInterrupted(made_result(success=False, message="interrupted after 3 steps"))
 
     monkeypatch.setattr(jm, "fit", interrupted)
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "fit.png").write_text("of an earlier fit")
     outcome = run("fit", csv_file(tmp_path), "--out", tmp_path / "out")
-    assert outcome.exit_code == 130
+    assert outcome.exit_code == 130 and not (tmp_path / "out" / "fit.png").exists()
     assert f"what had been reached is in {tmp_path / 'out'}" in outcome.stderr
     assert not jm.load_result(tmp_path / "out" / "fit.json").success
     assert (tmp_path / "out" / "spectrum.csv").exists()

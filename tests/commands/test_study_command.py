@@ -28,6 +28,7 @@ def command(*arguments):
     ("options", "message"),
     [
         ((), "study.csv: line 2: "),  # no rate
+        (("--rate", 100, "--axis", "q"), "study.csv: line 2: --axis 'q': choose one of x, y, z"),
         (("--rate", 100, "--rung", 7), "rung = 7: give a rung of the ladder"),
         (("--window", "early"), "--window early: give start and end in s"),
         (("--quantities", "tremor_frequenzy"), "did you mean 'tremor_frequency'?"),
@@ -48,9 +49,12 @@ def test_a_study_is_overwritten_only_with_force(table, tmp_path, monkeypatch):
 
     monkeypatch.setattr(jm, "run_study", run_study)
     out = tmp_path / "out"
-    first = command(table, "--out", out, "--rung", "2", "--window", "1:9", "--quantities", "mean, tremor_share")
+    first = command(table, "--out", out, "--rung", "2", "--window", "1:9", "--quantities", "mean, tremor_share",
+                    "--spectrum", "slow", "--skip-rows", 2, "--time", "clock")  # fmt: skip
     assert first.exit_code == 0, first.stderr
     assert (asked["rung"], asked["window"], asked["quantities"]) == (2, (1.0, 9.0), ["mean", "tremor_share"])
+    assert (asked["spectrum"], asked["skip_rows"], asked["time"]) == ("slow", 2, "clock")
+    assert not {"max_gap", "axis"} & set(asked)  # of study.toml, if it states them
     assert "Study: 10 people in 2 groups" in first.stdout and "differences.csv" in first.stdout
     before = (out / "study.json").read_bytes()
     again = command(table, "--out", out)

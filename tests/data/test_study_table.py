@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+import jaxmuscle as jm
 from jaxmuscle.data._study_table import cells_of_study, read_study
 
 RATE, SECONDS = 100, 12
@@ -54,6 +55,77 @@ def test_toml_with_a_table_and_with_recordings(folder):
     assert [row.person for row in listed.rows] == ["a", "b"] and listed.rows[0].reading == {"column": 0}
     rows = [{"file": folder / f"{p}1.npy", "person": p} for p in "ab"]
     assert [row.file for row in read_study(rows).rows] == [folder / "a1.npy", folder / "b1.npy"]
+
+
+OPTIONS = {"column": "force", "reference": "rest", "time": "clock", "skip_rows": 2, "max_gap": 0.05}
+
+
+@pytest.fixture
+def exported(folder):
+    """Texts with two lines above the header, a second column that could be the time, and a force to subtract."""
+    rng = np.random.default_rng(2)
+    for name in ("a1", "b1"):
+        rows = (f"{i},{i / RATE},{10 + x},{x / 2}" for i, x in enumerate(rng.standard_normal(25 * RATE)))
+        written(folder, "\n".join(("made by,us", "for,you", "count,clock,force,rest", *rows)), f"{name}.csv")
+    return folder
+
+
+@pytest.mark.parametrize("where", ["rows of a CSV", "keys of a TOML", "recordings of a TOML", "rows in memory"])
+def test_every_way_to_read_a_file_can_be_stated(where, exported):
+    said = OPTIONS | {"spectrum": "slow", "mvc": 50.0}
+    names, cells = ",".join(said), ",".join(str(value) for value in said.values())
+    keys = "".join(f'{name} = "{v}"\n' if isinstance(v, str) else f"{name} = {v}\n" for name, v in said.items())
+    people = [{"file": f"{p}1.csv", "person": p} for p in "ab"]
+    lines = ["".join(f'{name} = "{value}"\n' for name, value in row.items()) for row in people]
+    study = {
+        "rows of a CSV": lambda: written(exported, f"file,person,{names}\na1.csv,a,{cells}\nb1.csv,b,{cells}\n"),
+        "keys of a TOML": lambda: written(exported, keys + "".join(f"[[recordings]]\n{x}" for x in lines), "study.toml"),
+        "recordings of a TOML": lambda: written(
+            exported, "".join(f"[[recordings]]\n{x}{keys}" for x in lines), "study.toml"
+        ),
+        "rows in memory": lambda: [row | said | {"file": exported / row["file"]} for row in people],
+    }[where]()
+    table = read_study(study)
+    found = cells_of_study(table.rows, {"window": "all"} | table.options)
+    for cell in found:
+        same = jm.Trials([jm.load_recording(exported / f"{cell.person}1.csv", **OPTIONS)])
+        wanted = same.target(cell.person, mvc=50.0, settings="slow")
+        assert cell.target.settings == wanted.settings and cell.target.mvc_fraction == wanted.mvc_fraction
+        np.testing.assert_array_equal(cell.target.proportional_power, wanted.proportional_power)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("file,person,spectrum\na1.npy,a,slo\nb1.npy,b,slow\n", r"line 2: spectrum='slo': did you mean 'slow'\?"),
+        ("file,person,spectrum\na1.npy,a,pwelch\nb1.npy,b,\n",
+         r"line 3: spectrum = 'standard' here, 'pwelch' at .*line 2: give all rows the same"),
+        ("file,person,mvc\na1.npy,a,50\na2.npy,a,\nb1.npy,b,60\n",
+         r"line 3: mvc = None here, 50.0 at .*line 2: give all trials of a person"),
+        ("file,person,mvc\na1.npy,a,5\nb1.npy,b,60\n", r"line 2: a: mvc=5.0: give a force above the mean, (9\.9|10)"),
+        ("file,person,time\na1.npy,a,\nb1.npy,b,clock\n", r"line 3: .*time"),
+        ("file,person,axis\na1.npy,a,\nb1.npy,b,q\n", r"line 3: axis='q': choose one of x, y, z"),
+        ("file,person,skip_rows\na1.npy,a,\nb1.npy,b,2\n", r"line 3: skip_rows=2: leave it out: \.npy has no lines"),
+    ],
+)  # fmt: skip
+def test_a_mistake_in_how_a_file_is_read_names_row_and_column(text, message, folder):
+    rows = read_study(written(folder, text)).rows
+    with pytest.raises(ValueError, match=message):
+        cells_of_study(rows, {"rate": RATE, "window": "all"})
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("skip_rows", "2.5"), ("skip_rows", "two"), ("max_gap", "short"), ("mvc", "big")]
+)
+def test_cells_that_are_no_numbers(name, value, folder):
+    with pytest.raises(ValueError, match=rf"study.csv: line 2: {name} = '{value}' is not a (whole )?number"):
+        read_study(written(folder, f"file,person,{name}\na1.npy,a,{value}\nb1.npy,b,\n"))
+
+
+def test_an_mvc_that_is_no_number(folder):
+    rows = [{"file": folder / f"{p}1.npy", "person": p, "mvc": "strong"} for p in "ab"]
+    with pytest.raises(ValueError, match="row 1: mvc='strong': give a number in the unit of the recording"):
+        cells_of_study(read_study(rows).rows, {"rate": RATE})
 
 
 @pytest.mark.parametrize(

@@ -207,6 +207,35 @@ def test_a_csv_is_a_recording_or_a_spectrum(case, tmp_path):
     assert is_recording(tmp_path / "x.csv") == recorded
 
 
+TABS, BLANKS = (SPECTRUM.replace(",", sign) for sign in "\t ")
+SNIFFED_TEXT = {
+    "spectrum": (TABS, False),
+    "spectrum with blanks": (BLANKS, False),
+    "misspelt spectrum": ("freq;power\n" + "1;2\n" * 100, False),
+    "few numbers alone": (TABS.partition("\n")[2], False),
+    "recording": ("time\tforce\n" + "\n".join(f"{k / 100}\t{k % 7}" for k in range(500)), True),
+    "short recording": ("time\tforce\n0.0\t1\n0.1\t2\n", True),
+    "numbers alone": ("\n".join(f"{k % 7}" for k in range(300)), True),
+    "laboratory's header": ("Frequency:\t1000\nPower line:\toff\n" + "1\n" * 300, True),
+    "header of one cell": ("Frequency 1000 Hz\ntime\tforce\n" + "1\t2\n" * 300, True),
+    "empty": ("", True),
+}
+
+
+@pytest.mark.parametrize("suffix", [".txt", ".tsv", ".dat", ".asc"])
+@pytest.mark.parametrize("case", SNIFFED_TEXT)
+def test_a_text_is_a_recording_unless_it_states_a_spectrum(case, suffix, tmp_path):
+    text, recorded = SNIFFED_TEXT[case]
+    path = tmp_path / f"x{suffix}"
+    path.write_text(text)
+    assert is_recording(path) == recorded
+    if "spectrum" in case and "misspelt" not in case:
+        (tmp_path / "x.csv").write_text(SPECTRUM)
+        same, target = as_target(tmp_path / "x.csv"), as_target(path)
+        np.testing.assert_array_equal(target.proportional_power, same.proportional_power)
+        assert target.provenance == "user" and target.quantity == "force"
+
+
 def test_a_recording_read_as_a_spectrum_says_so(tmp_path):
     path = write(tmp_path / "x.csv", signal(np.random.default_rng(9)))
     with pytest.raises(TargetError, match=r"columns are time, force; .* Is this a recording\? .*analyse"):

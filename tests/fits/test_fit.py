@@ -18,8 +18,8 @@ import jaxmuscle as jm
 from jaxmuscle._common.arrays import as_arrays
 from jaxmuscle.fits import _search
 from jaxmuscle.fits._checks import AMBIGUOUS, Stage, rivals
-from jaxmuscle.model._parameters import DEFAULT_FREE, PARAMETERS
 from jaxmuscle.model._noises import with_noise
+from jaxmuscle.model._parameters import DEFAULT_FREE, PARAMETERS
 from jaxmuscle.objective._arguments import DT, RESIDUALS, free_names
 from jaxmuscle.objective._consequences import BATCH, _of_rows, consequences, derived, expand
 from jaxmuscle.objective._coordinates import Coordinates
@@ -472,15 +472,15 @@ def test_white_noise_works_where_the_output_does_not_contain_it():
     task = with_noise(jm.Isometric(), "white", {"noise_K_z": 0.0, "noise_C_z": 0.0, "noise_K_w": 0.2})
     assert isinstance(task.noise, jm.WhiteNoise)
     np.testing.assert_array_equal(task.noise.amplitude, [0.2, 0.0, PARAMETERS["noise_C_w"].default, 0.0])
-    assert "noise_K_z" not in free_names(task, None, {"noise_K_z": 0.0}, 30)
+    assert "noise_K_z" not in free_names(task, None, {"noise_K_z": 0.0}, VASTUS)
 
 
 def test_free_by_default():
-    assert free_names(jm.Isometric(), None, {}, 30) == DEFAULT_FREE
+    assert free_names(jm.Isometric(), None, {}, VASTUS) == DEFAULT_FREE
     ornstein = jm.Isometric(noise=jm.OrnsteinUhlenbeckNoise())
-    assert free_names(ornstein, None, {"k_w": 1.0}, 30) == (*DEFAULT_FREE[1:], "noise_correlation_time")
+    assert free_names(ornstein, None, {"k_w": 1.0}, VASTUS) == (*DEFAULT_FREE[1:], "noise_correlation_time")
     # What is zero cannot be fitted in log space and stays.
-    assert "harmonic_amplitude" not in free_names(jm.Isometric().replace(harmonic_amplitude=0.0), None, {}, 30)
+    assert "harmonic_amplitude" not in free_names(jm.Isometric().replace(harmonic_amplitude=0.0), None, {}, VASTUS)
 
 
 @pytest.mark.parametrize(

@@ -19,7 +19,7 @@ from jaxmuscle.fits._adequacy import Adequacy
 from jaxmuscle.fits._ladder import Rung
 from jaxmuscle.fits._part import Start
 from jaxmuscle.fits._result import FORMAT
-from jaxmuscle.model._presets import task_from_table, task_to_table
+from jaxmuscle.model._task_tables import task_from_table, task_to_table
 
 POWER = 1 / (1 + np.arange(1, 31) ** 2)
 TARGET = jm.Target("made", POWER, segments=[6, 7], coefficient_of_variation=0.02, notices=["a notice"])
@@ -67,6 +67,7 @@ def made_result(**changes: Any) -> jm.fits.FitResult:
         "harmonic_p_value": 0.08,
         "check": {"seeds": 64, "largest_deviation": 0.002, "largest_deviation_se": 2.1, "largest_deviation_sd": 0.01},
         "further": {"coefficient_of_variation": -1.5},
+        "stiffness": None,
         "notices": ("a notice",),
         "seed": 3,
         "settings": {"free": ["k_w", "c_w"], "starts": 2, "bounds": {"k_w": [1.0, 2e6]}, "mean_force": None},
@@ -492,7 +493,7 @@ def test_a_table_that_is_no_table(tmp_path):
 
 
 def test_an_unknown_preset_names_the_nearest(monkeypatch):
-    from jaxmuscle.model import _presets as _preset
+    from jaxmuscle.response import _presets as _preset
 
     monkeypatch.setattr(_preset, "list_presets", lambda: ("zagrodny-hamilton", "zagrodny-slifkin"))
     with pytest.raises(PresetError, match=r"'zagrodny-slifki': did you mean 'zagrodny-slifkin'.*or give a path"):

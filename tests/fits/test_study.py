@@ -164,6 +164,13 @@ def test_the_folder(tmp_path):
         assert said in methods, said
 
 
+def test_a_study_without_differences_leaves_none_of_an_earlier_one(tmp_path):
+    made_study().save(tmp_path)
+    (tmp_path / "mine.csv").write_text("kept")
+    made_study(quantities=["tremor_share"]).save(tmp_path)
+    assert {path.name for path in tmp_path.iterdir()} == {"study.json", "methods.txt", "spectra.png", "mine.csv"}
+
+
 def test_an_interrupted_save_leaves_an_earlier_study_as_it_was(tmp_path, monkeypatch):
     made_study(correction="fdr").save(tmp_path)
     before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
@@ -203,6 +210,7 @@ def test_the_figure_of_spectra():
         ({"rung": "high"}, "rung = 'high'"),
         ({"alpha": 5.0}, "alpha = 5.0: give a share between 0 and 1"),
         ({"correction": "bonferoni"}, "correction = 'bonferoni': .*holm"),
+        ({"skip_row": 2}, "unknown argument 'skip_row'; did you mean 'skip_rows'"),
         ({"quantities": ["tremor"]}, "quantities: unknown 'tremor'; did you mean 'tremor_"),
     ],
 )

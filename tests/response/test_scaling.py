@@ -314,5 +314,8 @@ def test_carrying_back_is_the_task_and_a_displacement_cannot_be_carried(x64):
     for move in (lambda: at_level(felt, 0.5), lambda: scaled(felt, 2.0)):
         with pytest.raises(ValueError, match=r"an acceleration has no coefficient of variation, .* observe='displacement'"):
             move()
-    with pytest.raises(ValueError, match="give one of the same sign"):
+    with pytest.raises(ValueError, match=r"of the same sign, not -3\.0 N"):
         jm.at_force(task, -3.0)
+    for still in (jm.Isometric(P_w=0.0), jm.PrescribedMotion(F_ext=0.0)):
+        with pytest.raises(ValueError, match="mean force of this task is zero"):
+            jm.at_force(still, 3.0)

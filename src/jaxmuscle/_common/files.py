@@ -47,6 +47,12 @@ def write_text(path: str | Path, text: str) -> None:
         temporary.write_text(text, encoding="utf-8")
 
 
+def remove(folder: Path, *names: str) -> None:
+    """Remove these files of an earlier result, as far as they are there."""
+    for name in names:
+        (folder / name).unlink(missing_ok=True)
+
+
 def nulled(value: Any) -> Any:
     """Nested tables and lists with None for every number that is not finite: JSON has no word for it."""
     if isinstance(value, dict):

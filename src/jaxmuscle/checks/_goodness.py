@@ -232,6 +232,7 @@ class Drawn(NamedTuple):
     expected: tuple[Float[np.ndarray, " bins"], ...]
     variation: tuple[Any, ...]
     mean: tuple[Any, ...]
+    stiffness: tuple[Any, ...]
 
 
 class Refits(NamedTuple):
@@ -248,7 +249,8 @@ def _drawn(problem: FitProblem, result: FitResult, count: int) -> tuple[Drawn, t
     found = []
     for i, (part, bins, seen) in enumerate(zip(problem.parts, Likelihood.of(problem).bins, moments, strict=True)):
         key = jax.random.fold_in(problem.key, 21)
-        keys = jax.random.split(jax.random.fold_in(key, i) if i else key, 3)
+        key = jax.random.fold_in(key, i) if i else key
+        keys = jax.random.split(key, 3)
 
         def scattered(given: Any, values: np.ndarray, key: Array) -> Any:
             if given is None:
@@ -258,7 +260,12 @@ def _drawn(problem: FitProblem, result: FitResult, count: int) -> tuple[Drawn, t
         power = drawn_spectra(bins, part.target, seen, keys[0])
         variation = scattered(part.variation, np.log(seen.variation), keys[1])
         mean = scattered(part.mean, np.asarray(seen.mean), keys[2])
-        found.append((power, seen.power[0] / np.sum(seen.power[0]), variation, mean))
+        stiffness = None
+        if part.target.stiffness is not None:
+            sd = np.tile(part.target.stiffness.known.stderr, (count, 1))
+            normal = np.asarray(jax.random.normal(jax.random.fold_in(key, 3), np.shape(seen.stiffness)))
+            stiffness = np.asarray(seen.stiffness) + sd[:, None] * normal, sd
+        found.append((power, seen.power[0] / np.sum(seen.power[0]), variation, mean, stiffness))
     return Drawn(*zip(*found, strict=True)), moments
 
 
@@ -302,7 +309,7 @@ def _data(problem: FitProblem, objective: Residuals, drawn: Drawn, share: tuple[
     for i, (part, own) in enumerate(zip(problem.parts, objective.data, strict=True)):
         law = bin_statistics(part.target, share[i])
         sigma = np.broadcast_to(np.asarray(own.sigma), (len(drawn.power[i]), *np.shape(own.sigma)))
-        made.append(Data(drawn.power[i], law.bias, law.sd, sigma, drawn.variation[i], drawn.mean[i]))
+        made.append(Data(drawn.power[i], law.bias, law.sd, sigma, drawn.variation[i], drawn.mean[i], drawn.stiffness[i]))
     return tuple(made)
 
 

@@ -15,6 +15,7 @@ from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.objective._likelihood import Likelihood, drawn_spectra, repeated
 from jaxmuscle.objective._problem import FitProblem, Part, target_variation
 from jaxmuscle.response._equilibrium import slowest_rate
+from jaxmuscle.response._input_response import dynamic_stiffness
 from jaxmuscle.response._linearised import settled
 from jaxmuscle.spectra._measures import coefficient_of_variation
 
@@ -37,8 +38,24 @@ def replicates_of(problem: FitProblem, tasks: tuple[AbstractTask, ...], count: i
             parts.append(_drawn(problem, tasks, i, count, key))
         else:
             parts.append(_simulated(part, task, count, key, failed))
+        parts[-1] = _with_stiffness(part, task, parts[-1], jax.random.fold_in(key, 77))
     made = {n: tuple(part[n] for part in parts) for n in range(count) if all(n in part for part in parts)}
     return made, {n: why for n, why in failed.items() if n not in made}
+
+
+def _with_stiffness(part: Part, task: AbstractTask, made: dict[int, Datum], key: Array) -> dict[int, Datum]:
+    """The targets with dynamic stiffnesses that scatter about the task's as the measured one does, where there is one."""
+    measured = part.target.stiffness
+    if measured is None:
+        return made
+    measured = measured.known
+    true = np.asarray(dynamic_stiffness(settled(task), measured.frequency))
+    found = {}
+    for number, (target, mean) in made.items():
+        normal = np.asarray(jax.random.normal(jax.random.fold_in(key, number), (2, len(true))))
+        value = true + measured.stderr * (normal[0] + 1j * normal[1])
+        found[number] = target.with_stiffness(dataclasses.replace(measured, value=value)), mean
+    return found
 
 
 def _simulated(part: Part, task: AbstractTask, count: int, key: Array, failed: dict[int, str]) -> dict[int, Datum]:

@@ -83,8 +83,9 @@ def _groups(path: Path) -> dict[str, str]:
 
 
 def _write(cohort: "CohortResult", folder: Path) -> None:
-    from jaxmuscle._common.files import write_text
+    from jaxmuscle._common.files import remove, write_text
 
+    remove(folder, "differences.csv", "cohort.png")  # an earlier cohort may have had them
     for name, result in cohort.results.items():
         write_fit(result, folder / name)
     write_text(folder / "cohort.csv", csv_text(_columns(cohort.table())))

@@ -156,8 +156,9 @@ def save_figure(figure: Any, path: Path) -> None:
 
 def write_fit(result: "FitResult", folder: Path, *, figure: bool = True) -> None:
     """fit.json, spectrum.csv and fit.png, each whole or not there."""
-    from jaxmuscle._common.files import write_text
+    from jaxmuscle._common.files import remove, write_text
 
+    remove(folder, "fit.png")
     result.save(folder / "fit.json")
     write_text(folder / "spectrum.csv", csv_text(result.only.columns()))
     if figure:

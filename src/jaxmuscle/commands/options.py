@@ -68,7 +68,8 @@ Recordings = Annotated[
     list[str], typer.Argument(metavar="RECORDING...", help="Text, .xlsx, .mat, .npy, .npz, .c3d, .edf, ... files of trials.")
 ]
 _Name = Annotated[
-    str | None, typer.Option(metavar="NAME", help="Column or point. Data:74 counts from 0. all: a trial in each.")
+    str | None,
+    typer.Option(metavar="NAME", help="Column or point. Data:74 counts from 0. all: a trial in each (no study)."),
 ]
 _Rate = Annotated[float | None, typer.Option(metavar="HZ", help="Sampling rate, if the file does not state it.")]
 _Units = Annotated[str | None, typer.Option(metavar="U", help="N, Nm, mm, m/s^2, % MVC, ...; by default the file's.")]

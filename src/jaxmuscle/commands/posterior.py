@@ -102,6 +102,9 @@ def _fitted(target: str, read: dict[str, Any], asked: dict[str, Any], seed: int)
 
 
 def _write(found: "Posterior", folder: Path) -> None:
+    from jaxmuscle._common.files import remove
+
+    remove(folder, "corner.png", "predictive.png")
     found.save(folder / "posterior.nc")
     found.save(folder / "posterior.json")
     save_figure(found.plot_chains(), folder / "chains.png")

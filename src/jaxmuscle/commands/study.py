@@ -1,27 +1,25 @@
 """`jaxmuscle study`."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 import jaxmuscle as jm
 
 from .console import CONVERGED, NOT_CONVERGED, err, out, plain, record, reporting, show, writable
-from .options import Force, Json, NoiseName, Output, Seed, names_in
-from .recordings import edges_of
+from .options import READING, Force, Json, NoiseName, Output, Seed, SpectrumName, Window, names_in
+from .recordings import edges_of, reads_recordings
 
 
+@reads_recordings
 def study(
     table: Annotated[Path, typer.Argument(help="study.csv or study.toml.")],
+    *,
     rung: Annotated[str | None, typer.Option(help="Model of all people: 0 to 3 (default 2), or auto: lowest AIC.")] = None,
     noise: Annotated[NoiseName | None, typer.Option(help="Colour of the noise on stiffness (band-limited).")] = None,
-    column: Annotated[str | None, typer.Option(help="Which column of the files, where the table does not say it.")] = None,
-    rate: Annotated[float | None, typer.Option(help="Sampling rate [Hz] where neither file nor table state it.")] = None,
-    units: Annotated[str | None, typer.Option(help="Unit of the recordings where the table does not say it.")] = None,
-    window: Annotated[
-        str | None, typer.Option(metavar="A:B", help="Part to analyse [s], or all; by default the steady part.")
-    ] = None,
+    window: Window = None,
+    spectrum: Annotated[SpectrumName | None, typer.Option(help="As in `jaxmuscle analyse`, the same for all.")] = None,
     quantities: Annotated[str | None, typer.Option(metavar="NAMES", help="What is compared, comma-separated.")] = None,
     alpha: Annotated[float | None, typer.Option(help="Level of the tests (0.05); intervals: 1 - alpha.")] = None,
     correction: Annotated[str | None, typer.Option(help="For many comparisons: holm (default), fdr or none.")] = None,
@@ -29,12 +27,14 @@ def study(
     output: Output = Path("out"),
     force: Force = False,
     as_json: Json = False,
+    reading: dict[str, Any],
 ) -> None:
     """Compare groups and conditions: fit all recordings of a study with one model, write tables, figures and methods.
 
     The table has a line for each recording, with the columns file and person; also group, condition and trial, if you have
-    these. The trials of a person in a condition are averaged. Writes DIR/people.csv, differences.csv, study.json,
-    spectra.png, quantities.png and methods.txt, all at the end.
+    these. The trials of a person in a condition are averaged. Options such as --column say how files are read where the
+    table does not say it. Writes DIR/people.csv, differences.csv, study.json, spectra.png, quantities.png and methods.txt,
+    all at the end.
 
     Examples:
 
@@ -52,15 +52,14 @@ def study(
             table,
             rung=int(rung) if rung is not None and rung.isdigit() else rung,
             noise=None if noise is None else str(noise),
-            column=column,
-            rate=rate,
-            units=units,
-            window=span,
             quantities=names_in(quantities),
             alpha=alpha,
             correction=correction,
             key=seed,
             progress=True,
+            window=span,
+            spectrum=None if spectrum is None else str(spectrum),
+            **{name: value for name, value in reading.items() if value != READING[name][1]},
         )
         whose: dict[str, list[str]] = {}
         for cell in found.cells:

@@ -17,7 +17,7 @@ from jaxmuscle._common.tables import frame
 from jaxmuscle._common.text import folded, probability
 from jaxmuscle.data._target import Target
 from jaxmuscle.fits._adequacy import ADEQUATE
-from jaxmuscle.model._presets import task_to_table
+from jaxmuscle.model._task_tables import task_to_table
 from jaxmuscle.model._tasks import AbstractTask
 
 if TYPE_CHECKING:

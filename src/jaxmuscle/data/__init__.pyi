@@ -2,6 +2,9 @@
 
 from ._as_target import as_target as as_target
 from ._as_target import is_recording as is_recording
+from ._frequency_response import FrequencyResponse as FrequencyResponse
+from ._frequency_response_files import load_frequency_response as load_frequency_response
+from ._perturbed import PerturbedRecording as PerturbedRecording
 from ._recording import Recording as Recording
 from ._recording_files import load_recording as load_recording
 from ._recording_quality import RecordingSummary as RecordingSummary

@@ -7,10 +7,12 @@ from typing import Any
 
 from jaxmuscle._common.errors import TargetError
 
+from ._frequency_response import FrequencyResponse
+from ._perturbed import PerturbedRecording
 from ._recording import Recording
 from ._recording_files import KINDS
 from ._target import Target, load_target
-from ._text_tables import SIGNS, cells_of, is_number, lines_of
+from ._text_tables import SIGNS, TEXT, cells_of, is_number, lines_of
 from ._trials import Trials, load_recordings
 
 LOOK = 1 << 16  # bytes of a text file that say what it is
@@ -31,8 +33,10 @@ def as_target(given: Any, **options: Any) -> Target:
     """
     if isinstance(given, Target):
         return given
-    if isinstance(given, Recording | Trials):
+    if isinstance(given, Recording | Trials | PerturbedRecording):
         return given.target()
+    if isinstance(given, FrequencyResponse):
+        return Target(given.name, None, source=given.source, stiffness=given, notices=given.notices)
     if isinstance(given, str | os.PathLike):
         if not is_recording(given):
             return load_target(given, **options)
@@ -59,20 +63,22 @@ def _remedy(given: Any) -> str:
 
 
 def is_recording(path: str | os.PathLike[str]) -> bool:
-    """Whether the file at `path` holds a recording rather than a spectrum: by its ending, a .csv by its header and rows."""
+    """Whether the file at `path` holds a recording rather than a spectrum: by its ending, a text by its header and rows."""
     path = Path(path).expanduser()
     kind = path.suffix.lower()
-    if kind != ".csv" or not path.is_file():
+    if kind not in TEXT or not path.is_file():
         return kind in KINDS and kind != ".csv"
     with path.open("rb") as file:
         text = file.read(LOOK).decode("utf-8", errors="replace")
     rows = [line.body for line in lines_of(text) if line.body.strip()]
     if not rows:
-        return False
+        return kind != ".csv"
     delimiter = next((sign for sign in SIGNS if sign in rows[0]), None)
     names = [cell.casefold() for cell in cells_of(rows[0], delimiter)]
     if all(is_number(name, delimiter) for name in names):
-        return len(rows) > POINTS
+        return len(rows) > (POINTS if kind == ".csv" else ROWS)
     spectral = any(name.startswith(("freq", "proportional", "power")) or name in ("f", "hz") for name in names)
+    if kind != ".csv":  # above the columns of a laboratory's text may stand a line "Frequency: 1000"
+        return not (spectral and len(names) > 1 and all(is_number(cell, delimiter) for cell in cells_of(rows[1], delimiter)))
     figure = len(rows) > 1 and set(map(str.casefold, cells_of(rows[1], delimiter))) == {"x", "y"}
     return not spectral and not figure and len(rows) > ROWS

@@ -1,7 +1,7 @@
 """From a table to a recording: choose a column or a point, find rate and unit, close short gaps."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -56,6 +56,42 @@ def recording_of(make: Callable[..., Any], table: Table, reading: Reading, name:
                     notices=(*notices, *closed))  # fmt: skip
     except ValueError as error:
         raise ValueError(f"{table.file}: column {chosen.name}: {error}") from None
+
+
+def perturbed_of(
+    make: Callable[..., Any],
+    table: Table,
+    reading: Reading,
+    columns: Mapping[str, str | int],
+    displacement_units: str | None,
+    **options: Any,
+) -> Any:
+    """What `make` makes of the columns of force and displacement, by name of the role; gaps are closed in both alike."""
+    times = clock(table, reading.time)
+    names = {role: find(table, column, role) for role, column in columns.items()}
+    for role, name in names.items():
+        if times is not None and name == times.name:
+            others = listed(_others(table, name))
+            raise ValueError(f"{table.file}: {role}={columns[role]!r} is the time; choose one of {others}")
+    force, displacement = names.values()
+    if force == displacement or table.rates.get(force) != table.rates.get(displacement):
+        fault = "are one column" if force == displacement else "have different rates; resample one"
+        raise ValueError(f"{table.file}: force={columns['force']!r} and displacement={columns['displacement']!r} {fault}")
+    signal = values(table, names.values())
+    found, notices = sampling(table, force, times, signal.shape[0], reading.rate)
+    units = _unit(table, _Choice(force, [force]), reading.units, None, notices)
+    moved = table.units.get(displacement) if displacement_units is None else displacement_units
+    if moved is None:
+        raise ValueError(f"{table.file}: does not say in which unit {displacement} is; give `displacement_units`, as "
+                         "displacement_units='mm'")  # fmt: skip
+    file = Path(table.file)
+    source = f"{file.name}, columns {force} and {displacement}, {found:.6g} Hz"
+    try:
+        whole, start, closed = filled(signal, found, float(reading.max_gap))
+        return make(*whole.T, found, units=units, displacement_units=moved, name=file.stem, source=source, start=start,
+                    notices=(*notices, *closed), **options)  # fmt: skip
+    except ValueError as error:
+        raise ValueError(f"{table.file}: {error}") from None
 
 
 def signals(table: Table, time: str | int | None) -> list[str]:

@@ -5,27 +5,34 @@ import os
 import re
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
+from typing import Any, overload
 
 from jaxmuscle.spectra._settings import require
 
+from ._perturbed import PerturbedRecording, Positive
 from ._recording import Recording
-from ._recording_choice import Reading, recording_of, signals
+from ._recording_choice import Reading, perturbed_of, recording_of, signals
 from ._recording_csv import read_csv
 from ._recording_formats import read_c3d, read_mat, read_npy, read_npz
 from ._recording_labs import read_acq, read_edf, read_smr, read_tdms, read_xlsx
 from ._recording_table import Table, find
+from ._text_tables import TEXT
 
-TEXT = (".csv", ".tsv", ".txt", ".dat", ".asc")
 ARRAYS = {".mat": read_mat, ".npy": read_npy, ".npz": read_npz}
 LABS = {".c3d": read_c3d, ".edf": read_edf, ".bdf": read_edf, ".tdms": read_tdms, ".acq": read_acq, ".smr": read_smr}
 KINDS = (*TEXT, ".xlsx", *ARRAYS, *LABS)
 
 
-def load_recording(
+@overload
+def load_recording(path: str | os.PathLike[str], *, force: None = None, **options: Any) -> Recording: ...
+@overload
+def load_recording(path: str | os.PathLike[str], *, force: str | int, **options: Any) -> PerturbedRecording: ...
+def load_recording(  # pyright: ignore[reportInconsistentOverload]
     path: str | os.PathLike[str],
     *,
     column: str | int | None = None,
+    force: str | int | None = None,
+    displacement: str | int | None = None,
     rate: float | int | None = None,
     units: str | None = None,
     axis: str | None = None,
@@ -33,7 +40,11 @@ def load_recording(
     time: str | int | None = None,
     skip_rows: int = 0,
     max_gap: float | int = 0.2,
-) -> Recording:
+    displacement_units: str | None = None,
+    lever_arm: float | int | None = None,
+    positive: Positive | None = None,
+    delay: float | int = 0.0,
+) -> Recording | PerturbedRecording:
     """Load a recording from text, Excel, MATLAB, NumPy, C3D, EDF, TDMS, AcqKnowledge or Spike2 files.
 
     Text (.csv, .tsv, .txt, .dat, .asc): delimiter, header, a row of units and decimal commas are detected, `#` starts a
@@ -47,10 +58,14 @@ def load_recording(
     Points have three columns, as `finger_x, finger_y, finger_z` or `finger:0` to `finger:2`. `axis="principal"` is the
     direction in which the point, minus reference, moves most; it is positive along its largest component.
 
+    A file of a perturbation experiment has two channels. Name both, `force` and `displacement`, to get a
+    `PerturbedRecording`, in N and m, lengthening positive.
+
     **Arguments:**
 
     - `path`: the file; its suffix says the format.
     - `column`: name (case and unit may be left out) or number from 0; needed if there are several.
+    - `force`, `displacement`: instead of `column`, the two channels of a perturbation experiment.
     - `rate` [Hz]: needed if the file does not state it.
     - `units`: as in `Recording`; by default what the file states, else N. Nothing is converted.
     - `axis`: which coordinate of the point `column`: x, y, z or principal.
@@ -58,11 +73,23 @@ def load_recording(
     - `time`: the column that holds the time, if it is not found by itself.
     - `skip_rows`: lines of a text, or rows of a sheet, to leave out at the top.
     - `max_gap` [s]: gaps (NaN, empty, C3D residual below 0) up to this long are closed by straight lines, with a notice.
+    - `displacement_units`: m, cm, mm, um, deg or rad; by default what the file states. `units` is that of the force.
+    - `lever_arm` [m], `positive`, `delay` [s]: of two channels, see `PerturbedRecording.from_array`.
 
     **Raises:** `ValueError` naming file, line or argument, and the remedy; `ImportError` that says what to install.
     """
-    table = _read(path, skip_rows)
-    return recording_of(Recording, table, Reading(column, rate, units, axis, reference, time, max_gap))
+    reading = Reading(column, rate, units, axis, reference, time, max_gap)
+    options = {"displacement_units": displacement_units, "lever_arm": lever_arm, "positive": positive, "delay": delay}
+    if force is None or displacement is None:
+        given = {"force": force, "displacement": displacement, **options, "delay": delay or None}
+        for name, value in given.items():
+            require(value is None, name, value, "belongs to recordings of two channels; give `force` and `displacement`")
+        return recording_of(Recording, read_table(path, skip_rows), reading)
+    for name in ("column", "axis", "reference"):
+        value = getattr(reading, name)
+        require(value is None, name, value, "leave it out: `force` and `displacement` name the columns")
+    columns = {"force": force, "displacement": displacement}
+    return perturbed_of(PerturbedRecording.from_array, read_table(path, skip_rows), reading, columns, **options)
 
 
 def load_columns(
@@ -77,14 +104,14 @@ def load_columns(
 
     `time`, `skip_rows` and the other options are those of `load_recording`.
     """
-    table = _read(path, skip_rows)
+    table = read_table(path, skip_rows)
     names = signals(table, time) if columns is None else [find(table, column, "columns") for column in columns]
     require(len(names) > 0, "columns", columns, "give the names of the columns that are recordings")
     stem = Path(table.file).stem
     return [recording_of(Recording, table, Reading(name, time=time, **options), f"{stem} {name}") for name in names]
 
 
-def _read(path: str | os.PathLike[str], skip_rows: int) -> Table:
+def read_table(path: str | os.PathLike[str], skip_rows: int) -> Table:
     require(isinstance(path, str | os.PathLike), "path", path, "give the path of a recording")
     file = Path(path)
     with contextlib.suppress(RuntimeError):

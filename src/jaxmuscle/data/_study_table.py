@@ -9,7 +9,9 @@ from typing import Any, NamedTuple
 
 from jaxmuscle._common.files import text_of
 from jaxmuscle._common.text import choices
+from jaxmuscle.spectra._settings import NAMED, require
 
+from ._recording_choice import Reading
 from ._recording_files import load_recording
 from ._target import Target
 from ._text_tables import SIGNS, cells_of, lines_of, number_in
@@ -17,9 +19,11 @@ from ._trials import Trials
 
 NEEDED = ("file", "person")
 LABELS = (*NEEDED, "group", "condition", "trial")
-NUMBERS = ("rate", "window_start", "window_stop")
-COLUMNS = (*LABELS, "column", "units", *NUMBERS)
-READING = ("column", "rate", "units", "window")
+FILES, SPECTRA = (*Reading._fields, "skip_rows"), ("spectrum", "mvc")  # of `load_recording`, of `Trials.target`
+EDGES = ("window_start", "window_stop")
+NUMBERS = ("rate", "max_gap", "skip_rows", "mvc", *EDGES)
+COLUMNS = (*LABELS, *FILES, *SPECTRA, *EDGES)
+READING = (*FILES, *SPECTRA, "window")
 OPTIONS = (*READING, "rung", "noise", "quantities", "alpha", "correction")
 
 
@@ -86,27 +90,42 @@ def read_study(study: "str | os.PathLike[str] | Iterable[Mapping[str, Any]]") ->
 def cells_of_study(rows: Iterable[Row], defaults: Mapping[str, Any]) -> list[Cell]:
     """The trials of every person in every condition made one target, each in its own or the `defaults`' window, or steady.
 
-    **Raises:** `ValueError` naming the line of a file that cannot be read or has no steady part.
+    **Raises:** `ValueError` naming the line of a file that cannot be read or has no steady part, of a spectrum that is not
+    that of the others, and of an mvc that is not that of the same person in the same condition.
     """
     together: dict[tuple[str, str, str], list[Any]] = defaultdict(list)
+    stated: dict[Any, tuple[Row, Any]] = {}
     for row in rows:
         reading = {**defaults, **row.reading}
-        window = reading.pop("window", None)
+        window, spectrum, mvc = (reading.pop(name, None) for name in ("window", *SPECTRA))
+        whose = row.person, row.group, row.condition
         try:
+            require(spectrum in (None, *NAMED), "spectrum", spectrum, choices(str(spectrum), NAMED))
+            require(mvc is None or isinstance(mvc, int | float), "mvc", mvc, "give a number in the unit of the recording")
+            _as_before(stated, "spectrum", row, spectrum or "standard", "give all rows the same, to compare like with like")
+            _as_before(stated, whose, row, mvc, "give all trials of a person in a condition the same mvc, or none")
             recording = load_recording(row.file, **reading)
-            trials = together[row.person, row.group, row.condition]
-            trials.append(recording if window == "all" else recording.steady(window))
+            together[whose].append(recording if window == "all" else recording.steady(window))
         except ValueError as error:
             raise ValueError(f"{row.place}: {error}") from None
     found = []
     for (person, group, condition), recordings in together.items():
         name = ", ".join(filter(None, (person, condition)))
+        first, mvc = stated[person, group, condition]
         try:
-            target = Trials(recordings).target(name)
+            target = Trials(recordings).target(name, mvc=mvc, settings=stated["spectrum"][1])
         except ValueError as error:
-            raise ValueError(f"{name}: {error}") from None
+            raise ValueError(f"{first.place}: {name}: {error}") from None
         found.append(Cell(person, group, condition, len(recordings), tuple(r.rate for r in recordings), target))
     return found
+
+
+def _as_before(stated: dict[Any, tuple[Row, Any]], key: Any, row: Row, value: Any, remedy: str) -> None:
+    """Remember what the first row says; refuse a row that says something else."""
+    first, before = stated.setdefault(key, (row, value))
+    if before != value:
+        name = key if isinstance(key, str) else "mvc"
+        raise ValueError(f"{name} = {value!r} here, {before!r} at {first.place}: {remedy}")
 
 
 def _bytes(path: Path) -> bytes:
@@ -141,9 +160,10 @@ def _lines(path: Path) -> list[tuple[str, dict[str, Any]]]:
         row: dict[str, Any] = {name: cell for name, cell in zip(names, cells, strict=True) if cell}
         for name in set(NUMBERS) & set(row):
             try:
-                row[name] = number_in(row[name], delimiter)
+                row[name] = int(row[name]) if name == "skip_rows" else number_in(row[name], delimiter)
             except ValueError:
-                raise ValueError(f"{place}: {name} = {row[name]!r} is not a number") from None
+                kind = "whole number" if name == "skip_rows" else "number"
+                raise ValueError(f"{place}: {name} = {row[name]!r} is not a {kind}") from None
         found.append((place, row))
     return found
 
@@ -179,13 +199,13 @@ def _row(place: str, given: dict[str, Any], folder: Path) -> Row:
     for name in NEEDED:
         if not str(given.get(name) or "").strip():
             raise ValueError(f"{place}: no {name}; every recording needs a file and a person")
-    window = [given.get(name) for name in ("window_start", "window_stop")]
+    window = [given.get(name) for name in EDGES]
     if window.count(None) == 1:
         raise ValueError(f"{place}: give window_start and window_stop, or neither")
     file = folder / Path(str(given["file"])).expanduser()
     if not file.is_file():
         raise ValueError(f"{place}: {file}: no such file")
-    reading = {name: given[name] for name in ("column", "rate", "units") if given.get(name) is not None}
+    reading = {name: given[name] for name in (*FILES, *SPECTRA) if given.get(name) is not None}
     reading |= {"window": tuple(window)} if None not in window else {}
     person, group, condition, trial = (str(given.get(name, "")).strip() for name in LABELS[1:])
     return Row(place, file, person, group, condition, trial, reading)

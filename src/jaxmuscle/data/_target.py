@@ -14,16 +14,17 @@ from jaxmuscle import plot
 from jaxmuscle._common.errors import TargetError
 from jaxmuscle._common.files import write_text
 from jaxmuscle._common.text import folded
+from jaxmuscle._common.units import NEWTONS
 from jaxmuscle.spectra._bin_law import bin_statistics, dispersion_of, trial_samples
 from jaxmuscle.spectra._settings import SpectrumSettings
 
 from . import _target_fields as check
+from ._frequency_response import FrequencyResponse
 from ._target_fields import Provenance, Quantity
 from ._target_files import KEYS, on_grid, read_target
 
 # A sum this near to 1 is rounding of the printed numbers, not another scale.
 SUM_TOLERANCE = 1e-3
-NEWTONS = {"N": 1.0, "mN": 1e-3, "kN": 1e3}
 # Of the mean, where nothing says how far it may be from the person's; and the least, that of a good calibration.
 MEAN_ERROR, LEAST_MEAN_ERROR = 0.02, 0.002
 UNUSUAL = 1.25  # dispersion from which trials are said to differ
@@ -51,6 +52,8 @@ class Target(eqx.Module):
       with `segments`.
     - `dispersion`: how many times more the mean of the trials scatters than their segments explain, and the standard error
       of this number. Above 1 it widens every error. If `trial_power` is given, it follows from that (`dispersion_of`).
+    - `stiffness`: the dynamic stiffness measured beside it, by a perturbation. Then `proportional_power` may be `None`: the
+      target has no spectrum.
     - `settings`: how the spectrum was estimated. The model's spectrum is made in the same way.
     - `notices`: what was done to the numbers, in sentences.
 
@@ -73,6 +76,7 @@ class Target(eqx.Module):
     trial_power: Float[np.ndarray, "trials bins"] | None
     dispersion: tuple[float, ...] | None = eqx.field(static=True)
     reason: str | None = eqx.field(static=True)
+    stiffness: FrequencyResponse | None
     settings: SpectrumSettings = eqx.field(static=True)
     notices: tuple[str, ...] = eqx.field(static=True)
 
@@ -94,6 +98,7 @@ class Target(eqx.Module):
         trial_power: Any = None,
         dispersion: float | Sequence[float] | None = None,
         reason: str | None = None,
+        stiffness: FrequencyResponse | Mapping[str, Any] | None = None,
         settings: SpectrumSettings | None = None,
         notices: Iterable[str] = (),
     ):
@@ -109,10 +114,15 @@ class Target(eqx.Module):
         self.mean, self.unit = check.metadata("mean", mean), check.metadata("unit", unit)
         self.reason = check.metadata("reason", reason)
         self.settings = settings
+        self.stiffness = FrequencyResponse.from_table(stiffness) if isinstance(stiffness, Mapping) else stiffness
+        if proportional_power is None and stiffness is not None:
+            proportional_power, bins = np.zeros(0), np.zeros(0, int)
         selected = np.arange(settings.first_bin, settings.last_bin + 1)
         self.bins = check.frozen(selected if bins is None else check.bin_numbers(bins, settings))
         self.frequency = check.frozen(settings.frequency[self.bins - settings.first_bin])
-        power = check.positive("proportional_power", proportional_power, self.bins.size)
+        power = (
+            np.zeros(0) if self.bins.size == 0 else check.positive("proportional_power", proportional_power, self.bins.size)
+        )
         deviation = None if sigma is None else check.positive("sigma", sigma, self.bins.size)
         self.proportional_power, self.sigma = _normalised(power, deviation)
         self.trial_power, self.dispersion = None, check.metadata("dispersion", dispersion)
@@ -188,6 +198,7 @@ class Target(eqx.Module):
         arrays |= {"proportional_power": self.proportional_power.tolist(), "sigma": sigma}
         arrays["trial_power"] = None if self.trial_power is None else self.trial_power.tolist()
         arrays["dispersion"] = self.dispersion if self.trial_power is None else None
+        arrays["stiffness"] = None if self.stiffness is None else self.stiffness.to_table()
         table = {key: arrays[key] if key in arrays else getattr(self, key) for key in KEYS}
         return {key: value for key, value in table.items() if value not in (None, ())}
 
@@ -198,6 +209,10 @@ class Target(eqx.Module):
         settings = SpectrumSettings.from_dict(fields.pop("settings"))
         bins = np.rint(np.asarray(fields.pop("frequency_hz")) / settings.resolution).astype(int)
         return cls(**fields, bins=bins, settings=settings)
+
+    def with_stiffness(self, stiffness: FrequencyResponse) -> "Target":
+        """The same with a dynamic stiffness that was measured beside it."""
+        return Target.from_table(self.to_table() | {"stiffness": stiffness})
 
     def plot(self, ax: Any = None, *, log: bool = False) -> Any:
         """Draw the spectrum, see `jaxmuscle.plot.target`; `log`: both axes logarithmic. Returns the axes."""
@@ -280,6 +295,8 @@ def _words(value: str | tuple[int, ...]) -> str:
 
 def _normalised(power: np.ndarray, sigma: np.ndarray | None) -> tuple[np.ndarray, np.ndarray | None]:
     """Both over the sum of the power, unless that is 1 to rounding: a saved target is read back exactly."""
+    if not power.size:
+        return check.frozen(power), None
     total = np.sum(power)
     total = 1.0 if abs(total - 1) < 1e-12 else total
     return check.frozen(power / total), None if sigma is None else check.frozen(sigma / total)
@@ -288,11 +305,11 @@ def _normalised(power: np.ndarray, sigma: np.ndarray | None) -> tuple[np.ndarray
 def _own_notices(target: Target, total: float) -> list[str]:
     settings, notices = target.settings, []
     missing = np.setdiff1d(np.arange(settings.first_bin, settings.last_bin + 1), target.bins)
-    if missing.size:
+    if missing.size and target.bins.size:
         runs = np.split(missing, np.flatnonzero(np.diff(missing) > 1) + 1)
         spans = ", ".join(f"{run[0]}" if run.size == 1 else f"{run[0]} to {run[-1]}" for run in runs)
         notices.append(f"bins not covered and left out: {spans} (bin spacing {settings.resolution:g} Hz)")
-    if abs(total - 1) > SUM_TOLERANCE:
+    if target.bins.size and abs(total - 1) > SUM_TOLERANCE:
         notices.append(f"proportional power summed to {total:.4g} over the bins covered: rescaled to 1")
     if target.overdispersion > UNUSUAL and target.dispersion is not None:
         notices.append(f"the trials {_dispersion_in_words(target.dispersion)}: all errors are widened by that. Did the "

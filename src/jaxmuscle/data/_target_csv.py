@@ -24,7 +24,7 @@ class Sheet(NamedTuple):
 def read_csv(text: str, file: str) -> Sheet:
     """Read `frequency_hz,proportional_power[,sigma]`, or two columns without a header.
 
-    Columns are separated by comma, semicolon or tab; with the last two the decimal sign may be a comma. `#`
+    Columns are separated by comma, semicolon, tab or blanks; but for the first the decimal sign may be a comma. `#`
     starts a comment.
 
     **Raises:** `TargetError` naming file and line.
@@ -61,12 +61,12 @@ def merge_duplicates(columns: Columns, tolerance: float) -> Columns:
     return Columns(frequency, power, None, tuple(columns.places[group[0]] for group in groups))
 
 
-def _delimiter(place: str, body: str, file: str) -> str:
+def _delimiter(place: str, body: str, file: str) -> str | None:
     if "\t" in body.strip() and ";" in body:
         raise TargetError(f"{file}, {place}: holds tabs and semicolons; use one of them between the columns")
     found = next((sign for sign in SIGNS if sign in body.strip()), None)
-    if found is None:
-        raise TargetError(f"{file}, {place}: one column; separate frequency and power by comma, semicolon or tab")
+    if found is None and len(body.split()) < 2:
+        raise TargetError(f"{file}, {place}: one column; separate frequency and power by comma, semicolon, tab or blanks")
     return found
 
 
@@ -87,7 +87,7 @@ def _header(place: str, row: list[str], file: str) -> list[str]:
     return names
 
 
-def _numbers(place: str, row: list[str], names: list[str], delimiter: str, file: str) -> list[float]:
+def _numbers(place: str, row: list[str], names: list[str], delimiter: str | None, file: str) -> list[float]:
     if len(row) != len(names):
         remedy = "decimal commas need a semicolon or tab between the columns" if delimiter == "," else "check it"
         remedy = "a third column needs a header naming it sigma, or " + remedy if len(row) == 3 else remedy

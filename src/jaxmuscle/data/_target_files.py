@@ -27,10 +27,11 @@ from ._target_fields import (
     is_number,
     metadata,
 )
+from ._text_tables import TEXT
 
 REQUIRED = ("name", "quantity", "provenance", "source", "frequency_hz", "proportional_power")
 METADATA = ("segments", "coefficient_of_variation", "mvc_fraction", "mean", "unit", "dispersion", "reason", "notices")
-KEYS = (*REQUIRED, "sigma", *METADATA, "trial_power", "settings")
+KEYS = (*REQUIRED, "sigma", *METADATA, "trial_power", "stiffness", "settings")
 
 
 class Raw(NamedTuple):
@@ -91,6 +92,7 @@ def _read(name_or_path: str | os.PathLike[str]) -> tuple[str, str, str]:
     kind = path.suffix.lower()
     if kind == ".tar":
         kind, data = ".json", read_tar(data, str(path)) if data.strip() else data
+    kind = ".csv" if kind in TEXT else kind
     if kind not in (".toml", ".csv", ".json"):
         problem = f"{path}: a target is a .toml or .csv file, not {kind or 'one without ending'}"
         raise TargetError(f"{problem}; a WebPlotDigitizer project ends in .json or .tar")

@@ -4,6 +4,7 @@ import csv
 from typing import NamedTuple
 
 SIGNS = ("\t", ";", ",")
+TEXT = (".csv", ".tsv", ".txt", ".dat", ".asc")  # files that hold one
 
 
 class Line(NamedTuple):

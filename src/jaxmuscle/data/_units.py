@@ -1,6 +1,13 @@
 """Units as files write them: of a signal, and of its times."""
 
+import math
 import re
+from typing import Any
+
+import numpy as np
+
+from jaxmuscle._common.text import choices
+from jaxmuscle.spectra._settings import require
 
 from ._target_fields import Quantity
 
@@ -11,11 +18,15 @@ UNITS: dict[str, Quantity | None] = {
 }  # fmt: skip
 _SPELLINGS = {"nm": "N m", "ncm": "N cm", "nmm": "N mm", "%mvc": "% MVC", "pctmvc": "% MVC", "%": "% MVC", "µm": "um",
               "au": "a.u.", "newton": "N", "newtons": "N", "volt": "V", "volts": "V"}  # fmt: skip
+_SI = {"force": {"N": 1.0, "mN": 1e-3, "kN": 1e3}, "torque": {"N m": 1.0, "N cm": 1e-2, "N mm": 1e-3},
+       "displacement": {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6},
+       "angle": {"rad": 1.0, "deg": math.pi / 180}}  # fmt: skip
+_ANGLES = {"rad": "rad", "radian": "rad", "radians": "rad", "deg": "deg", "degree": "deg", "degrees": "deg", "°": "deg"}
 _SECONDS = {1.0: "s sec secs sek seg second seconds sekunden secondes segundos", 60.0: "min minutes", 3600.0: "h hr hours",
             1e-3: "ms msec msecs millisec milliseconds", 1e-6: "us µs usec"}  # fmt: skip
 SECONDS = {name: scale for scale, names in _SECONDS.items() for name in names.split()}
 _BRACKETS = re.compile(r"(.*?)\s*[\[(]([^\[\]()]+)[\])]\s*")
-_SUFFIX = re.compile(r"(.+?)(?:_|\s*/\s*)(N|mN|kN|pctMVC|Nm|Ncm|Nmm|m|cm|mm|um|µm|V|mV|s|ms|us)\s*")
+_SUFFIX = re.compile(r"(.+?)(?:_|\s*/\s*)(N|mN|kN|pctMVC|Nm|Ncm|Nmm|m|cm|mm|um|µm|V|mV|s|ms|us|deg|rad)\s*")
 
 
 def known_unit(unit: str) -> str | None:
@@ -34,3 +45,23 @@ def name_and_unit(name: str) -> tuple[str, str | None]:
     """A column's name in small letters, and the unit it holds: `Force [N]`, `Kraft / N`, `force_N`, `torque_Nm`."""
     found = _BRACKETS.fullmatch(name) or _SUFFIX.fullmatch(name)
     return (found[1].strip().casefold(), found[2].strip()) if found else (name.strip().casefold(), None)
+
+
+def scale_to_si(unit: str, argument: str, quantity: str, lever_arm: Any) -> tuple[float, bool]:
+    """What a force is multiplied with to be in N, a displacement to be in m; a torque or an angle needs a lever arm [m].
+
+    **Returns:** the factor, and whether the lever arm is in it.
+
+    **Raises:** `ValueError` that names `argument` for the unit of something else, and for a lever arm that is missing.
+    """
+    turned = {"force": "torque", "displacement": "angle"}[quantity]
+    known = known_unit(unit) or _ANGLES.get(unit.strip(" []()").casefold())
+    remedy = f"give the unit of a {quantity} or of its {turned}; {choices(unit, (*_SI[quantity], *_SI[turned]))}"
+    require(known in _SI[quantity] or known in _SI[turned], argument, unit, remedy)
+    if known in _SI[quantity]:
+        return _SI[quantity][str(known)], False
+    remedy = f"{argument} is {known}: give the distance from the axis to the insertion in m, as lever_arm=0.1"
+    number = isinstance(lever_arm, int | float | np.number) and not isinstance(lever_arm, bool)
+    require(number and 0 < lever_arm < math.inf, "lever_arm", lever_arm, remedy)
+    scale, arm = _SI[turned][str(known)], float(lever_arm)
+    return (scale / arm if quantity == "force" else scale * arm), True

@@ -157,7 +157,7 @@ def _drawn(objective: Residuals, scatter: np.ndarray, generator: np.random.Gener
     start = 0
     for part in objective.parts:
         bins = len(part.statistics.sd)
-        if part.residual == "log" and objective.linear:
+        if part.residual == "log" and objective.linear and bins:
             drawn[:, start : start + bins] = drawn_log_residuals(part, generator, REPLICATES)
         start += _rows_of(part)
     return drawn
@@ -165,18 +165,28 @@ def _drawn(objective: Residuals, scatter: np.ndarray, generator: np.random.Gener
 
 def _rows_of(part: PartResiduals) -> int:
     bins = len(part.statistics.sd) - (part.residual == "cumulative")
-    return bins + (part.data.variation is not None) + (part.data.mean is not None)
+    return bins + part.data.further
 
 
 def _misfit(problem: FitProblem, objective: Residuals, residuals: np.ndarray, covariance: np.ndarray) -> str:
     """In words, the run of neighbouring bins whose residuals have the largest sum in its standard errors."""
     if problem.residual == "cumulative":
         return ""
+    whose = {part.name: f"{part.name} has" if len(problem.parts) > 1 else "the data have" for part in problem.parts}
     start, worst = 0, (0.0, "")
     for part, own in zip(problem.parts, objective.parts, strict=True):
-        bins = _rows_of(own) - (own.data.variation is not None) - (own.data.mean is not None)
-        rows = slice(start, start + bins)
+        bins = _rows_of(own) - own.data.further
+        rows, points = slice(start, start + bins), part.points
         start += _rows_of(own)
+        if points is not None:
+            each = residuals[start - 2 * len(points) : start].reshape(2, -1)
+            off = np.sqrt(np.sum(each**2, axis=0))
+            i = int(np.argmax(off))
+            if off[i] > abs(worst[0]):
+                worst = off[i], (f"{whose[part.name]} another dynamic stiffness than the model at {points[i]:.2g} Hz "
+                                 f"({off[i]:.1f} standard errors)")  # fmt: skip
+        if not bins:
+            continue
         size = np.concatenate([[0.0], np.cumsum(residuals[rows])])
         spread = np.zeros((bins + 1, bins + 1))
         spread[1:, 1:] = np.cumsum(np.cumsum(covariance[rows, rows], axis=0), axis=1)
@@ -190,6 +200,5 @@ def _misfit(problem: FitProblem, objective: Residuals, residuals: np.ndarray, co
             low, high = part.target.frequency[first[i]], part.target.frequency[last[i] - 1]
             place = f"at {low:.2g} Hz" if last[i] - first[i] == 1 else f"from {low:.2g} to {high:.2g} Hz"
             more = "more" if ratio[i] > 0 else "less"
-            whose = f"{part.name} has" if len(problem.parts) > 1 else "the data have"
-            worst = ratio[i], f"{whose} {more} power than the model {place} ({abs(ratio[i]):.1f} standard errors)"
+            worst = ratio[i], f"{whose[part.name]} {more} power than the model {place} ({abs(ratio[i]):.1f} standard errors)"
     return worst[1]

@@ -13,7 +13,6 @@ from jaxmuscle import plot
 from jaxmuscle._common.environment import versions
 from jaxmuscle._common.progress import told
 from jaxmuscle._common.tables import frame
-from jaxmuscle.data._as_target import as_target
 from jaxmuscle.data._target import Target
 from jaxmuscle.model._noise import AbstractNoise
 from jaxmuscle.model._noises import with_noise
@@ -24,6 +23,7 @@ from jaxmuscle.spectra._bin_law import trial_samples
 
 from ._differences import Difference, difference
 from ._ladder import options_for
+from ._perturbed import aimed
 from ._result import FitResult
 from ._search import search_together
 
@@ -204,7 +204,7 @@ def _loaded(targets: Iterable[Any]) -> tuple[dict[str, Target], dict[str, str]]:
     failed: dict[str, str] = {}
     for given in targets:
         try:
-            target = as_target(given)
+            target = aimed(given)
         except (ValueError, OSError) as error:
             failed[str(given)] = str(error)
             continue

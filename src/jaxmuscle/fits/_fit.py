@@ -17,6 +17,7 @@ from jaxmuscle.model._white_noise import BandLimitedNoise
 from jaxmuscle.objective._arguments import DT, FitOptions, at_mean, planned
 
 from ._ladder import Models, options_for
+from ._perturbed import analysed, recordings_of
 from ._result import FitResult
 from ._search import search
 
@@ -77,14 +78,18 @@ def fit(
     if not isinstance(task, AbstractTask):
         raise ValueError(f"task: this is a {type(task).__name__}; give a task first, as jaxmuscle.Isometric(), then the "
                          "target: fit(task, target)")  # fmt: skip
-    target = as_target(target)
-    with told(progress, f"fitting {target.name}") as tell, jax.enable_x64(True):
+    recordings = recordings_of(target)
+    aim = recordings[0].name if recordings else (target := as_target(target)).name
+    with told(progress, f"fitting {aim}") as tell, jax.enable_x64(True):
         options = FitOptions(
             free=free, fix=fix, method=method, residual=residual, starts=starts, seeds=seeds, check_seeds=check_seeds,
             key=key, bounds=bounds, priors=priors, coefficient_of_variation=coefficient_of_variation,
             mean_force=mean_force, max_steps=max_steps, dt=dt, progress=tell, rungs=rungs,
         )  # fmt: skip
         task = with_noise(task, noise, fix)
+        if recordings:
+            tell("taking off the response to the perturbation", 0.01)
+            target = analysed(recordings, task, options)
         top = _top(task, target, options, chosen=noise is not None)
         task, options = at_mean(task, target, options)
         plan = planned(task, target, options)

@@ -9,7 +9,6 @@ from jaxtyping import PRNGKeyArray
 
 from jaxmuscle._common.progress import told
 from jaxmuscle._common.text import choices
-from jaxmuscle.data._as_target import as_target
 from jaxmuscle.data._target import Target
 from jaxmuscle.model._noise import AbstractNoise
 from jaxmuscle.model._noises import with_noise
@@ -30,6 +29,7 @@ from jaxmuscle.objective._arguments import (
 from jaxmuscle.objective._problem import FitProblem
 from jaxmuscle.response._scaling import at_force, is_scalable, times_force
 
+from ._perturbed import aimed
 from ._result import FitResult
 from ._search import search
 
@@ -146,7 +146,7 @@ def _loaded(targets: Mapping[str, Any]) -> dict[str, Target]:
     for name in targets:
         if not name or "@" in name:
             raise ValueError(f"targets: a name must not be empty nor contain '@', as {name!r} does")
-    return {name: as_target(t) for name, t in targets.items()}
+    return {name: aimed(t) for name, t in targets.items()}
 
 
 def _models(targets: dict[str, Target], tasks: Mapping[str, AbstractTask], noise: Any, fix: dict[str, float]) -> Tasks:
@@ -184,7 +184,7 @@ def _local_free(
         if free is not None and not here:
             raise ValueError(f"free: none of these belongs to the task of target {t!r}: free one, or leave the target out")
         held = {base_of(n): 0.0 for n, holders in fixed.items() if t in holders}
-        found[t] = free_names(task, None if free is None else here, held, len(targets[t].bins))
+        found[t] = free_names(task, None if free is None else here, held, targets[t])
         found[t] += ("P_w",) if t in carried and "P_w" not in found[t] else ()
     return found
 

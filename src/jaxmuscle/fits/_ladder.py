@@ -133,7 +133,8 @@ def rung_of(ended: Endpoint, number: int) -> Rung:
     assert verdict is not None
     (part,) = ended.problem.parts
     aic, parameters = criterion(ended)
-    return Rung(number, RUNGS[number], aic, parameters, verdict.chi2 / (len(part.target.bins) - 1), verdict.p)
+    points = 0 if part.points is None else 2 * len(part.points)
+    return Rung(number, RUNGS[number], aic, parameters, verdict.chi2 / (len(part.target.bins) - 1 + points), verdict.p)
 
 
 def criterion(ended: Endpoint) -> tuple[float, float]:

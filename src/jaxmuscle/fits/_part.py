@@ -4,13 +4,13 @@ from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Complex, Float
 
 from jaxmuscle._common.arrays import from_nulls, with_nulls
 from jaxmuscle._common.tables import frame
 from jaxmuscle._common.text import rounded
 from jaxmuscle.data._target import Target
-from jaxmuscle.model._presets import task_from_table, task_to_table
+from jaxmuscle.model._task_tables import task_from_table, task_to_table
 from jaxmuscle.model._tasks import TASKS, AbstractTask
 
 if TYPE_CHECKING:
@@ -78,7 +78,8 @@ class FittedPart(eqx.Module):
     have in linear response: the `relaxation` of the active tissue under its noise, the `floor` from noise on the passive
     one, the `harmonic`, the `tremor`, `resonance_2`; `stretch`, time and output of a few simulated seconds; `check`, how far
     linear response and nonlinear simulation differ; `further`, residuals of the coefficient of variation and of the mean, as
-    far as they are data [standard deviations, model above data].
+    far as they are data [standard deviations, model above data]; `stiffness`, the fitted dynamic stiffness [N/m] at the
+    frequencies of the target's.
     """
 
     target: Target
@@ -93,11 +94,17 @@ class FittedPart(eqx.Module):
     stretch: tuple[np.ndarray, np.ndarray]
     check: dict[str, float | int]
     further: dict[str, float]
+    stiffness: Complex[np.ndarray, " points"] | None = None
 
     @property
     def frequency_hz(self) -> Float[np.ndarray, " bins"]:
         """Frequencies of the bins [Hz]."""
         return np.asarray(self.target.frequency)
+
+    @property
+    def data(self) -> int:
+        """Numbers that the fit compares: bins less one, as only their shape counts, and two for each dynamic stiffness."""
+        return max(len(self.fitted) - 1, 0) + (0 if self.stiffness is None else 2 * len(self.stiffness))
 
     def columns(self) -> dict[str, Any]:
         """What `spectrum.csv` holds, by column."""
@@ -157,6 +164,9 @@ def part_to_table(part: FittedPart) -> dict[str, Any]:
         "stretch": {"time": with_nulls(part.stretch[0]), "output": with_nulls(part.stretch[1])},
         "check": part.check,
         "further": part.further,
+        "stiffness": None
+        if part.stiffness is None
+        else [np.real(part.stiffness).tolist(), np.imag(part.stiffness).tolist()],
         "target_table": part.target.to_table(),
         "task_table": task_to_table(part.task),
     }
@@ -175,4 +185,5 @@ def read_part(table: dict[str, Any]) -> FittedPart:
         stretch=(from_nulls(stretch["time"]), from_nulls(stretch["output"])),
         check=table["check"],
         further=table["further"],
+        stiffness=None if (found := table.get("stiffness")) is None else np.array(found[0]) + 1j * np.array(found[1]),
     )

@@ -5,6 +5,7 @@ from typing import NamedTuple
 import jax
 import numpy as np
 from jaxtyping import Float
+from scipy.linalg import block_diag
 
 from jaxmuscle._common.arrays import as_arrays
 from jaxmuscle.data._target import Target
@@ -25,7 +26,8 @@ class Refit(NamedTuple):
     With line i residuals lose `change[i]`, and what lies in `taken[i]`, orthonormal columns, is taken up by the other
     parameters, at the `penalty` of the frequency's prior. The last line is the fitted one, which changes nothing.
     `frequency` of each; `used`, the coordinates of amplitude and frequency, none where no line is sought; `prior`, the
-    prior's rows at the fit.
+    prior's rows at the fit; `narrow`, which turns residuals into the fewer ones that all this is about: of many rows those
+    directions, orthonormal columns, in which the parameters can move them.
     """
 
     change: Float[np.ndarray, "lines all"]
@@ -34,9 +36,11 @@ class Refit(NamedTuple):
     prior: Float[np.ndarray, " rows"]
     frequency: Float[np.ndarray, " lines"]
     used: tuple[int, ...]
+    narrow: Float[np.ndarray, "rows all"]
 
     def cost(self, residuals: Float[np.ndarray, "rows all"]) -> Float[np.ndarray, "rows lines"]:
         """`|(1 - U Uᵀ) (r - change)|²` with the penalty, less `|r|²`."""
+        residuals = residuals @ self.narrow
         lines, size, fitted = self.taken.shape
         basis = np.moveaxis(self.taken, 1, 0).reshape(size, -1)
         held = np.einsum("la,lak->lk", self.change, self.taken)
@@ -46,9 +50,11 @@ class Refit(NamedTuple):
 
     def left(self, residuals: Float[np.ndarray, "rows all"], line: np.ndarray | int = -1) -> Float[np.ndarray, "rows all"]:
         """What is left of every row with its line."""
-        rest = residuals - self.change[line]
+        own = residuals @ self.narrow
+        rest = own - self.change[line]
         taken = np.broadcast_to(self.taken[line], (len(rest), *self.taken.shape[1:]))
-        return rest - np.einsum("rak,rk->ra", taken, np.einsum("rak,ra->rk", taken, rest))
+        rest = rest - np.einsum("rak,rk->ra", taken, np.einsum("rak,ra->rk", taken, rest))
+        return residuals + (rest - own) @ self.narrow.T
 
 
 def refit_of(problem: FitProblem, objective: Residuals, seen: Expansion, found: Consequences) -> Refit:
@@ -56,11 +62,21 @@ def refit_of(problem: FitProblem, objective: Residuals, seen: Expansion, found: 
     names, prior = problem.coordinates.names, np.sqrt(problem.prior)
     free = tuple(names.index(n) for n in HARMONIC if n in names)
     moments, slopes, own = seen.moments[0], seen.slopes[0], objective.parts[0]
+    jacobian, turn = _narrowed(objective, found.jacobian)
+    found = found._replace(residuals=turn.T @ found.residuals, jacobian=jacobian)
     power, line = np.asarray(moments.power), np.asarray(moments.line)
     alone = len(problem.parts) == 1 and len(free) == 2 and problem.residual == "log"
     if not (alone and np.all(power > line) and np.any(line > 0)):
         taken = taken_up(np.concatenate([found.jacobian, np.diag(prior)]))[None]
-        return Refit(np.zeros((1, taken.shape[1])), taken, np.zeros(1), prior * seen.theta, np.zeros(1), ())
+        return Refit(
+            np.zeros((1, taken.shape[1])),
+            taken,
+            np.zeros(1),
+            prior * seen.theta,
+            np.zeros(1),
+            (),
+            np.asarray(block_diag(turn, np.eye(len(prior)))),
+        )
     part, (a, f), sd, noise = problem.parts[0], free, problem.coordinates.sd, power - line
     task = part.task_at(seen.theta)
     here = float(task["harmonic_frequency"])
@@ -92,8 +108,24 @@ def refit_of(problem: FitProblem, objective: Residuals, seen: Expansion, found: 
     jacobian[:, count:-1] = np.diag(prior[kept])
     jacobian[:, -1] = -0.5 * prior[a] * level / sd[a]
     theta = seen.theta[f] + np.log(frequency / here) / sd[f]
-    return Refit(change, taken_up(jacobian), problem.prior[f] * (theta**2 - seen.theta[f] ** 2),
-                  np.append(prior[kept] * seen.theta[kept], prior[a] * seen.theta[a]), frequency, free)  # fmt: skip
+    rows = np.append(prior[kept] * seen.theta[kept], prior[a] * seen.theta[a])
+    return Refit(change, taken_up(jacobian), problem.prior[f] * (theta**2 - seen.theta[f] ** 2), rows, frequency, free,
+                 np.asarray(block_diag(turn, np.eye(len(rows)))))  # fmt: skip
+
+
+def _narrowed(objective: Residuals, jacobian: Float[np.ndarray, "rows free"]) -> tuple[np.ndarray, np.ndarray]:
+    """The Jacobian with the many rows of a dynamic stiffness turned into few, and what turns them."""
+    turns, start = [], 0
+    for part in objective.parts:
+        points = 0 if part.model.points is None else 2 * len(part.model.points)
+        rows = part.data.further - points + len(part.statistics.sd) - (part.residual == "cumulative")
+        turns.append(np.eye(rows))
+        start += rows
+        if points:
+            turns.append(np.linalg.qr(jacobian[start : start + points])[0])
+            start += points
+    turn = np.asarray(block_diag(*turns))
+    return turn.T @ jacobian, turn
 
 
 class Lines(NamedTuple):

@@ -91,7 +91,8 @@ def report_fit(
     theta, tasks = seen.theta, problem.tasks_at(seen.theta)
     try:
         for part, moments in zip(problem.parts, seen.moments, strict=True):
-            check_power(part.task, moments)
+            if len(part.target.bins):
+                check_power(part.task, moments)
     except ValueError as error:
         return _failed(problem, common, str(error))
     try:
@@ -110,7 +111,7 @@ def report_fit(
     )
     if interrupted:
         success, message = False, f"interrupted after {int(final.steps.max())} steps; this is what had been reached"
-    tables = [derived_table(part, values | observed(_mean(m.each)), slopes, jackknife(m.each), covariance, known)
+    tables = [derived_table(part, values | _observed(part, m.each), slopes, jackknife(m.each), covariance, known)
               for part, values, slopes, m in zip(problem.parts, found.values, found.slopes, made, strict=True)]  # fmt: skip
     parameters = parameter_table(problem, tasks, covariance, known)
     derived = merged(problem, tables, found.slopes)
@@ -177,8 +178,9 @@ def _expected_only(moments: Moments) -> _Made:
     return _Made(jax.tree.map(lambda x: np.asarray(x)[None], moments), None, (np.zeros(0), np.zeros(0)))
 
 
-def _mean(each: Moments) -> Moments:
-    return jax.tree.map(lambda x: np.mean(x, axis=0), each)
+def _observed(part: Part, each: Moments) -> dict[str, Any]:
+    """What follows from the mean of the moments, where there is a spectrum."""
+    return observed(jax.tree.map(lambda x: np.mean(x, axis=0), each)) if len(part.target.bins) else {}
 
 
 def _parts(
@@ -190,7 +192,7 @@ def _parts(
     polish: dict[str, float | int],
 ) -> tuple[dict[str, FittedPart], list[str]]:
     """Every target's spectrum, and what has to be said of it."""
-    parts, notices = {}, []
+    parts, notices, polished = {}, [], stages[-1].name == "polishing"
     for i, (part, task, moments, simulated) in enumerate(zip(plan.problem.parts, tasks, seen, made, strict=True)):
         target, share = part.target, np.asarray(moments.line / moments.power)
         statistics, power = bin_statistics(target, share), np.mean(simulated.each.power, axis=0)
@@ -199,7 +201,7 @@ def _parts(
         check: dict[str, float | int] = {}
         if simulated.expected is not None:
             check = linear_check(np.asarray(simulated.each.power), simulated.expected, statistics)
-        elif isinstance(model := stages[-1].objective.parts[i].model, Linear) and stages[-1].name == "polishing":
+        elif polished and len(residual) and isinstance(model := stages[-1].objective.parts[i].model, Linear):
             check = {"largest_deviation": float(np.max(np.abs(np.asarray(model.correction.power) - 1)))}
         further = further_of(stages[-1].objective.parts[i], moments)
         own = [*notices_of(target, statistics, check, unsettled(plan.problem, moments)), *further_notices(further),
@@ -208,8 +210,8 @@ def _parts(
         parts[part.name or target.name] = FittedPart(
             target=target,
             task=task,
-            chi2_per_bin=float(np.sum(residual**2) / (len(residual) - 1)) if statistics.known else None,
-            rms_log_error=float(np.std(np.log(target.proportional_power / fitted))),
+            chi2_per_bin=float(np.sum(residual**2) / (len(residual) - 1)) if statistics.known and len(residual) else None,
+            rms_log_error=float(np.std(np.log(target.proportional_power / fitted))) if len(residual) else None,
             fitted=fitted,
             harmonic_share=share,
             residual=residual,
@@ -218,6 +220,7 @@ def _parts(
             stretch=simulated.stretch,
             check=check | polish,
             further=further,
+            stiffness=None if part.points is None else np.array([1, 1j]) @ np.asarray(moments.stiffness),
         )
     return parts, notices
 
@@ -240,10 +243,10 @@ def _components(part: Part, task: AbstractTask) -> dict[str, np.ndarray]:
 
 
 def further_of(part: PartResiduals, moments: Moments) -> dict[str, float]:
-    """Residuals of a target's further data by name."""
+    """Residuals of a target's coefficient of variation and mean by name."""
     names = [name for name, given in (("coefficient_of_variation", part.data.variation), ("mean", part.data.mean))
              if given is not None]  # fmt: skip
-    return dict(zip(names, map(float, further_residuals(moments, part.data)), strict=True))
+    return dict(zip(names, map(float, further_residuals(moments, part.data)), strict=False))
 
 
 def of_several(parts: dict[str, FittedPart]) -> tuple[str, ...]:
@@ -264,7 +267,7 @@ def of_several(parts: dict[str, FittedPart]) -> tuple[str, ...]:
 
 def unsimulated(plan: Plan, stages: list[Stage]) -> tuple[str, ...]:
     """What was left out of a fit."""
-    if plan.check_seeds:
+    if plan.check_seeds or not any(len(part.target.bins) for part in plan.problem.parts):
         return ()
     if len(plan.problem.parts) == 1:
         return (UNCHECKED if stages[-1].name == "polishing" else TOGETHER,)

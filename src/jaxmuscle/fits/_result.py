@@ -132,8 +132,9 @@ class FitResult(eqx.Module):
             return f"not fitted: {self.message}"
         if self.adequacy is None:
             return "cannot be judged: the target does not say how much its powers scatter (segments or sigma)"
-        bins = sum(len(part.fitted) - 1 for part in self.parts.values())
-        found = f"chi2 per bin {self.adequacy.chi2 / bins:.2g}, {probability(self.adequacy.p)}"
+        data = sum(part.data for part in self.parts.values())
+        each = "bin" if all(part.stiffness is None for part in self.parts.values()) else "datum"
+        found = f"chi2 per {each} {self.adequacy.chi2 / data:.2g}, {probability(self.adequacy.p)}"
         if self.adequacy.adequate:
             return f"describes the data: {found}"
         return f"does not describe the data: {found}; {self.adequacy.misfit}"
@@ -153,9 +154,11 @@ class FitResult(eqx.Module):
     def per_newton(self) -> dict[str, float]:
         """Base stiffness [1/m] and damping [s/m] of both tissues per newton of mean force: free of the scale of force.
 
-        Empty where a mean force was given, and where the output is no force.
+        Empty where a mean force or a dynamic stiffness was given, and where the output is no force.
         """
-        if len(self.parts) > 1 or self.settings.get("mean_force") is not None or self.task.output_unit != "N":
+        if len(self.parts) > 1 or self.settings.get("mean_force") is not None or self.only.stiffness is not None:
+            return {}
+        if self.task.output_unit != "N":
             return {}
         mean = self.derived["mean"].value if "mean" in self.derived else np.nan
         return {n: self.derived[n].value / mean for n in ("K_w0", "K_z0", "C_w0", "C_z0") if n in self.derived}
@@ -183,7 +186,7 @@ class FitResult(eqx.Module):
     @property
     def derived_names(self) -> tuple[str, ...]:
         """Names that derived quantities have in this fit."""
-        return derived_names(self.task) if len(self.parts) == 1 else tuple(self.derived)
+        return derived_names(self.task, self.only.fitted.size > 0) if len(self.parts) == 1 else tuple(self.derived)
 
     @property
     def determined(self) -> dict[str, Estimate]:

@@ -33,7 +33,7 @@ def text_of(result: "FitResult") -> str:
     intervals = any(p.interval is not None for p in shown.values())
     in_bands = {name: p for name, p in shown.items() if base_of(name) in BANDS}
     rows = {name: p for name, p in shown.items() if name not in in_bands}
-    lines += _table("determined by the data", rows, " 95 % interval  " * intervals)
+    lines += _table("determined by the data", rows, " 95 % interval    " * intervals)
     lines += [f"  {sentence}" for sentence in _by_band(in_bands)]
     fixed = [name for name in result.products if name not in result.parameters]
     lines += [f"  they also fix, roughly: {', '.join(fixed)}"] if fixed else []
@@ -70,7 +70,7 @@ def _table(title: str, table: dict[str, Estimate], column: str = "") -> list[str
     lines = [f"  {title}:"] if not column else [f"  {title + ':':<{wide + 24}}{column.strip()}"]
     for name, p in table.items():
         unit = "" if p.unit == "1" else p.unit
-        interval = f"{p.interval_in_words():<18}" if column else ""
+        interval = f"{p.interval_in_words():<19} " if column else ""
         lines.append(f"    {name:<{wide}}{p.in_words():<20}{interval}{unit}".rstrip())
     return lines if table else [*lines, "    nothing"]
 

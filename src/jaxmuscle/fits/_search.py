@@ -199,7 +199,9 @@ def _polished(plan: Plan, known: Known, stages: list[Stage]) -> None:
         if len(made) < len(new):
             return
         if corrections is not None:
-            changes = [np.max(np.abs(np.log(a.power / b.power))) for a, b in zip(made, corrections, strict=True)]
+            changes = [
+                np.max(np.abs(np.log(a.power / b.power)), initial=0.0) for a, b in zip(made, corrections, strict=True)
+            ]
             if max(changes) < STILL:
                 return
         corrections, objective = made, problem.linear(shares, made)
@@ -222,6 +224,8 @@ def _with_recombined(plan: Plan, objective: Residuals, found: Minima) -> Minima:
 
 def correction_at(problem: FitProblem, part: Part, task: AbstractTask) -> Moments | None:
     """Moments of the nonlinear model over those of the linear response; None if the task cannot be simulated."""
+    if not len(part.target.bins):
+        return part.ones
     try:
         runs = ensemble(settled(task), fold_in(problem.key, 2), seeds=problem.seeds)
     except (SimulationError, ValueError):
@@ -232,13 +236,8 @@ def correction_at(problem: FitProblem, part: Part, task: AbstractTask) -> Moment
     mean = jax.tree.map(lambda x: np.asarray(x).mean(axis=0), each)
     power = mean.power[part.chosen] / np.asarray(expected.power)[part.chosen]
     level = np.ones(()) if task.quantity == "acceleration" else mean.mean / expected.mean  # the mean of one is zero
-    found = power, np.ones(len(power)), level, mean.variance / expected.variance
-    resonant = tuple(np.ones(len(power)) for _ in expected.resonant)
-    return (
-        Moments(*found, np.ones(()), np.ones(()), resonant)
-        if all(np.all(np.isfinite(x) & (np.asarray(x) > 0)) for x in found)
-        else None
-    )
+    found = part.ones._replace(power=power, mean=level, variance=mean.variance / expected.variance)
+    return found if all(np.all(np.isfinite(x) & (np.asarray(x) > 0)) for x in found[:4]) else None
 
 
 def _montecarlo(plan: Plan, points: np.ndarray, stages: list[Stage]) -> None:

@@ -16,7 +16,7 @@ import numpy as np
 from jaxmuscle import plot
 from jaxmuscle._common.arrays import with_nulls
 from jaxmuscle._common.environment import versions
-from jaxmuscle._common.files import write_json, write_text
+from jaxmuscle._common.files import remove, write_json, write_text
 from jaxmuscle._common.progress import Tell, told
 from jaxmuscle._common.tables import frame
 from jaxmuscle._common.text import WIDTH, choices, folded
@@ -170,8 +170,7 @@ class StudyResult(eqx.Module):
         with tempfile.TemporaryDirectory(prefix=".study-", dir=folder) as made:
             new = Path(made)
             self._write(new)
-            for name in FILES:
-                (folder / name).unlink(missing_ok=True)  # of an earlier study, which may have had more of them
+            remove(folder, *FILES)  # an earlier study may have had more of them
             for path in sorted(new.iterdir()):
                 os.replace(path, folder / path.name)
 
@@ -239,10 +238,6 @@ def run_study(
     study: "str | os.PathLike[str] | Iterable[Mapping[str, Any]]",
     *,
     rung: int | str | None = None,
-    window: tuple[float, float] | str | None = None,
-    column: str | int | None = None,
-    rate: float | None = None,
-    units: str | None = None,
     noise: str | None = None,
     quantities: Iterable[str] | None = None,
     alpha: float | None = None,
@@ -250,6 +245,7 @@ def run_study(
     starts: int = 32,
     key: int = 0,
     progress: bool | Tell = False,
+    **reading: Any,
 ) -> StudyResult:
     """Fit the recordings of a whole study with one model and compare groups and conditions.
 
@@ -263,13 +259,11 @@ def run_study(
     **Arguments:**
 
     - `study`: one of three things. A table (.csv, .tsv, .txt) with a line for each recording. It has the columns file
-      (relative to the table) and person; it may have group, condition, trial, column, rate, units, window_start,
-      window_stop. Or a .toml with `table = "study.csv"` or `[[recordings]]` of the same fields, and any of the options
-      below up to `correction`. Or rows, as dictionaries.
+      (relative to the table) and person; it may have group, condition, trial, window_start, window_stop and those of
+      `reading` but window. Or a .toml with `table = "study.csv"` or `[[recordings]]` of the same fields, and any of the
+      options below but `starts`, `key` and `progress`. Or rows, as dictionaries.
     - `rung`: the model of all people (`on_rung`), 0 to 3; by default 2, with activation and tremor. "auto" fits several and
       takes the one whose AIC, summed over all targets, is lowest; that is three or four times as long.
-    - `window` (start, stop) [s] or "all" (by default the steady part), `column`, `rate` [Hz], `units`: how files are read
-      where a row does not say it.
     - `noise`: as in `fit`; `starts` of each fit; `key` of its random numbers.
     - `quantities`: what is reported and compared; by default the derived quantities. The fewer, the less the correction
       costs.
@@ -277,6 +271,9 @@ def run_study(
     - `correction` for many comparisons: "holm" (default), "fdr" or "none". All comparisons of one kind (groups, conditions,
       interaction) are corrected together.
     - `progress`: True or a function of (text, share).
+    - `reading`: how files are read where a row does not say it. `window` (start, stop) [s] or "all" (by default the steady
+      part); `column`, `rate`, `units`, `axis`, `reference`, `time`, `skip_rows`, `max_gap` as in `load_recording`;
+      `spectrum`, a name of settings, the same for all; `mvc` as in `Trials.target`.
 
     An option that is given here replaces that of the .toml; what a row says about its own file stays.
 
@@ -284,18 +281,20 @@ def run_study(
 
     **Raises:** `ValueError` naming file, line and column, or the argument, and the remedy.
     """
+    for name in reading:
+        if name not in READING:
+            raise ValueError(f"unknown argument {name!r}; {choices(name, READING)}")
     table = read_study(study)
-    given = {"rung": rung, "window": window, "column": column, "rate": rate, "units": units, "noise": noise,
-             "quantities": quantities, "alpha": alpha, "correction": correction}  # fmt: skip
+    given = {"rung": rung, "noise": noise, "quantities": quantities, "alpha": alpha, "correction": correction} | reading
     options = USUAL | table.options | {name: value for name, value in given.items() if value is not None}
     options = _checked(options)
-    reading = {name: options.pop(name) for name in READING if name in options}
+    usual = {name: options.pop(name) for name in READING if name in options}
     options = options | {"starts": starts, "key": key}
     with told(progress, f"study of {len({row.person for row in table.rows})} people") as tell:
         tell("reading recordings", 0.0)
-        cells = cells_of_study(table.rows, reading)
+        cells = cells_of_study(table.rows, usual)
         cohort, aic = _fitted(cells, options, tell)
-    return StudyResult(cohort, tuple(cells), aic, options | {"reading": reading}, table.source)
+    return StudyResult(cohort, tuple(cells), aic, options | {"reading": usual}, table.source)
 
 
 def _checked(options: dict[str, Any]) -> dict[str, Any]:

@@ -8,6 +8,7 @@ import scipy
 
 from jaxmuscle._common.environment import versions
 from jaxmuscle.model._rungs import RUNGS
+from jaxmuscle.spectra._settings import SpectrumSettings
 
 from ._differences import Difference
 
@@ -105,7 +106,7 @@ def methods_paragraph(study: "StudyResult") -> str:
         f"We analysed {_people(study)}: {_trials(study)}.",
         f"Recordings (sampled at {_range(rates)} Hz) were resampled to {s.rate:g} Hz and {low_pass}; {part} was analysed "
         "where the table of the study states no other window.",
-        f"Power spectra were estimated by Welch's method ({s.window.capitalize()} window, {s.length} samples, "
+        f"Power spectra were estimated by Welch's method ({_window(s)}, {s.length} samples, "
         f"{100 * s.overlap:g} % overlap, {DETREND[s.detrend]}) from {s.frequency[0]:.2f} to {s.frequency[-1]:.2f} Hz. "
         f"Spectra of trials of one {whose} were averaged, weighted with their segments; where trials scattered more than "
         "their segments explain, all errors were widened by that.",
@@ -119,6 +120,10 @@ def methods_paragraph(study: "StudyResult") -> str:
         f"Python {platform.python_version()}.",
     ]  # fmt: skip
     return " ".join(said)
+
+
+def _window(s: SpectrumSettings) -> str:
+    return f"{s.tapers} Slepian tapers" if s.window == "dpss" else f"{s.window.capitalize()} window"
 
 
 def _choice(study: "StudyResult") -> str:

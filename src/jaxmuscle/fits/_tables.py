@@ -16,7 +16,8 @@ from ._intervals import Interval
 from ._part import Estimate
 
 OUTPUTS = ("coefficient_of_variation", "mean")
-BASE = ("K_w0", "K_z0", "C_w0", "C_z0")
+BASE = {"K_w0": "k_w", "K_z0": "k_z", "C_w0": "c_w", "C_z0": "c_z"}
+STRAIGHT = 0.25  # error of a log up to which a quantity is as good as linear
 
 
 def parameter_table(
@@ -64,7 +65,7 @@ def derived_table(
     Their errors are those of the parameters and, where a value comes from fresh seeds, their sampling error.
     """
     table = {}
-    for name in (n for n in derived_names(part.task) if n in values):
+    for name in (n for n in derived_names(part.task, len(part.target.bins) > 0) if n in values):
         g = np.asarray(slopes[name])
         free = bool(np.any(g != 0))
         determined = free and known.determines(g)
@@ -79,13 +80,17 @@ def too_curved(problem: FitProblem, derived: Collection[str], known: Identifiabi
 
     Along such a direction they bend, unless it is a common scale: on simulated recordings of muscles drawn from the
     prior, intervals by curvature or by profile held the truth in 75 to 85 % of cases, not in 95 % (docs/fitting.md).
-    Observed quantities are not concerned, nor what several targets share.
+    Observed quantities are not concerned, nor what several targets share, nor what a dynamic stiffness among the data makes
+    known within a quarter: so small an error is straight (docs/perturbed.md).
     """
     names = problem.coordinates.names
     if np.sum(~known.determined) <= len(common_scales(names, known)):
         return set()
     shape = ("_frequency", "_width", "_time")
     single = {n for n in names if not base_of(n).endswith(shape)} | {n for n in derived if base_of(n) in BASE}
+    if any(part.points is not None for part in problem.parts):
+        left = {n: known.left(unit) for n, unit in zip(names, np.eye(len(names)), strict=True)}
+        single = {n for n in single if left.get(BASE.get(n, n), 1.0) > STRAIGHT**2}
     return single if len(problem.parts) == 1 else {n for n in single if "@" in n}
 
 

@@ -1,4 +1,4 @@
-"""The model: parameters, material laws, muscle, inputs over time, noises, tasks, presets.
+"""The model: parameters, material laws, muscle, inputs over time, noises, tasks.
 
 Equations of motion are written here and nowhere else.
 """

@@ -18,7 +18,7 @@ from jaxmuscle.model._muscle import Muscle
 from jaxmuscle.model._noise import AbstractNoise
 from jaxmuscle.model._noises import with_noise
 from jaxmuscle.model._parameters import PARAMETERS, USUALLY_FREE
-from jaxmuscle.model._tasks import AbstractTask, Isometric, Observed, PrescribedForce
+from jaxmuscle.model._tasks import AbstractTask, Isometric, Observed, PrescribedForce, PrescribedLength
 from jaxmuscle.response._expected import check_line
 from jaxmuscle.response._linearised import has_response
 from jaxmuscle.response._scaling import FORCES, at_force, is_scalable
@@ -39,14 +39,15 @@ NARROW = 0.5
 def task_for(
     target: Target, kind: type[AbstractTask] | None = None, *, noise: str | AbstractNoise | None = None
 ) -> AbstractTask:
-    """The task that a target measured: `Isometric` for force and torque, `PrescribedForce` for displacement and
-    acceleration (with `observe="acceleration"`).
+    """The task that a target measured: `Isometric` for force and torque, `PrescribedLength` for a dynamic stiffness,
+    `PrescribedForce` for displacement and acceleration (with `observe="acceleration"`).
 
     Of another `kind` if one is given. It has the target's spectrum settings and default parameters; `noise` is a name of
     `NOISES` or a noise object.
     """
     what: Any = target.quantity
-    task = PrescribedForce(observe=what) if what in get_args(Observed) else Isometric()
+    held = Isometric() if target.stiffness is None else PrescribedLength()
+    task = PrescribedForce(observe=what) if what in get_args(Observed) else held
     task = task if kind in (None, type(task)) else kind()
     return with_noise(task.with_parts(settings=target.settings), noise)
 
@@ -59,9 +60,23 @@ def check_quantity(task: AbstractTask, target: Target, name: str, remedy: str) -
                          f"{task.output_name} in {task.output_unit}: {remedy}")  # fmt: skip
 
 
-def free_names(task: AbstractTask, free: Iterable[str] | None, fix: Mapping[str, float], bins: int) -> tuple[str, ...]:
-    """The parameters to fit, checked against the task, the fixed ones and the number of bins."""
-    known = task.parameter_names
+def check_stiffness(task: AbstractTask, target: Target) -> None:
+    """Refuse a task in which no insertion can be moved, where the target has a dynamic stiffness."""
+    if target.stiffness is not None and not isinstance(task, PrescribedLength):
+        raise ValueError(f"target {target.name!r} has a dynamic stiffness, which {type(task).__name__} cannot give: fit "
+                         "jaxmuscle.PrescribedLength()")  # fmt: skip
+
+
+def free_names(task: AbstractTask, free: Iterable[str] | None, fix: Mapping[str, float], target: Target) -> tuple[str, ...]:
+    """The parameters to fit, checked against the task, the fixed ones and the number of data.
+
+    By default those of muscle, noise and rhythms; where the target has no spectrum those of the muscle alone.
+    """
+    known, bins = task.parameter_names, len(target.bins)
+    if free is None and not bins:
+        free = [n for n in COEFFICIENTS if n in known and n not in fix]
+    if target.stiffness is not None:
+        bins += 2 * len(target.stiffness.known.frequency)
     if free is None:
         # Nothing shows the frequency of what has no amplitude.
         still = [n.removesuffix("amplitude") for n in known if n.endswith("_amplitude") and not float(task[n]) > 0]
@@ -163,19 +178,22 @@ def planned(task: AbstractTask, target: Target, options: FitOptions) -> Plan:
     task = as_numbers(task.with_parts(settings=target.settings).replace(**fix))
     if "acceleration" in (task.quantity, target.quantity):
         check_quantity(task, target, target.name, "fit jaxmuscle.task_for(target), or state the target's quantity")
-    names = free_names(task, options.free, fix, len(target.bins))
+    check_stiffness(task, target)
+    names = free_names(task, options.free, fix, target)
     names += tuple(name for name in options.also_free if name not in names)
     mean = options.mean_force if isinstance(options.mean_force, tuple) else None
     _check_names("priors", priors, names)
     _check_names("bounds", bounds, names)
     check_line(task, target.settings)
-    require(target.settings.segments(samples_in(WINDOW, target.settings)) > 0, "length", target.settings.length,
+    spectral, settings = len(target.bins) > 0, target.settings
+    require(not spectral or settings.segments(samples_in(WINDOW, settings)) > 0, "length", settings.length,
             "a fit simulates 10 s, which is shorter than a segment; analyse the data with shorter ones")  # fmt: skip
-    if not (np.any(np.asarray(task.noise.amplitude) > 0) or float(task.harmonic.amplitude) > 0):
+    if spectral and not (np.any(np.asarray(task.noise.amplitude) > 0) or float(task.harmonic.amplitude) > 0):
         raise ValueError("the task has neither noise nor a harmonic, so its spectrum is zero: set noise_K_w, say")
     _check_mean(task, names, mean)
     control = has_response(task, required=options.method == "linear")
     many = {"starts": 100, "seeds": 32, "check_seeds": 64} if control else {"starts": 8, "seeds": 48, "check_seeds": 200}
+    many |= {} if spectral else {"seeds": 0, "check_seeds": 0}
     counts = {name: count if getattr(options, name) is None else getattr(options, name) for name, count in many.items()}
     if options.method == "montecarlo" and counts["seeds"] < 1:
         raise ValueError("seeds = 0: a Monte Carlo fit needs at least one")

@@ -36,11 +36,15 @@ UNITS = {
 }
 
 
-def derived_names(task: Any) -> tuple[str, ...]:
-    """The derived quantities that a task has."""
+OF_SPECTRUM = {"harmonic_share", "harmonic_frequency", "high_frequency_floor", "tremor_frequency", "tremor_width",
+               "tremor_share", "resonance_2_share", "coefficient_of_variation", "mean", *BANDS}  # fmt: skip
+
+
+def derived_names(task: Any, spectrum: bool = True) -> tuple[str, ...]:
+    """The derived quantities that a task has; without a spectrum among the data those of the muscle alone."""
     frequency, resonances = task.settings.frequency, sum(isinstance(n, ResonantNoise) for n in task.noise.components)
     bands = {name for name, (low, high) in BANDS.items() if np.any((frequency >= low) & (frequency < high))}
-    missing = set(BANDS) - bands
+    missing = set(BANDS) - bands | (set() if spectrum else OF_SPECTRUM)
     missing |= set() if task.activation is not None else {"contraction_time"}
     missing |= {"tremor_frequency", "tremor_width", "tremor_share"} if resonances < 1 else set()
     missing |= {"resonance_2_share"} if resonances < 2 else set()

@@ -155,6 +155,9 @@ def _written(names: list[str], signs: tuple[float, ...]) -> str:
 
 def residual_covariance(target: Target, part: PartResiduals, share: np.ndarray) -> np.ndarray:
     """Covariance of one target's data residuals: scatter of the target and of the simulated mean."""
+    variation, rows = part.data.variation, np.ones(part.data.further)
+    if not len(target.bins):
+        return np.diag(rows)
     start, stop = WINDOW
     per_seed = target.settings.segments(round((stop - start) * target.settings.rate))
     law = welch_law(target.settings, target.bins, (per_seed,))
@@ -168,9 +171,8 @@ def residual_covariance(target: Target, part: PartResiduals, share: np.ndarray) 
     p = np.asarray(target.proportional_power)
     spread = _spread_map(part, p)
     total = spread @ (measured + simulated) @ spread.T
-    variation, mean = part.data.variation, part.data.mean
-    rows = [] if variation is None else [1.0 + 0.25 * float(p @ simulated @ p) / float(variation[1]) ** 2]
-    rows += [] if mean is None else [1.0]
+    if variation is not None:
+        rows[0] += 0.25 * float(p @ simulated @ p) / float(variation[1]) ** 2
     return np.block([[total, np.zeros((len(total), len(rows)))], [np.zeros((len(rows), len(total))), np.diag(rows)]])
 
 

@@ -52,7 +52,7 @@ class Bins(NamedTuple):
 
 def require_spread(target: Target) -> None:
     """Raises `ValueError` for a target that states neither segments nor sigma."""
-    if target.segments is None and target.sigma is None:
+    if target.segments is None and target.sigma is None and len(target.bins):
         raise ValueError(
             f"{target.name}: states neither segments nor sigma, so nothing says how much it scatters: give segments, "
             "the number of Welch segments that were averaged (--segments), or a sigma per bin"

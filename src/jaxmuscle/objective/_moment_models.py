@@ -14,6 +14,7 @@ from jaxmuscle.model._resonant_noise import ResonantNoise
 from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.response._equilibrium import slowest, slowest_rate
 from jaxmuscle.response._expected import Moments, expected_moments, response
+from jaxmuscle.response._input_response import parts_of_stiffness
 from jaxmuscle.response._linearised import LinearTask, settled
 from jaxmuscle.response._transfer import half_power_frequency
 from jaxmuscle.simulation._batch import respond
@@ -49,13 +50,14 @@ def welch_operator(
 class Linear(eqx.Module):
     """The expected spectrum of a task in linear response, times a `correction` (of a nonlinear simulation, say).
 
-    Its variance is that of a recording of so many `samples`.
+    Its variance is that of a recording of so many `samples`. `points`: frequencies of a measured dynamic stiffness [Hz].
     """
 
     chosen: np.ndarray
     correction: Moments
     samples: Int[Array | np.ndarray, ""]
     window: tuple[float, float] = eqx.field(static=True)
+    points: Float[Array | np.ndarray, " points"] | None = None
 
     def moments(self, task: AbstractTask) -> Moments:
         """Expected moments of the task's output."""
@@ -64,6 +66,8 @@ class Linear(eqx.Module):
         power, line, resonant = jax.tree.map(lambda x: x[self.chosen], (found.power, found.line, found.resonant))
         half = half_power_frequency(task, system)
         found = found._replace(power=power, line=line, resonant=resonant, rate=slowest(system.A), half=half)
+        if self.points is not None:
+            found = found._replace(stiffness=parts_of_stiffness(task, system, self.points))
         return jax.tree.map(jnp.multiply, found, self.correction)
 
 
@@ -83,10 +87,12 @@ class MonteCarlo(eqx.Module):
     grid: Grid
     window: tuple[float, float] = eqx.field(static=True)
     control: bool = eqx.field(static=True)
+    points: Float[Array | np.ndarray, " points"] | None = None
 
     @classmethod
     def of(cls, task: AbstractTask, normals: Any, grid: Grid, chosen: np.ndarray, window: tuple[float, float], *,
-           colour_free: bool, control: bool, samples: int | None = None) -> "MonteCarlo":  # fmt: skip
+           colour_free: bool, control: bool, samples: int | None = None,
+           points: Any = None) -> "MonteCarlo":  # fmt: skip
         """Prepare for the task's settings; `chosen` are the positions of the compared bins among the settings' bins.
 
         With a control variate the variance is that of a recording of so many `samples`, by default as many as simulated.
@@ -96,7 +102,7 @@ class MonteCarlo(eqx.Module):
         noise = normals if colour_free else jax.jit(jax.vmap(lambda z: task.noise.realise(z, grid.dt)))(normals)
         operator = welch_operator(task.settings, grid.steps // grid.every + 1, window)
         samples = samples_in(window, task.settings) if samples is None else samples
-        return cls(noise, jnp.asarray(operator), chosen, jnp.asarray(samples), grid, window, control)
+        return cls(noise, jnp.asarray(operator), chosen, jnp.asarray(samples), grid, window, control, points)
 
     @property
     def seeds(self) -> int:
@@ -129,7 +135,9 @@ class MonteCarlo(eqx.Module):
             spread = jnp.mean(swing(seen) - swing(beside))
             resonant = tuple(own[self.chosen] for own in exact.resonant)
             half = half_power_frequency(task, system)
-            return Moments(power, exact.line[self.chosen], mean, exact.variance + spread, slowest(system.A), half, resonant)
+            stiffness = () if self.points is None else parts_of_stiffness(task, system, self.points)
+            return Moments(power, exact.line[self.chosen], mean, exact.variance + spread, slowest(system.A), half, resonant,
+                           stiffness)  # fmt: skip
         quiet, noisy = seen[:1], seen[1:] - seen[:1]
         line, random = jnp.mean(self._power(quiet, settings), 0), jnp.mean(self._power(noisy, settings), 0)
         variance = swing(quiet[0]) + jnp.mean(swing(noisy))

@@ -95,20 +95,35 @@ class Part:
             return self
         return dataclasses.replace(self, variation=target_variation(self.target, task))
 
+    @property
+    def points(self) -> Float[np.ndarray, " points"] | None:
+        """Frequencies of the target's dynamic stiffness [Hz]."""
+        return None if self.target.stiffness is None else np.asarray(self.target.stiffness.known.frequency)
+
+    @property
+    def ones(self) -> Moments:
+        """The correction of moments that changes nothing."""
+        ones, one = np.ones(len(self.chosen)), np.ones(())
+        resonant = tuple(ones for noise in self.task.noise.components if isinstance(noise, ResonantNoise))
+        stiffness = () if self.points is None else np.ones((2, len(self.points)))
+        return Moments(ones, ones, one, one, one, one, resonant, stiffness)
+
     def linear(self, residual: str, share: np.ndarray | None = None, correction: Moments | None = None) -> PartResiduals:
         """Its residuals in linear response, times a correction of its moments."""
-        if correction is None:
-            ones, one = np.ones(len(self.chosen)), np.ones(())
-            resonant = tuple(ones for noise in self.task.noise.components if isinstance(noise, ResonantNoise))
-            correction = Moments(ones, ones, one, one, one, one, resonant)
+        known: Moments = jax.tree.map(np.asarray, self.ones if correction is None else correction)
         samples = np.asarray(trial_samples(self.target))
-        return self.residuals(Linear(self.chosen, jax.tree.map(np.asarray, correction), samples, WINDOW), residual, share)
+        return self.residuals(Linear(self.chosen, known, samples, WINDOW, self.points), residual, share)
 
     def residuals(self, model: Linear | MonteCarlo, residual: str, share: np.ndarray | None) -> PartResiduals:
         """Its residuals with a model of its moments; `share` is what a line holds of each bin."""
         statistics = bin_statistics(self.target, share)
         sigma = residual_sigma(residual, self.target, statistics)
-        data = Data(self.target.proportional_power, statistics.bias, statistics.sd, sigma, self.variation, self.mean)
+        measured, stiffness = self.target.stiffness, None
+        if measured is not None:
+            known = measured.known
+            stiffness = np.stack([np.real(known.value), np.imag(known.value)]), known.stderr
+        spectrum = self.target.proportional_power, statistics.bias, statistics.sd, sigma
+        data = Data(*spectrum, self.variation, self.mean, stiffness)
         given = as_arrays({"data": data, "statistics": statistics})
         return PartResiduals(as_arrays(self.task), self.coordinates, model, **given, residual=residual)
 
@@ -227,7 +242,7 @@ class FitProblem:
         shaping = {n for n, path in paths_of(task).items() if path[0] == "noise" and "amplitude" not in path}
         colour = not shaping.isdisjoint(part.coordinates.names)
         return MonteCarlo.of(task, normals, grid, part.chosen, WINDOW, colour_free=colour, control=self.control,
-                             samples=trial_samples(part.target))  # fmt: skip
+                             samples=trial_samples(part.target), points=part.points)  # fmt: skip
 
     def finer(self, objective: Residuals, points: Float[np.ndarray, "points free"]) -> Residuals:
         """The residuals with as many sub-steps as the stiffest of the points asks for; never fewer than they have."""

@@ -17,7 +17,8 @@ from ._moment_models import Linear, MonteCarlo
 
 
 class Data(eqx.Module):
-    """What a fit knows of a target: powers, their spread, log coefficient of variation and mean with their sds (or None).
+    """What a fit knows of a target: powers, their spread; log coefficient of variation, mean, and real and imaginary part of
+    the dynamic stiffness, each with its sd (or None).
 
     The model does not depend on it.
     """
@@ -28,6 +29,13 @@ class Data(eqx.Module):
     sigma: Float[Array | np.ndarray, "*rows bins"]
     variation: tuple[Scalar, Scalar] | None
     mean: tuple[Scalar, Scalar] | None
+    stiffness: tuple[Float[Array | np.ndarray, "*rows 2 points"], Float[Array | np.ndarray, "*rows points"]] | None = None
+
+    @property
+    def further(self) -> int:
+        """How many residuals there are besides those of the spectrum."""
+        points = 0 if self.stiffness is None else 2 * np.shape(self.stiffness[1])[-1]
+        return (self.variation is not None) + (self.mean is not None) + points
 
 
 class PartResiduals(eqx.Module):
@@ -45,7 +53,7 @@ class PartResiduals(eqx.Module):
         return self.model.moments(task_at(self.task, self.coordinates, theta))
 
     def data_residuals(self, moments: Moments, data: Data) -> Float[Array, " residuals"]:
-        """Residuals in standard deviations of the data: spectrum, then coefficient of variation and mean."""
+        """Residuals in standard deviations of the data: spectrum, then the further ones."""
         return jnp.concatenate([jnp.asarray(self._spectrum_residuals(moments, data)), further_residuals(moments, data)])
 
     def _spectrum_residuals(self, moments: Moments, data: Data) -> Float[Array | np.ndarray, " bins"]:
@@ -59,10 +67,14 @@ class PartResiduals(eqx.Module):
 
 
 def further_residuals(moments: Moments, data: Data) -> Float[Array, " rows"]:
-    """Residuals of coefficient of variation and mean, where there are such."""
+    """Residuals of coefficient of variation, mean and dynamic stiffness, where there are such."""
     rows = [] if data.variation is None else [(jnp.log(moments.variation) - data.variation[0]) / data.variation[1]]
     rows += [] if data.mean is None else [(moments.mean - data.mean[0]) / data.mean[1]]
-    return jnp.stack([jnp.asarray(row) for row in rows]) if rows else jnp.zeros(0)
+    found = jnp.stack([jnp.asarray(row) for row in rows]) if rows else jnp.zeros(0)
+    if data.stiffness is None:
+        return found
+    measured, sd = data.stiffness
+    return jnp.concatenate([found, jnp.reshape((jnp.asarray(moments.stiffness) - measured) / sd, -1)])
 
 
 class Residuals(eqx.Module):

@@ -9,6 +9,8 @@ from ._designed_input import designed_input as designed_input
 from ._fit import fit as fit
 from ._identifiability import identifiability as identifiability
 from ._moments import moments as moments
+from ._perturbed import frequency_response as frequency_response
+from ._perturbed import perturbed as perturbed
 from ._posterior import chains as chains
 from ._posterior import posterior as posterior
 from ._posterior import predictive as predictive

@@ -30,7 +30,8 @@ class Moments(NamedTuple):
 
     The variance is that of the low-passed output, as a recording's: what lies above the low-pass is not in it. `rate` is
     the slowest of the operating point [1/s], `half` the frequency of half power of the slow part [Hz], where they were
-    computed. `resonant`: Welch power per bin of every resonance alone.
+    computed. `resonant`: Welch power per bin of every resonance alone. `stiffness`: real and imaginary part of the dynamic
+    stiffness at the points of a measured one.
     """
 
     power: Float[Array | np.ndarray, " bins"]
@@ -40,6 +41,7 @@ class Moments(NamedTuple):
     rate: Float[Array | np.ndarray, ""] | float = np.nan
     half: Float[Array | np.ndarray, ""] | float = np.nan
     resonant: tuple[Float[Array | np.ndarray, " bins"], ...] = ()
+    stiffness: Float[Array | np.ndarray, "2 points"] | tuple[()] = ()
 
     @property
     def proportional(self) -> Float[Array | np.ndarray, " bins"]:

@@ -40,6 +40,19 @@ def stiffness_at(task: PrescribedLength, system: Linearisation, f: Frequencies) 
     return -(_gain(by_place, s) + s * _gain(by_velocity, s))
 
 
+def parts_of_stiffness(task: AbstractTask, system: Linearisation, f: Frequencies) -> Float[Array, "2 frequencies"]:
+    """Its real and its imaginary part. Raises `ValueError` for a task in which the insertion is not held or moved."""
+    found = stiffness_at(_perturbed(task), system, f)
+    return jnp.stack([jnp.real(found), jnp.imag(found)])
+
+
+def _perturbed(task: AbstractTask) -> PrescribedLength:
+    if isinstance(task, PrescribedLength):
+        return task
+    raise ValueError(f"task: this is a {type(task).__name__}, in which the insertion is not moved; put its muscle into the "
+                     "experiment: task.as_task(jaxmuscle.PrescribedLength)")  # fmt: skip
+
+
 def density_at(task: AbstractTask, system: Linearisation, f: Frequencies) -> Float[Array, " frequencies"]:
     """`noise_density` where the linearisation is known."""
     s, found = _laplace(f, system), jnp.zeros(np.shape(f), system.A.dtype)
@@ -68,7 +81,7 @@ def _checked(task: AbstractTask) -> None:
         check_equilibrium(task, np.asarray(system.point), np.asarray(system.A))
 
 
-def dynamic_stiffness(task: PrescribedLength, frequency: Frequencies) -> Complex[Array, " frequencies"]:
+def dynamic_stiffness(task: AbstractTask, frequency: Frequencies) -> Complex[Array, " frequencies"]:
     """Force per lengthening of the muscle at each frequency, in linear response about the operating point.
 
         H(f) = -F_ext(f) / x_z(f) = -[C (s - A)⁻¹ (b₀ + s b₁) + d₀ + s d₁ + s² d₂],    s = 2πif
@@ -84,10 +97,7 @@ def dynamic_stiffness(task: PrescribedLength, frequency: Frequencies) -> Complex
     **Raises:** `ValueError` for another task; `OperatingPointError` (a `ValueError`) where an input moves or there is no
     stable equilibrium.
     """
-    if not isinstance(task, PrescribedLength):
-        raise ValueError(f"task: this is a {type(task).__name__}, in which the insertion is not moved; put its muscle into "
-                         "the experiment: task.as_task(jaxmuscle.PrescribedLength)")  # fmt: skip
-    _checked(task)
+    _checked(_perturbed(task))
     return _stiffness(as_arrays(task), jnp.asarray(frequency, jnp.result_type(float)))
 
 

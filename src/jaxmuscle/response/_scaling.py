@@ -21,6 +21,7 @@ from ._linearised import check_equilibrium, check_inputs
 from ._second_order import warn_beyond
 
 FORCES = ("P_w", "F_ext")
+NO_FORCE = 1e-15  # N, below which a mean force is rounding
 SIZES_OF_A_SIGNAL = ("level", "initial", "final")
 
 
@@ -97,15 +98,16 @@ def at_force(task: AbstractTask, mean: Scalar) -> AbstractTask:
 
     **Arguments:** `mean` [N], of the sign of the task's own mean force.
 
-    **Returns:** a task of the same kind. **Raises:** `ValueError` for a task whose output is not a force, a mean of zero or
-    of the other sign, a muscle that is not made of the paper's quadratic laws; `OperatingPointError` (a `ValueError`)
-    where there is no stable equilibrium.
+    **Returns:** a task of the same kind. **Raises:** `ValueError` for a task whose output is not a force or has a mean of
+    zero, a `mean` of zero or of the other sign, a muscle that is not made of the paper's quadratic laws;
+    `OperatingPointError` (a `ValueError`) where there is no stable equilibrium.
     """
     if task.output_unit != "N":
         raise ValueError(f"the output of {type(task).__name__} is {task.output_name} in {task.output_unit}, not a force")
     here = _moments(task).mean
+    require(abs(here) > NO_FORCE, "the mean force of this task is zero, and stays so: give it a P_w or F_ext")
     factor = _number(mean) / here
-    require(factor > 0, f"mean = {mean} N: the mean force of this task is {here} N; give one of the same sign")
+    require(factor > 0, f"the mean force of this task is {here} N: give a mean of the same sign, not {mean} N")
     return times_force(task, factor)
 
 

@@ -126,7 +126,7 @@ def bin_statistics(target: Any, line_share: Float[np.ndarray, "*rows bins"] | No
     if target.sigma is not None:
         sd = np.sqrt(np.log1p((target.sigma / target.proportional_power) ** 2))
         return BinStatistics(np.zeros(share.shape), np.broadcast_to(sd, share.shape), np.eye(n), unknown, True)
-    return BinStatistics(np.zeros(share.shape), np.ones(share.shape), np.eye(n), unknown, False)
+    return BinStatistics(np.zeros(share.shape), np.ones(share.shape), np.eye(n), unknown, n == 0)
 
 
 def samples_of(segments: int, settings: SpectrumSettings) -> int:
@@ -146,6 +146,8 @@ def standardised(
 ) -> Float[np.ndarray, " bins"]:
     """`(z_k - z̄) / sd_k` with `z_k = ln(target_k / fitted_k) - bias_k`."""
     z = np.log(target_power) - np.log(fitted) - statistics.bias
+    if not z.size:
+        return z
     return (z - z.mean()) / statistics.sd
 
 

@@ -21,6 +21,7 @@ from jaxmuscle.objective._scoring import Maximum, highest
 from jaxmuscle.objective._starts import distinct, frequency_names
 from jaxmuscle.response._expected import Moments, noise_response, noise_variance
 from jaxmuscle.response._harmonic_line import LineTable, harmonic_size, line_table
+from jaxmuscle.response._input_response import parts_of_stiffness
 from jaxmuscle.response._linearised import Linearisation, linearise
 from jaxmuscle.response._transfer import harmonic_system, polynomial, polynomials
 from jaxmuscle.spectra._bin_law import trial_samples
@@ -48,6 +49,7 @@ class Features(NamedTuple):
     size: Float[Array, "2"]
     numerator: Float[Array, " above"]
     denominator: Float[Array, " below"]
+    stiffness: Float[Array, "2 points"] | tuple[()]
 
     def moments(self, frequency: Float[Array, " grid"], table: LineTable) -> Moments:
         """Moments with the harmonic at each frequency; a leading axis of frequencies."""
@@ -55,8 +57,10 @@ class Features(NamedTuple):
         reply = jax.lax.complex(*self.size) * polynomial(self.numerator, s) / polynomial(self.denominator, s)
         line = table.power(reply)
         unknown = jnp.full(frequency.shape, jnp.nan)
-        return Moments(self.power + line, line, jnp.broadcast_to(self.mean, frequency.shape),
-                       self.variance + table.variance(reply), unknown, unknown)  # fmt: skip
+        mean, stiffness = jax.tree.map(lambda x: jnp.broadcast_to(x, (*frequency.shape, *x.shape)),
+                                       (self.mean, self.stiffness))  # fmt: skip
+        return Moments(self.power + line, line, mean, self.variance + table.variance(reply), unknown, unknown,
+                       stiffness=stiffness)  # fmt: skip
 
 
 class Band(eqx.Module):
@@ -173,7 +177,8 @@ class PosteriorDensity(eqx.Module):
         size = harmonic_size(task, system.A.dtype)
         size = jnp.stack([jnp.real(size), jnp.imag(size)])
         power = jnp.sum(power, axis=0)[model.chosen] * model.correction.power
-        return Features(power, system.rest, variance, size, *polynomials(harmonic_system(task, system)))
+        stiffness = () if model.points is None else parts_of_stiffness(task, system, model.points)
+        return Features(power, system.rest, variance, size, *polynomials(harmonic_system(task, system)), stiffness)
 
     def heights(
         self, band: Band, s: Float[Array, " free"], offsets: Float[Array, " parts"], systems: Systems

@@ -1,19 +1,13 @@
-"""Saved tasks: one table holds the muscle, its perturbation, the inputs and the spectrum settings."""
+"""Tasks as tables: one holds the muscle, its perturbation, the inputs and the spectrum settings."""
 
 import dataclasses
-import json
-import tomllib
-from pathlib import Path
 from typing import Any, Literal, get_args, get_origin
 
 import equinox as eqx
 import numpy as np
-import tomli_w
 
 from jaxmuscle._common.arrays import as_numbers
-from jaxmuscle._common.bundled import bundled_text, list_presets
 from jaxmuscle._common.errors import PresetError
-from jaxmuscle._common.files import write_text
 from jaxmuscle._common.text import choices
 from jaxmuscle.spectra._settings import SpectrumSettings
 
@@ -121,42 +115,3 @@ def _from_table(key: str, value: Any, where: str) -> Any:
     if isinstance(value, list):
         return tuple(value) if key == "initial" else np.array(value, dtype=float)
     return value
-
-
-def load_preset(name_or_path: str | Path) -> AbstractTask:
-    """The task of a bundled preset, of a preset file (.toml), or of a `fit.json`: `name_or_path`.
-
-    **Raises:** `PresetError` naming the file or the nearest bundled name, and what is wrong.
-    """
-    name = str(name_or_path)
-    if name in list_presets():
-        return task_from_table(tomllib.loads(bundled_text(name, "presets"))["task_table"])
-    path = Path(name).expanduser()
-    if not path.suffix and not path.exists():
-        raise PresetError(f"unknown preset {name!r}: {choices(name, list_presets())}; or give a path")
-    table = _read(path)
-    if not isinstance(table.get("task_table"), dict):
-        raise PresetError(f"{path}: has no [task_table]: is it a preset or a fit.json?")
-    try:
-        return task_from_table(table["task_table"])
-    except ValueError as error:
-        raise PresetError(f"{path}: {error}") from None
-
-
-def _read(path: Path) -> dict[str, Any]:
-    try:
-        text = path.read_text(encoding="utf-8")
-        table = json.loads(text) if path.suffix == ".json" else tomllib.loads(text)
-    except OSError as error:
-        raise PresetError(f"{path}: cannot be read: {error.strerror}") from None
-    except ValueError as error:
-        raise PresetError(f"{path}: is not valid {'JSON' if path.suffix == '.json' else 'TOML'}: {error}") from None
-    if not isinstance(table, dict):
-        raise PresetError(f"{path}: is not a preset or a fit.json: it holds no table")
-    return table
-
-
-def save_preset(path: str | Path, task: AbstractTask, *, description: str = "", fit: dict[str, Any] | None = None) -> None:
-    """Write a task to `path` as a preset: TOML with a description, the fit that made it and the task table."""
-    table: dict[str, Any] = {"description": description} | ({"fit": fit} if fit else {})
-    write_text(path, tomli_w.dumps(table | {"task_table": task_to_table(task)}))

@@ -1,0 +1,224 @@
+"""Frequency responses: the dynamic stiffness of a muscle, measured or published, with its errors."""
+
+import os
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Complex, Float
+
+from jaxmuscle import plot
+from jaxmuscle._common.files import write_text
+from jaxmuscle._common.text import folded
+from jaxmuscle.spectra._settings import require
+
+from ._target_fields import frozen
+
+COLUMNS = ("frequency_hz", "gain_N/m", "phase_deg", "stderr_N/m", "coherence")
+
+
+class FrequencyResponse(eqx.Module):
+    """The dynamic stiffness of a muscle: force per lengthening of its insertion, over frequency.
+
+        H(f) = F(f) / X(f)  [N/m]
+
+    X counts *lengthening* as positive, so that H has a positive real part at low frequency (a spring), and a positive
+    phase where it damps.
+
+    **Arguments:**
+
+    - `frequency` [Hz], shape `(bins,)`: above 0 and rising.
+    - `value` [N/m], shape `(bins,)`: H, complex.
+    - `stderr` [N/m], shape `(bins,)`: standard error of the real part, and of the imaginary part; infinite where the
+      value is of no use.
+    - `coherence`, shape `(bins,)`: the share of the force's power that follows the displacement, 0 to 1; or `None`.
+    - `name`, `source`, `notices`: how reports call it, where it comes from, what was done to it.
+
+    **Raises:** `ValueError` naming the argument, the entry and the remedy.
+    """
+
+    frequency: Float[np.ndarray, " bins"]
+    value: Complex[np.ndarray, " bins"]
+    stderr: Float[np.ndarray, " bins"]
+    coherence: Float[np.ndarray, " bins"] | None
+    name: str = eqx.field(static=True)
+    source: str = eqx.field(static=True)
+    notices: tuple[str, ...] = eqx.field(static=True)
+
+    def __init__(
+        self,
+        frequency: Any,
+        value: Any,
+        stderr: Any,
+        coherence: Any = None,
+        *,
+        name: str = "response",
+        source: str = "given by the user",
+        notices: Iterable[str] = (),
+    ):
+        self.frequency = _column("frequency", frequency, None)
+        size = self.frequency.size
+        rising = (self.frequency > 0) & (np.diff(self.frequency, prepend=0.0) > 0) & (self.frequency < np.inf)
+        _require_all(rising, "frequency", self.frequency, "give rising frequencies above 0 Hz, each once")
+        self.value = _column("value", value, size, complex)
+        _require_all(np.isfinite(self.value) & (self.value != 0), "value", self.value, "give finite numbers other than 0")
+        self.stderr = _column("stderr", stderr, size)
+        remedy = "give standard errors above 0, infinite where a value is of no use"
+        _require_all(self.stderr > 0, "stderr", self.stderr, remedy)
+        require(bool(np.any(np.isfinite(self.stderr))), "stderr", "all infinite", "give one that is finite")
+        self.coherence = None if coherence is None else _column("coherence", coherence, size)
+        if self.coherence is not None:
+            inside = (self.coherence >= 0) & (self.coherence <= 1)
+            _require_all(inside, "coherence", self.coherence, "give the squared coherence, 0 to 1")
+        self.name, self.source, self.notices = name, source, tuple(notices)
+
+    @classmethod
+    def from_gain(
+        cls,
+        frequency: Any,
+        gain: Any,
+        phase: Any,
+        *,
+        coherence: Any = None,
+        segments: Any = None,
+        stderr: Any = None,
+        **fields: Any,
+    ) -> "FrequencyResponse":
+        """A response as figures show it: gain, phase and coherence.
+
+        Where `stderr` is not known, coherence γ² and the number K of independent averages give it:
+
+            stderr = gain √((1 - γ²) / (2 K γ²))
+
+        **Arguments:** `frequency` [Hz]; `gain` [N/m]; `phase` [deg], positive where the force leads; `coherence` γ²;
+        `segments`, K, one number or one for each frequency; `stderr` [N/m]; `fields` as in `FrequencyResponse` (name, ...).
+
+        **Raises:** `ValueError` without `stderr` and without (`coherence` and `segments`), and as `FrequencyResponse` does.
+
+        **Source:** Bendat & Piersol, Random Data, 4th ed. 2010, section 9.2 (docs/perturbed.md derives it).
+        """
+        frequency = _column("frequency", frequency, None)
+        gain, phase = (_column(n, v, frequency.size) for n, v in (("gain", gain), ("phase", phase)))
+        _require_all(gain > 0, "gain", gain, "give positive numbers; a negative stiffness has the phase 180")
+        if stderr is None:
+            if coherence is None or segments is None:
+                raise ValueError("stderr: is not known; give it, or the coherence and the number of independent averages, "
+                                 "as coherence=[0.9, ...], segments=40")  # fmt: skip
+            shared = _column("coherence", coherence, frequency.size)
+            _require_all((shared >= 0) & (shared <= 1), "coherence", shared, "give the squared coherence, 0 to 1")
+            remedy = "the formula has no error for a coherence of 1; give `stderr`"
+            _require_all(shared < 1, "coherence", shared, remedy)
+            averages = np.broadcast_to(np.asarray(segments, float), frequency.shape)
+            _require_all(averages >= 1, "segments", averages, "give the number of independent averages, at least 1")
+            with np.errstate(divide="ignore"):
+                stderr = gain * np.sqrt((1 - shared) / (2 * averages * shared))
+        value = gain * np.exp(1j * np.radians(phase))
+        return cls(frequency, value, stderr, coherence, **fields)
+
+    @property
+    def known(self) -> "FrequencyResponse":
+        """The response where its error is finite."""
+        kept = np.isfinite(self.stderr)
+        return self if np.all(kept) else self._with(kept)
+
+    def _with(self, kept: np.ndarray) -> "FrequencyResponse":
+        shared = None if self.coherence is None else self.coherence[kept]
+        fields = {"name": self.name, "source": self.source, "notices": self.notices}
+        return FrequencyResponse(self.frequency[kept], self.value[kept], self.stderr[kept], shared, **fields)
+
+    @property
+    def gain(self) -> Float[np.ndarray, " bins"]:
+        """`|H|` [N/m]."""
+        return np.abs(self.value)
+
+    @property
+    def phase(self) -> Float[np.ndarray, " bins"]:
+        """The phase of H [deg], -180 to 180: positive where the force leads the lengthening."""
+        return np.degrees(np.angle(self.value))
+
+    @property
+    def gain_stderr(self) -> Float[np.ndarray, " bins"]:
+        """Standard error of the gain [N/m]."""
+        return self.stderr
+
+    @property
+    def phase_stderr(self) -> Float[np.ndarray, " bins"]:
+        """Standard error of the phase [deg], to first order in stderr / gain."""
+        return np.degrees(self.stderr / self.gain)
+
+    @property
+    def averages(self) -> Float[np.ndarray, " bins"] | None:
+        """How many independent averages errors and coherence imply: K = (1 - γ²) gain² / (2 γ² stderr²); or `None`."""
+        if self.coherence is None:
+            return None
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return (1 - self.coherence) / (2 * self.coherence) * (self.gain / self.stderr) ** 2
+
+    def to_table(self) -> dict[str, Any]:
+        """The response as plain lists, for TOML and JSON; an infinite error is the text "inf"."""
+        table: dict[str, Any] = {
+            "name": self.name, "source": self.source, "notices": list(self.notices),
+            "frequency_hz": self.frequency.tolist(),
+            "real": np.real(self.value).tolist(), "imaginary": np.imag(self.value).tolist(),
+            "stderr": [e if np.isfinite(e) else "inf" for e in self.stderr.tolist()],
+        }  # fmt: skip
+        return table | ({} if self.coherence is None else {"coherence": self.coherence.tolist()})
+
+    @classmethod
+    def from_table(cls, table: Mapping[str, Any]) -> "FrequencyResponse":
+        """The reverse of `to_table`, exactly."""
+        value = np.asarray(table["real"], float) + 1j * np.asarray(table["imaginary"], float)
+        stderr = [float(error) for error in table["stderr"]]
+        fields = {key: table[key] for key in ("name", "source", "notices")}
+        return cls(table["frequency_hz"], value, stderr, table.get("coherence"), **fields)
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write a CSV that `jaxmuscle.load_frequency_response` reads; an existing file is replaced in one step.
+
+        **Raises:** `ValueError` if the path does not end in .csv.
+        """
+        path = Path(path).expanduser()
+        require(
+            path.suffix.lower() == ".csv", "path", str(path), "a response is saved as text; give a name that ends in .csv"
+        )
+        columns = [self.frequency, self.gain, self.phase, self.stderr]
+        columns += [] if self.coherence is None else [self.coherence]
+        rows = [",".join(map(repr, row)) for row in np.stack(columns, axis=1).tolist()]
+        write_text(path, "\n".join([f"# {self.source}", ",".join(COLUMNS[: len(columns)]), *rows]) + "\n")
+
+    def plot(self, ax: Any = None) -> Any:
+        """Draw gain, phase and coherence with their errors, see `jaxmuscle.plot.frequency_response`; returns the figure."""
+        return plot.frequency_response(self, ax)
+
+    def __str__(self) -> str:
+        f, error = self.frequency, self.stderr / self.gain
+        lines = [
+            f"{self.name}: dynamic stiffness [N/m], {f.size} frequencies from {f[0]:.3g} to {f[-1]:.3g} Hz",
+            f"  source    {self.source}",
+            f"  gain      {self.gain.min():.4g} to {self.gain.max():.4g} N/m, standard error {100 * np.median(error):.2g} % "
+            "(median)",
+            f"  phase     {self.phase.min():.0f} to {self.phase.max():.0f} deg",
+        ]
+        if self.coherence is not None:
+            low = int(np.argmin(self.coherence))
+            median = np.median(self.coherence)
+            lines.append(f"  coherence {median:.2f} (median), lowest {self.coherence[low]:.2f} at {f[low]:.3g} Hz")
+        return folded(lines + [f"  notice    {notice}" for notice in self.notices])
+
+
+def _column(name: str, given: Any, size: int | None, kind: type = float) -> Any:
+    try:
+        values = np.array(given, dtype=kind)
+    except (TypeError, ValueError):
+        raise ValueError(f"{name}: give numbers, one for each frequency") from None
+    remedy = "give a list of numbers" if size is None else f"give {size} values, one for each frequency"
+    require(values.ndim == 1 and values.size > 0 and size in (None, values.size), f"{name} shape", values.shape, remedy)
+    return frozen(values)
+
+
+def _require_all(holds: Any, name: str, values: Any, remedy: str) -> None:
+    wrong = np.flatnonzero(~holds)
+    if wrong.size:
+        raise ValueError(f"{name}, entry {wrong[0] + 1}: {values[wrong[0]]:g}: {remedy}")

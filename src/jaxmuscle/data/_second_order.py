@@ -1,0 +1,56 @@
+"""The classical description of a dynamic stiffness: a spring, a damper and a mass, with or without a pure delay."""
+
+from typing import NamedTuple
+
+import numpy as np
+import scipy
+from jaxtyping import Complex, Float
+
+from jaxmuscle.spectra._cross_spectrum import Response
+from jaxmuscle.spectra._settings import require
+
+
+class SecondOrder(NamedTuple):
+    """`value` and `stderr` of K [N/m], B [N s/m], I [kg] and, if fitted, of the delay τ [s]; chi² over its expectation."""
+
+    value: Float[np.ndarray, " parameters"]
+    stderr: Float[np.ndarray, " parameters"]
+    chi2: float
+
+
+def second_order_shape(frequency: Float[np.ndarray, " bins"], parameters: Float[np.ndarray, " parameters"]) -> np.ndarray:
+    """H = (K + iωB - ω²I) e^{-iωτ} [N/m], ω = 2πf; τ = 0 if there are three parameters."""
+    k, b, i, *delay = parameters
+    s = 2j * np.pi * frequency
+    return (k + s * b + s**2 * i) * np.exp(-s * sum(delay))
+
+
+def second_order_fit(response: Response, delayed: bool) -> SecondOrder:
+    """K, B and I, and a delay, by least squares weighted with the response's errors.
+
+    The errors take the correlation of neighbouring bins into account. Where chi² is more than it should be, since the muscle
+    has another shape, they are multiplied by √(chi² / its expectation).
+    """
+    f, weight = response.frequency, 1 / np.concatenate([response.stderr] * 2)
+    count = 3 + delayed
+    require(2 * f.size > count, "bins", f.size, "too few for a fit; excite a wider band, or take longer segments")
+    scale = np.abs(response.value).max() / (2 * np.pi * f.max()) ** np.arange(3)
+    scale = np.append(scale, 1 / (2 * np.pi * f.max()))[:count]
+
+    def residuals(x: Float[np.ndarray, " parameters"]) -> Float[np.ndarray, " twice"]:
+        return _parts(second_order_shape(f, x * scale) - response.value) * weight
+
+    shapes = np.stack([_parts(second_order_shape(f, unit * scale[:3])) for unit in np.eye(3)], axis=1) * weight[:, None]
+    start = np.linalg.lstsq(shapes, _parts(response.value) * weight)[0]
+    found = scipy.optimize.least_squares(residuals, np.append(start, 0.0)[:count], x_scale="jac", jac="3-point")
+    inverse = np.linalg.pinv(found.jac.T @ found.jac)
+    c = response.correlation
+    covariance = np.block([[np.real(c), -np.imag(c)], [np.imag(c), np.real(c)]])
+    spread = inverse @ found.jac.T @ covariance @ found.jac @ inverse
+    expected = 2 * f.size - np.trace(inverse @ found.jac.T @ covariance @ found.jac)
+    chi2 = float(2 * found.cost / expected)
+    return SecondOrder(found.x * scale, np.sqrt(np.diag(spread) * max(chi2, 1.0)) * scale, chi2)
+
+
+def _parts(values: Complex[np.ndarray, " bins"]) -> Float[np.ndarray, " twice"]:
+    return np.concatenate([np.real(values), np.imag(values)])

@@ -1,0 +1,54 @@
+"""Perturbed recordings as the target of a fit: the response to the perturbation is taken off by the model that is fitted."""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import numpy as np
+
+from jaxmuscle.data._as_target import as_target
+from jaxmuscle.data._perturbed import PerturbedRecording
+from jaxmuscle.data._perturbed_target import perturbed_target
+from jaxmuscle.data._target import Target
+from jaxmuscle.model._tasks import AbstractTask, PrescribedLength
+from jaxmuscle.objective._arguments import FitOptions, at_mean, planned
+from jaxmuscle.objective._least_squares import least_squares
+from jaxmuscle.objective._starts import starting_points
+from jaxmuscle.response._input_response import dynamic_stiffness
+
+STARTS, STEPS, ROUNDS, KEPT = 16, 20, 2, 2
+
+
+def aimed(given: Any, task: AbstractTask | None = None, options: FitOptions | None = None) -> Target:
+    """The target of whatever a fit was given; that of perturbed recordings with the response of the task's muscle."""
+    recordings = recordings_of(given)
+    if not recordings:
+        return as_target(given)
+    with jax.enable_x64(True):
+        return analysed(recordings, PrescribedLength() if task is None else task, options or FitOptions())
+
+
+def recordings_of(given: object) -> tuple[PerturbedRecording, ...]:
+    """The perturbed recordings that a fit was given; none of anything else."""
+    if isinstance(given, PerturbedRecording):
+        return (given,)
+    if isinstance(given, Sequence) and len(given) > 0 and all(isinstance(one, PerturbedRecording) for one in given):
+        return tuple(given)
+    return ()
+
+
+def analysed(recordings: Sequence[PerturbedRecording], task: AbstractTask, options: FitOptions) -> Target:
+    """Their target, with the response by the muscle that fits it: found in a few rounds from the nonparametric one."""
+    target, points = perturbed_target(recordings), None
+    for _ in range(ROUNDS):
+        carried, given = at_mean(task, target, options)
+        problem = planned(carried, target, dataclasses.replace(given, method="linear")).problem
+        points = starting_points(problem, STARTS) if points is None else points
+        found = least_squares(problem.linear(), points, STEPS)
+        if not np.isfinite(found.cost[found.best]):
+            break
+        (muscle,) = problem.tasks_at(np.asarray(problem.coordinates.theta(found.s[found.best])))
+        points = found.s[np.argsort(np.where(np.isfinite(found.cost), found.cost, np.inf))[:KEPT]]
+        target = perturbed_target(recordings, lambda f, muscle=muscle: np.asarray(dynamic_stiffness(muscle, f)))
+    return target

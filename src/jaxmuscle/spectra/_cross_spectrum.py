@@ -1,0 +1,79 @@
+"""How one signal follows another: the frequency response by Welch's segments, with its errors."""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Complex, Float
+
+from ._bin_law import bin_rows
+from ._settings import SpectrumSettings, require
+
+LEAST_INPUT = 1e-4  # of the largest density of the input
+FEWEST = 3  # segments times tapers
+
+
+class Response(NamedTuple):
+    """The response H of an output to an input in the bins that the input excites.
+
+    `input_power` is the input's density, `stderr` the standard error of the real and of the imaginary part of `value`,
+    `correlation` that of the errors of bins, `E e_k e_l* / √(E|e_k|² E|e_l|²)`.
+    """
+
+    frequency: Float[np.ndarray, " bins"]
+    value: Complex[np.ndarray, " bins"]
+    stderr: Float[np.ndarray, " bins"]
+    coherence: Float[np.ndarray, " bins"]
+    correlation: Complex[np.ndarray, "bins bins"]
+    input_power: Float[np.ndarray, " bins"]
+
+
+def ordinates(
+    signal: Float[np.ndarray, " times"], settings: SpectrumSettings
+) -> Complex[np.ndarray, "segments bins tapers"]:
+    """The transforms of all segments, detrended and tapered; the mean of their squares, added over tapers, is the density.
+
+    **Raises:** `ValueError` if the signal holds fewer than three, tapers counted.
+    """
+    count, rows, n = settings.segments(signal.size), bin_rows(settings), settings.length
+    needed = n + (-(-FEWEST // settings.tapers) - 1) * settings.step
+    remedy = (
+        f"a frequency response needs {needed} at {settings.rate:g} Hz, {needed / settings.rate:g} s; give a longer window"
+    )
+    require(count * settings.tapers >= FEWEST, "samples", signal.size, remedy)
+    pieces = signal[settings.step * np.arange(count)[:, None] + np.arange(n)]
+    return (pieces @ rows.reshape(-1, n).T).reshape(count, *rows.shape[:2])
+
+
+def response_of(
+    given: Float[np.ndarray, " times"], output: Float[np.ndarray, " times"], settings: SpectrumSettings
+) -> Response:
+    """The least-squares response `H_k = Σ X* Y / Σ |X|²` over segments and tapers, with the errors that noise in Y leaves.
+
+    Given the input, the error of H_k is `Σ X* N / Σ |X|²`. The ordinates N of the noise are correlated by what segments,
+    tapers and bins share, `E N_a N_b* = S g_ab` for a density S that is flat across a bin. So
+
+        Cov(H_k, H_l) = √(S_k S_l) v_kl,   v_kl = Σ_ab X*_ak X_bl g_ab,kl / (Σ|X_k|² Σ|X_l|²),
+
+    exactly for any input, periodic or random. S_k is the residual `Σ |Y - H X|²` over its expectation
+    `Σ g_aa - v_kk Σ|X_k|²`. Bins with less than 1e-4 of the input's largest density are left out.
+    """
+    x, y = ordinates(given, settings), ordinates(output, settings)
+    count, step, n = len(x), settings.step, settings.length
+    power = np.sum(np.abs(x) ** 2, axis=(0, 2))
+    kept = power >= LEAST_INPUT * power.max()
+    x, y, power, rows = x[:, kept], y[:, kept], power[kept], bin_rows(settings)[kept]
+    shape, flat, rows = rows.shape[:2], x.reshape(count, -1), rows.reshape(-1, n)
+    v = np.zeros((shape[0], shape[0]), complex)
+    for j in range(min(count - 1, (n - 1) // step) + 1):
+        shared = rows[:, j * step :] @ rows[:, : n - j * step].conj().T
+        part = (flat[: count - j].conj().T @ flat[j:] * shared).reshape(shape * 2).sum(axis=(1, 3))
+        v += part if j == 0 else part + part.conj().T
+    v /= np.outer(power, power)
+    cross, total = np.sum(x.conj() * y, axis=(0, 2)), np.sum(np.abs(y) ** 2, axis=(0, 2))
+    expected = count * np.sum(np.abs(rows) ** 2, axis=1).reshape(shape).sum(axis=1) - np.real(np.diag(v)) * power
+    noise = np.maximum(total - np.abs(cross) ** 2 / power, 0.0) / expected
+    sd = np.sqrt(np.real(np.diag(v)))
+    return Response(
+        settings.frequency[kept], cross / power, sd * np.sqrt(noise / 2), np.abs(cross) ** 2 / (power * total),
+        v / np.outer(sd, sd), power / count,
+    )  # fmt: skip
