@@ -240,8 +240,11 @@ def design_information(
     for name in design.separate:
         if name not in names:
             raise ValueError(f"{design.name}: separate: {name!r} is not free in the fit; free are {', '.join(names)}")
+    if design.lengthening is not None and not isinstance(given, PrescribedLength):
+        raise ValueError(f"{design.name}: lengthening: in {type(given).__name__} no motor moves the insertion; give "
+                         "task=jaxmuscle.PrescribedLength(...)")  # fmt: skip
     settings = like.target.settings if design.settings is None else design.settings
-    task = given.with_parts(settings=settings)
+    task: Any = given.with_parts(settings=settings)
     has_response(task, required=True)
     own, coordinates = coordinates_of(like, theta, task)
     local = _local(like, coordinates, task, design)
@@ -250,9 +253,6 @@ def design_information(
     (moments,) = seen.moments
     found = _information(dataclasses.replace(here, parts=(_with_data(local, design, moments),)), design, seen)
     if design.lengthening is not None:
-        if not isinstance(task, PrescribedLength):
-            raise ValueError(f"{design.name}: lengthening: in {type(task).__name__} no motor moves the insertion; give "
-                             "task=jaxmuscle.PrescribedLength(...)")  # fmt: skip
         found = found + design.lengthening.information(task, coordinates, theta[own])
     kept = np.array([names[i] not in design.separate for i in own])
     whole = np.zeros((len(names), len(names)))

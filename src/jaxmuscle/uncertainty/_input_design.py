@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Iterable
-from typing import Any, NamedTuple, Self
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -89,7 +89,7 @@ def design_input(
 
     with jax.enable_x64(True):
         even = Lengthening.flat(rms, band, seconds)
-        experiment = _Experiment.of(result, quantities, even, target)
+        experiment = Experiment.of(result, quantities, even, target)
         motion = realised(even.power)[0]
         even = even.of_motion(motion)
         for _ in range(TRIES if np.isfinite(min(limits)) else 1):
@@ -102,7 +102,7 @@ def design_input(
     return DesignedInput(quantities, own, even, motion, float(rate), values, units, *errors)
 
 
-class _Experiment(NamedTuple):
+class Experiment(NamedTuple):
     """What is known without the motion: `start` of all data, information `apart` from the response; that of its lines."""
 
     here: Here
@@ -113,7 +113,9 @@ class _Experiment(NamedTuple):
     lines: Float[np.ndarray, "lines free free"]
 
     @classmethod
-    def of(cls, given: FitResult | AbstractTask, quantity: Iterable[str], record: Lengthening, target: str | None) -> Self:
+    def of(
+        cls, given: FitResult | AbstractTask, quantity: Iterable[str], record: Lengthening, target: str | None
+    ) -> "Experiment":
         """Of a record, at the values of a fit or task. Needs double precision."""
         problem, theta, derived = _problem(given)
         seen = seen_here(problem, theta)
@@ -144,7 +146,7 @@ class _Experiment(NamedTuple):
 
         Convex, in shares of steps of the density.
         """
-        steps = _steps(self.frequency)
+        steps = steps_of(self.frequency)
         steps = (1 - spread) * steps + spread / len(self.frequency)
         each = rms**2 * np.tensordot(steps, self.lines, 1)
         fast = (rms / speed) ** 2 * steps @ (2 * np.pi * self.frequency) ** 2
@@ -170,7 +172,7 @@ class _Experiment(NamedTuple):
         return {name: float(np.sqrt(g @ after @ g)) for name, g in self.here.gradients.items()}
 
 
-def _steps(frequency: Float[np.ndarray, " lines"]) -> Float[np.ndarray, "steps lines"]:
+def steps_of(frequency: Float[np.ndarray, " lines"]) -> Float[np.ndarray, "steps lines"]:
     """Where the density may be raised: neighbouring lines, each with an equal share."""
     starts, n = [0], len(frequency)
     while (following := max(starts[-1] + FEWEST, int(np.searchsorted(frequency, (1 + WIDTH) * frequency[starts[-1]])))) < n:

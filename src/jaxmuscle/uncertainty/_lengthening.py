@@ -4,7 +4,6 @@ from typing import Any
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
@@ -12,7 +11,7 @@ from jaxmuscle._common.arrays import as_arrays
 from jaxmuscle._common.programs import kept
 from jaxmuscle.model._tasks import PrescribedLength
 from jaxmuscle.objective._coordinates import Coordinates, task_at
-from jaxmuscle.response._input_response import density_at, stiffness_at
+from jaxmuscle.response._input_response import density_at, parts_of_stiffness
 from jaxmuscle.response._linearised import linearise
 
 EVEN = 1024  # lines are padded to multiples of it: few programs for any record
@@ -107,9 +106,8 @@ def _sensed(task: Any, coordinates: Any, theta: Any, f: Any) -> tuple[Float[Arra
     """Slopes of real and imaginary part of the dynamic stiffness, and the density of the noise."""
 
     def parts(theta):
-        moved: Any = task_at(task, coordinates, theta)
-        found = stiffness_at(moved, linearise(moved), f)
-        return jnp.stack([jnp.real(found), jnp.imag(found)])
+        moved = task_at(task, coordinates, theta)
+        return parts_of_stiffness(moved, linearise(moved), f)
 
     there = task_at(task, coordinates, theta)
     return jax.jacfwd(parts)(theta), density_at(there, linearise(there), f)
