@@ -6,6 +6,7 @@ import json
 import jax
 import matplotlib.pyplot as plt
 import numpy as np
+import pages
 import pytest
 import scipy.optimize
 import scipy.stats
@@ -258,6 +259,13 @@ def test_the_file_for_the_motor(tmp_path):
     made.save(tmp_path / "design.json")
     kept = json.loads((tmp_path / "design.json").read_text())
     assert kept["quantities"]["K_w0"]["stderr"] == made.stderr["K_w0"] and kept["gain"] == made.gain
+
+
+def test_the_page(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    made = pages.run("docs/perturbed-design.md", {"result": fitted(), "jm": jm})["made"]
+    plt.close("all")
+    assert made.gain == pytest.approx(designed().gain) and (tmp_path / "motor.csv").exists()
 
 
 def test_in_words():
