@@ -9,7 +9,10 @@ import argparse
 import warnings
 from collections.abc import Callable
 
+import jax
 import numpy as np
+import scipy.integrate
+import scipy.interpolate
 from perturbed_muscle import DT, Sines, force, recorded
 
 import jaxmuscle as jm

@@ -69,5 +69,6 @@ from .spectra._settings import SpectrumSettings as SpectrumSettings
 from .uncertainty._designs import Design as Design
 from .uncertainty._identifiability import identifiability as identifiability
 from .uncertainty._identifiability import standard_designs as standard_designs
+from .uncertainty._input_design import design_input as design_input
 from .uncertainty._posterior import posterior as posterior
 from .uncertainty._profile import profile as profile
