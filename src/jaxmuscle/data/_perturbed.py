@@ -216,7 +216,7 @@ class PerturbedRecording(eqx.Module):
         the nonparametric one (`frequency_response`), which takes some of the fluctuations with it.
 
         **Arguments:** `stiffness`, the dynamic stiffness H [N/m] as a function of frequencies [Hz]: with a muscle's own,
-        `lambda f: jaxmuscle.dynamic_stiffness(task, f)`; others as in `Recording.target`.
+        `lambda f: jaxmuscle.response.dynamic_stiffness(task, f)`; others as in `Recording.target`.
 
         **Raises:** `ValueError` for a window of less than 8 s besides 2 s of recording before and after it.
         """
