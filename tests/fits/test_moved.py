@@ -67,7 +67,7 @@ def test_its_figure_shows_gain_phase_and_residuals(fitted):
     panels = {ax.get_ylabel(): ax for ax in figure.axes if ax.get_ylabel()}
     assert set(panels) == {"Gain (N/m)", "Phase (deg)", "Residual (SE)"}
     gain, phase, rest = panels.values()
-    (points, _, _), curve = gain.containers[0], gain.lines[-1]
+    points, curve = gain.containers[0][0], next(line for line in gain.lines if line.get_label() == "fit")
     np.testing.assert_allclose(points.get_ydata(), given.gain)
     x, y = curve.get_data()
     np.testing.assert_allclose(np.interp(F, x, y), np.abs(result.only.stiffness), rtol=1e-6)
@@ -88,7 +88,7 @@ def moved(folder, seconds=40.0):
     phase = rng.uniform(0, 2 * np.pi, lines.size)
     length = 1e-3 * np.sqrt(2 / lines.size) * np.cos(2 * np.pi * np.outer(time, lines) + phase).sum(axis=1)
     task = TASK.with_parts(x_z=jm.model.Sampled.through(time, -length))
-    force = np.asarray(jm.simulate(task, jax.random.key(1), duration=time[-1], rate=rate).output)
+    force = np.asarray(jm.simulate(task, jax.random.key(1), duration=float(time[-1]), rate=float(rate)).output)
     table = np.stack([time, force, 1e3 * length], axis=1)[3 * rate :]
     path = folder / "perturbed.csv"
     np.savetxt(path, table, delimiter=",", header="time,force_N,displacement_mm", comments="", fmt="%.8g")
@@ -110,7 +110,7 @@ def test_a_file_of_both_channels_is_fitted_from_the_command_line_alone_and_with_
     assert {"Gain (N/m)", "Phase (deg)", "Residual (SE)", "Residual (SD)"} <= set(shown)
     plt.close(figure)
     hold = tmp_path / "hold.csv"
-    force = np.asarray(jm.simulate(jm.Isometric(), jax.random.key(2), duration=40.0, rate=100).output)
+    force = np.asarray(jm.simulate(jm.Isometric(), jax.random.key(2), duration=40.0, rate=100.0).output)
     table = np.stack([np.arange(force.size) / 100, force], axis=1)[300:]
     np.savetxt(hold, table, delimiter=",", header="time,force_N", comments="", fmt="%.8g")
     joint = jm.fit_joint({"pull": str(path), "hold": str(hold)}, starts=8, seeds=0)

@@ -15,10 +15,14 @@ POINTS: dict[str, Any] = {"fmt": "o", "ms": 2.8, "lw": 0.8, "color": BLACK, "zor
 
 
 def gain(ax: Axes, response: Any, curve: Curve | None = None, title: str = "Dynamic stiffness") -> None:
-    """The gain with two standard errors either way, and the gain of a curve with its name, at the same frequencies."""
-    f, known = response.frequency, np.isfinite(response.stderr)
+    """The gain with two standard errors either way, and the gain of a curve with its name, at the same frequencies.
+
+    Points whose error is larger than the curve, where nothing moved the insertion, are left out.
+    """
+    f, known, shown = response.frequency, np.isfinite(response.stderr), _shown(response, curve)
     low = np.minimum(2 * response.stderr, 0.95 * response.gain)  # a bar to 0 has no end on a logarithmic axis
-    ax.errorbar(f, response.gain, np.where(known, [low, 2 * response.stderr], 0.0), label="measured ± 2 SE", **POINTS)
+    bars = np.where(known, [low, 2 * response.stderr], 0.0)
+    ax.errorbar(f[shown], response.gain[shown], bars[:, shown], label="± 2 SE", **POINTS)
     if curve is not None:
         name, values = curve
         fine, smooth = _smooth(f, values)
@@ -32,8 +36,9 @@ def gain(ax: Axes, response: Any, curve: Curve | None = None, title: str = "Dyna
 
 def phase(ax: Axes, response: Any, curve: Curve | None = None) -> None:
     """The phase with two standard errors either way, and that of a curve."""
-    f, known = response.frequency, np.isfinite(response.stderr)
-    ax.errorbar(f, response.phase, np.where(known, np.minimum(2 * response.phase_stderr, 180.0), 0.0), **POINTS)
+    f, known, shown = response.frequency, np.isfinite(response.stderr), _shown(response, curve)
+    bars = np.where(known, np.minimum(2 * response.phase_stderr, 180.0), 0.0)
+    ax.errorbar(f[shown], response.phase[shown], bars[shown], **POINTS)
     if curve is not None:
         fine, smooth = _smooth(f, curve[1])
         ax.plot(fine, np.degrees(np.unwrap(np.angle(smooth))), color=BLUE, lw=1.2, zorder=2)
@@ -58,6 +63,11 @@ def stiffness_residuals(ax: Axes, part: Any) -> None:
     ax.set(xlabel="Frequency (Hz)", ylabel="Residual (SE)", ylim=(-reach, reach))
     ax.set_title("Stiffness: measured less fitted")
     legend(ax, "above")
+
+
+def _shown(response: Any, curve: Curve | None) -> np.ndarray:
+    """Which points say something: those whose error is smaller than the curve, where there is one."""
+    return np.full(len(response.frequency), True) if curve is None else ~(response.stderr > np.abs(curve[1]))
 
 
 def _smooth(f: np.ndarray, values: Any) -> tuple[np.ndarray, np.ndarray]:
