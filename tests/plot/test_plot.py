@@ -277,6 +277,7 @@ def result(**changes):
         "profile": (np.linspace(0.4, 11.7, 64), 10 - 9 * np.exp(-((np.linspace(0.4, 11.7, 64) - 3.9) ** 2))),
         "harmonic_p_value": 0.08,
         "seed": 7,
+        "stiffness": None,
         "settings": {"check_seeds": 64},
     }
     found = types.SimpleNamespace(**(fields | changes))
