@@ -93,6 +93,18 @@ for i, name in enumerate(["ann", "ben", "eve", "jim", "kim", "tom"]):
 cohort = jm.fit_cohort(list(people.values()), groups={name: "ab"[i % 2] for i, name in enumerate(people)})
 pair = {name: jm.Isometric().replace(P_w=5.0 * people[name].mvc_fraction / 0.26) for name in ("ann", "eve")}
 """
+MOVED = """
+import numpy as np
+import scipy.signal
+
+held = np.asarray(jm.simulate(jm.settled(result.task), key, duration=60.0, rate=1000.0).output)
+low = scipy.signal.butter(4, 5.0, fs=1000.0, output="sos")
+moved = scipy.signal.sosfilt(low, np.random.default_rng(0).standard_normal(held.size))
+moved *= 1e-3 / np.std(moved)
+speed = np.gradient(moved, 1e-3)
+force = held + 300.0 * moved + 6.0 * speed + 0.1 * np.gradient(speed, 1e-3)  # a spring, damper, mass beside it
+perturbed = jm.PerturbedRecording.from_array(force, moved, 1000, name="anna", window=(2.0, 60.0))
+"""
 STUDY = """
 rows = []
 for i, name in enumerate(people):
@@ -141,6 +153,12 @@ SECTIONS = (
         Shown("gallery/levels.png", 'cohort.plot(by="level")', "The same by level", "fitting.md#many-targets"),
         Shown("gallery/joint.png", "jm.fit_joint({name: people[name] for name in pair}, tasks=pair).plot()",
               "Two measurements fitted together", "identifiability.md#a-joint-fit"),
+    )),
+    Section("A moved insertion", MOVED, (
+        Shown("gallery/perturbed.png", "perturbed.plot()", "Force and displacement, and the stiffness between them",
+              "perturbed.md"),
+        Shown("gallery/frequency_response.png", "perturbed.frequency_response().plot()", "That stiffness with its errors",
+              "perturbed.md"),
     )),
     Section("A study", STUDY, (
         Shown("gallery/study.png", "study.plot()", "Spectra of people and of groups", "study.md"),

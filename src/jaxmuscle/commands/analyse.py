@@ -7,13 +7,13 @@ import typer
 
 from .console import absent, csv_text, err, out, plain, record, reporting, save_figure, writable
 from .options import Force, Json, Output, Recordings, SpectrumName, Window
-from .recordings import read_trials, reads_recordings
+from .recordings import perturbed, read_perturbed, read_trials, reads_perturbed
 
 if TYPE_CHECKING:
-    from jaxmuscle import Trials
+    from jaxmuscle import PerturbedRecording, Trials
 
 
-@reads_recordings
+@reads_perturbed
 def analyse(
     paths: Recordings,
     *,
@@ -40,6 +40,9 @@ def analyse(
     The steady part of each is found by itself, unless --window gives it. The spectra of several trials are averaged. Writes
     DIR/analysis.json, DIR/spectrum.csv and DIR/analysis.png.
 
+    Of a perturbed insertion (--force-column, --displacement): the dynamic stiffness instead, in DIR/analysis.json,
+    DIR/response.csv and DIR/analysis.png.
+
     Examples:
 
         jaxmuscle analyse trial.csv --column force --rate 2048 --window 8:25 --save-target trial.toml
@@ -49,6 +52,8 @@ def analyse(
         jaxmuscle analyse trial.csv --column force --spectrum slow --save-target slow.toml
 
         jaxmuscle analyse trial.c3d --column finger --axis principal --reference stand --window all
+
+        jaxmuscle analyse perturbed.csv --force-column force_N --displacement displacement_mm
     """
     with reporting(as_json):
         if save_target is not None and save_target.suffix.lower() != ".toml":
@@ -56,6 +61,10 @@ def analyse(
         if save_target is not None:
             absent(save_target, force=force)
         writable(output, "analysis.json", force=force)
+        if perturbed(reading):
+            if save_target is not None or mvc is not None:
+                raise ValueError("--save-target and --mvc belong to spectra; this is a perturbation experiment")
+            return _write_perturbed(read_perturbed(paths, reading, window), str(spectrum), output)
         _write(read_trials(paths, reading, window), str(spectrum), mvc, output, save_target)
 
 
@@ -100,3 +109,33 @@ def _write(trials: "Trials", settings: str, mvc: float | None, folder: Path, sav
         written.append(str(save_target))
     record(found)
     out.print(f"Written: {', '.join(written)}", highlight=False)
+
+
+def _write_perturbed(recording: "PerturbedRecording", settings: str, folder: Path) -> None:
+    from rich.table import Table
+
+    from jaxmuscle._common.files import write_json
+    from jaxmuscle._common.text import rounded
+
+    response, delay = recording.frequency_response(settings), recording.delay(settings)
+    classical = {name: (m.value, float(m.stderr or 0.0), m.unit) for name, m in recording.second_order(settings).items()}
+    classical["delay"] = (*delay, "s")
+    save_figure(recording.plot(settings), folder / "analysis.png")
+    response.save(folder / "response.csv")
+    names = ("name", "source", "rate", "window", "notices")
+    found = {
+        "recording": {key: getattr(recording, key) for key in names},
+        "response": response.to_table(),
+        "second_order": {name: dict(zip(("value", "stderr", "unit"), row, strict=True)) for name, row in classical.items()},
+    }
+    write_json(folder / "analysis.json", found)
+    out.print(plain(recording), highlight=False)
+    for line in str(response).splitlines():
+        if line.startswith(("  gain", "  phase", "  coherence")):
+            out.print(plain(line), highlight=False)
+    table = Table(title="H = K + iωB - ω²I, and a delay", title_justify="left", show_header=False)
+    for name, (value, error, unit) in classical.items():
+        table.add_row(name, " ± ".join(rounded(value, error)), unit)
+    out.print(table)
+    record(found)
+    out.print(f"Written: {folder}/analysis.json, response.csv, analysis.png", highlight=False)

@@ -98,6 +98,7 @@ def _as_options(message: str) -> str:
     """A message as it reads at the command line: the arguments `rate` and `rate=20` are the options --rate and --rate 20."""
     names = "|".join(SAME_NAME)
     message = re.sub(rf"(?<![\w.-])({names})=(?=\S)", lambda found: f"`{found[1]}` ", message)
+    message = message.replace("`force`", "`force_column`")  # --force overwrites
     return re.sub(rf"`({names})`", lambda found: "--" + found[1].replace("_", "-"), message)
 
 

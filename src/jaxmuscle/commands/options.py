@@ -85,7 +85,27 @@ READING: dict[str, tuple[Any, Any]] = {  # how a recording is read: annotation a
     "skip_rows": (Annotated[int, typer.Option(min=0, metavar="N", help="Lines to leave out at the top.")], 0),
     "max_gap": (Annotated[float, typer.Option(metavar="S", help="Longest gap in s that is closed.")], 0.2),
 }
-SAME_NAME = (*READING, "window", "quantity", "segments")  # arguments in messages that are options of the same name
+_Force = Annotated[str | None, typer.Option(metavar="NAME", help="Perturbed insertion: the column of the force.")]
+_Displacement = Annotated[str | None, typer.Option(metavar="NAME", help="Perturbed insertion: that of its displacement.")]
+_Moved = Annotated[str | None, typer.Option(metavar="U", help="m, cm, mm, um, deg or rad; by default the file's.")]
+_Arm = Annotated[float | None, typer.Option(metavar="M", help="Lever arm in m, for a torque and for an angle.")]
+_Positive = Annotated[str | None, typer.Option(help="lengthening or shortening; by default found from the data.")]
+PERTURBED: dict[str, tuple[Any, Any]] = {  # the same for a file of force and displacement
+    "force_column": (_Force, None),
+    "displacement": (_Displacement, None),
+    "displacement_units": (_Moved, None),
+    "lever_arm": (_Arm, None),
+    "positive": (_Positive, None),
+    "delay": (Annotated[float, typer.Option(metavar="S", help="By which the force lags behind the displacement.")], 0.0),
+}
+SAME_NAME = (
+    *READING,
+    *PERTURBED,
+    "force",
+    "window",
+    "quantity",
+    "segments",
+)  # arguments in messages that are options of the same name
 
 
 def names_in(free: str | None) -> list[str] | None:

@@ -2,26 +2,26 @@
 
 import functools
 import inspect
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import jaxmuscle as jm
 
-from .options import READING
+from .options import PERTURBED, READING
 
 if TYPE_CHECKING:
-    from jaxmuscle import Recording, Trials
+    from jaxmuscle import PerturbedRecording, Trials
 
 
-def reads_recordings(command: Callable[..., None]) -> Callable[..., None]:
-    """Give a command the options of `READING`; it gets their values together, as its argument `reading`.
+def reads_recordings(command: Callable[..., None], options: Mapping[str, tuple[Any, Any]] = READING) -> Callable[..., None]:
+    """Give a command options, by default those of `READING`; it gets their values together, as its argument `reading`.
 
     An option of that name which the command has itself serves both.
     """
 
     @functools.wraps(command)
     def with_options(**given: Any) -> None:
-        reading = {name: given.get(name) for name in READING}
+        reading = {name: given.get(name) for name in options}
         command(**{name: value for name, value in given.items() if name in kept}, reading=reading)
 
     signature = inspect.signature(command)
@@ -29,24 +29,42 @@ def reads_recordings(command: Callable[..., None]) -> Callable[..., None]:
     kept = {parameter.name for parameter in own}
     keyword = inspect.Parameter.KEYWORD_ONLY
     added = [inspect.Parameter(name, keyword, default=default, annotation=annotation)
-             for name, (annotation, default) in READING.items() if name not in kept]  # fmt: skip
+             for name, (annotation, default) in options.items() if name not in kept]  # fmt: skip
     parameters = [parameter.replace(kind=keyword) for parameter in own] + added
     setattr(with_options, "__signature__", signature.replace(parameters=parameters))  # noqa: B010
     with_options.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
     return with_options
 
 
+def reads_perturbed(command: Callable[..., None]) -> Callable[..., None]:
+    """The same with the options of `PERTURBED` as well."""
+    return reads_recordings(command, READING | PERTURBED)
+
+
+def perturbed(reading: dict[str, Any]) -> bool:
+    """Whether the options name the two channels of a perturbation experiment."""
+    return reading["force_column"] is not None or reading["displacement"] is not None
+
+
+def read_perturbed(paths: Sequence[str], reading: dict[str, Any], window: str | None = None) -> "PerturbedRecording":
+    """The recording of force and displacement in a file, with its steady part as window."""
+    if len(paths) > 1:
+        raise ValueError(f"{len(paths)} files with force and displacement: give one at a time")
+    options = {"force" if name == "force_column" else name: value for name, value in reading.items()}
+    return read(paths[0], options, window)
+
+
 def read_trials(paths: Sequence[str], reading: dict[str, Any], window: str | None = None) -> "Trials":
     """The recordings of one condition, each with its steady part: several files, or all columns of one (`--column all`)."""
     if len(paths) > 1 or reading["column"] != "all":
-        return jm.Trials([read(path, reading, window) for path in paths])
+        return jm.Trials([read(path, {name: reading[name] for name in READING}, window) for path in paths])
     edges = edges_of(window)
-    options = {name: value for name, value in reading.items() if name not in ("column", "reference")}
+    options = {name: reading[name] for name in READING if name not in ("column", "reference")}
     trials = jm.load_recordings(paths[0], **options)
     return trials if edges == "all" else trials.steady(edges)
 
 
-def read(path: str, reading: dict[str, Any], window: str | None = "all") -> "Recording":
+def read(path: str, reading: dict[str, Any], window: str | None = "all") -> Any:
     """The recording of a file, its steady part as window: the one that is given, `all`, or None to find it."""
     edges = edges_of(window)
     try:

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any, Literal
+from typing import Any
 
 import equinox as eqx
 import numpy as np
@@ -22,8 +22,7 @@ from ._steadiness import Measure
 from ._target import Target
 from ._units import scale_to_si
 
-Positive = Literal["lengthening", "shortening"]
-SURE = 2.0  # standard errors from which on the sign of the displacement is found
+SURE = 3.0  # standard errors from which on the sign of the displacement is found
 UNITS = ("N/m", "N s/m", "kg", "s")
 
 
@@ -84,7 +83,7 @@ class PerturbedRecording(eqx.Module):
         units: str = "N",
         displacement_units: str = "m",
         lever_arm: float | int | None = None,
-        positive: Positive | None = None,
+        positive: str | None = None,
         delay: float | int = 0.0,
         name: str = "recording",
         source: str = "given by the user",
@@ -118,6 +117,8 @@ class PerturbedRecording(eqx.Module):
         require(
             pull.size == moved.size, "displacement", f"{moved.size} samples", f"the force has {pull.size}; give one length"
         )
+        more = ["the mean force is negative: count the muscle's pull as positive, or the stiffness has the wrong sign"]
+        notices = (*notices, *more * bool(np.mean(pull) < 0))
         pull, moved, begin, said = _shifted(scale * pull, reach * moved, float(rate), delay)
         fields: dict[str, Any] = {"name": name, "source": source, "start": float(start) + begin, "window": window}
         held, given = _recording("force", pull, rate, "N", fields), _recording("displacement", moved, rate, "m", fields)
@@ -284,7 +285,7 @@ def _response(force: Recording, displacement: Recording, settings: SpectrumSetti
     return response_of(given, force.filtered(settings), settings)
 
 
-def _sign(force: Recording, displacement: Recording, positive: Positive | None) -> tuple[float, list[str]]:
+def _sign(force: Recording, displacement: Recording, positive: str | None) -> tuple[float, list[str]]:
     """1 or -1, so that the displacement counts lengthening as positive, and a notice.
 
     The response is weighted with the input's power: Σ P_k Re H_k over the lower half of the excited band.

@@ -9,7 +9,7 @@ from typing import Any, overload
 
 from jaxmuscle.spectra._settings import require
 
-from ._perturbed import PerturbedRecording, Positive
+from ._perturbed import PerturbedRecording
 from ._recording import Recording
 from ._recording_choice import Reading, perturbed_of, recording_of, signals
 from ._recording_csv import read_csv
@@ -42,7 +42,7 @@ def load_recording(  # pyright: ignore[reportInconsistentOverload]
     max_gap: float | int = 0.2,
     displacement_units: str | None = None,
     lever_arm: float | int | None = None,
-    positive: Positive | None = None,
+    positive: str | None = None,
     delay: float | int = 0.0,
 ) -> Recording | PerturbedRecording:
     """Load a recording from text, Excel, MATLAB, NumPy, C3D, EDF, TDMS, AcqKnowledge or Spike2 files.

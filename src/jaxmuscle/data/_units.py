@@ -16,8 +16,8 @@ UNITS: dict[str, Quantity | None] = {
     "m": "displacement", "cm": "displacement", "mm": "displacement", "um": "displacement", "m/s^2": "acceleration",
     "mm/s^2": "acceleration", "g": "acceleration", "mg": "acceleration", "V": None, "mV": None, "a.u.": None,
 }  # fmt: skip
-_SPELLINGS = {"nm": "N m", "ncm": "N cm", "nmm": "N mm", "%mvc": "% MVC", "pctmvc": "% MVC", "%": "% MVC", "µm": "um",
-              "au": "a.u.", "newton": "N", "newtons": "N", "volt": "V", "volts": "V"}  # fmt: skip
+_SPELLINGS = {"nm": "N m", "ncm": "N cm", "nmm": "N mm", "%mvc": "% MVC", "pctmvc": "% MVC", "%": "% MVC",
+              "\u03bcm": "um", "au": "a.u.", "newton": "N", "newtons": "N", "volt": "V", "volts": "V"}  # fmt: skip
 _SI = {"force": {"N": 1.0, "mN": 1e-3, "kN": 1e3}, "torque": {"N m": 1.0, "N cm": 1e-2, "N mm": 1e-3},
        "displacement": {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6},
        "angle": {"rad": 1.0, "deg": math.pi / 180}}  # fmt: skip
@@ -60,7 +60,7 @@ def scale_to_si(unit: str, argument: str, quantity: str, lever_arm: Any) -> tupl
     require(known in _SI[quantity] or known in _SI[turned], argument, unit, remedy)
     if known in _SI[quantity]:
         return _SI[quantity][str(known)], False
-    remedy = f"{argument} is {known}: give the distance from the axis to the insertion in m, as lever_arm=0.1"
+    remedy = f"`{argument}` is {known}: give the distance from the axis to the insertion in m, as lever_arm=0.1"
     number = isinstance(lever_arm, int | float | np.number) and not isinstance(lever_arm, bool)
     require(number and 0 < lever_arm < math.inf, "lever_arm", lever_arm, remedy)
     scale, arm = _SI[turned][str(known)], float(lever_arm)

@@ -38,12 +38,12 @@ def perturbed(recording: Any, settings: Any = None, ax: Axes | None = None) -> F
     for whole, near, (channel, scale, label, colour) in zip(traces, closer, channels, strict=True):
         time = channel.start + np.arange(channel.whole.size) / channel.rate
         whole.plot(time, scale * channel.whole, color=colour, lw=0.5)
-        whole.set_ylabel(label)
         if channel.window is not None:
             whole.axvspan(*channel.window, color=ORANGE, alpha=0.25, lw=0, label="window")
         shown = slice(0, round(SHOWN * channel.rate))
         near.plot(channel.time[shown], scale * channel.samples[shown], color=colour, lw=0.9)
         for panel in (whole, near):
+            panel.set_ylabel(label)
             panel.margins(x=0)
     traces[0].set_title("Whole recording")
     closer[0].set_title(f"First {SHOWN:g} s of the window" if recording.window else f"First {SHOWN:g} s")
@@ -55,7 +55,7 @@ def perturbed(recording: Any, settings: Any = None, ax: Axes | None = None) -> F
     s = 2j * np.pi * response.frequency
     line = sum(classical[name].value * s**power for power, name in enumerate("KBI"))
     _response(panels, response, line)
-    fig.suptitle(recording.source, x=0.01, ha="left", fontsize=8.0, parse_math=False)
+    fig.suptitle(f"{recording.name}: {recording.source}", x=0.01, ha="left", fontsize=8.0, parse_math=False)
     return fig
 
 

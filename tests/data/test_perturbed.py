@@ -1,0 +1,416 @@
+"""Recordings of force and displacement: the response and its errors, sign, delay, units, files, what is refused."""
+
+import json
+
+import numpy as np
+import pages
+import pytest
+import scipy.signal
+import scipy.stats
+from typer.testing import CliRunner
+
+import jaxmuscle as jm
+from jaxmuscle.commands.main import app
+from jaxmuscle.data._second_order import second_order_fit
+from jaxmuscle.spectra._cross_spectrum import Response, response_of
+
+RATE, SECONDS, SEEDS = 100.0, 60.0, 40
+K, B, INERTIA = 1500.0, 25.0, 0.3
+MEAN, DISPLACED, AR = 50.0, 1e-3, 0.95
+CHANCE = 3.9  # standard errors that one draw in 10 000 exceeds
+FINE = jm.SpectrumSettings(length=512, last_bin=50, filter_direction="both")  # resolves how the response bends
+
+
+def stiffness(f):
+    s = 2j * np.pi * f
+    return K + s * B + s**2 * INERTIA
+
+
+def spring_damper_mass(band=5.0, rate=RATE):
+    """Filters from white noise to displacement and to force, by the exact step of x, x', x'', x''' (scipy, no jaxmuscle).
+
+    The displacement is white noise, held for a sample, through an analog Butterworth filter of fourth order.
+    """
+    b, a = scipy.signal.butter(4, 2 * np.pi * band, analog=True)
+    a_matrix = np.eye(4, k=1)
+    a_matrix[3] = -a[:0:-1]
+    outputs = b[-1] * np.array([[1.0, 0.0, 0.0, 0.0], [K, B, INERTIA, 0.0]])
+    system = (a_matrix, np.eye(4)[:, [3]], outputs, np.zeros((2, 1)))
+    step = scipy.signal.cont2discrete(system, 1 / rate)
+    (x, force), poles = scipy.signal.ss2tf(*step[:4])
+    return x, force, poles
+
+
+def drawn(seeds, noise, rate=RATE, seed=0):
+    """Displacement [m] and force [N] of some seeds, and the filters; the force has noise of density 2 noise² / rate |A|²."""
+    rng = np.random.default_rng(seed)
+    x, force, poles = spring_damper_mass(rate=rate)
+    scale = DISPLACED / np.sqrt(np.sum(scipy.signal.lfilter(x, poles, np.eye(1, 20_000)[0]) ** 2))
+    kept = round(SECONDS * rate)
+    white = rng.standard_normal((2, seeds, kept + round(5 * rate)))
+    moved, pulled = (scale * scipy.signal.lfilter(f, poles, white[0])[:, -kept:] for f in (x, force))
+    return moved, pulled + MEAN + scipy.signal.lfilter([noise], [1, -AR], white[1])[:, -kept:], (scale * x, poles)
+
+
+def recorded(displacement, force, rate=RATE, **options):
+    return jm.PerturbedRecording.from_array(force, displacement, rate, **options)
+
+
+@pytest.fixture(scope="module")
+def responses():
+    """Of all seeds: the frequency response in the bins that all have, and the second-order fits."""
+    moved, force, _ = drawn(SEEDS, 0.2)
+    recordings = [recorded(x, f, positive="lengthening") for x, f in zip(moved, force, strict=True)]
+    found = [recording._response(FINE) for recording in recordings]
+    bins = min(response.frequency.size for response in found)
+    return recordings, found, bins
+
+
+def test_response_equals_scipy():
+    moved, force, _ = drawn(1, 0.2)
+    settings = jm.SpectrumSettings(filter_cutoff=None)
+    found = recorded(moved[0], force[0]).frequency_response(settings)
+    options = {"fs": RATE, "nperseg": 256, "noverlap": 128, "window": "hann", "detrend": "constant"}
+    bins = np.rint(found.frequency / settings.resolution).astype(int)
+    cross = scipy.signal.csd(moved[0], force[0], **options)[1][bins]
+    power = scipy.signal.welch(moved[0], **options)[1][bins]
+    np.testing.assert_allclose(found.value, cross / power, rtol=1e-10)
+    np.testing.assert_allclose(found.coherence, scipy.signal.coherence(moved[0], force[0], **options)[1][bins], rtol=1e-10)
+
+
+def test_several_tapers_are_added_up():
+    moved, force, _ = drawn(1, 0.2)
+    settings = jm.SpectrumSettings.named("multitaper").replace(filter_cutoff=None)
+    found = recorded(moved[0], force[0]).frequency_response(settings)
+    tapers = scipy.signal.windows.dpss(1000, 2, 3)
+    bins = np.rint(found.frequency / settings.resolution).astype(int)
+    cross, power = (sum(scipy.signal.csd(moved[0], y, RATE, taper, 1000, 500, detrend="linear")[1][bins] for taper in tapers)
+                    for y in (force[0], moved[0]))  # fmt: skip
+    np.testing.assert_allclose(found.value, cross / power, rtol=1e-9)
+
+
+def test_errors_of_few_segments_are_not_too_small():
+    """Of four segments the response takes up one; without that the stated variance would be a quarter too small."""
+    x, noise = np.random.default_rng(4).standard_normal((2, 250, 640))
+    found = [response_of(*pair, jm.SpectrumSettings()) for pair in zip(x, noise, strict=True)]  # the response is 0
+    seen = np.array([np.mean(np.abs(r.value) ** 2) for r in found])
+    stated = np.array([np.mean(2 * r.stderr**2) for r in found])
+    spread = np.std(seen / seen.mean() - stated / stated.mean()) / np.sqrt(len(found))
+    assert seen.mean() / stated.mean() == pytest.approx(1, abs=CHANCE * spread)
+    assert CHANCE * spread < 0.25
+
+
+def test_one_standard_error_covers_what_it_should(responses):
+    _, found, bins = responses
+    error = np.array([((r.value - stiffness(r.frequency)) / r.stderr)[:bins] for r in found])
+    within = np.concatenate([np.abs(error.real) < 1, np.abs(error.imag) < 1], axis=1)
+    averages = FINE.degrees_of_freedom(FINE.segments(round(SECONDS * RATE))) / 2
+    expected = scipy.stats.t.cdf(1, 2 * (averages - 1)) - scipy.stats.t.cdf(-1, 2 * (averages - 1))
+    binomial = np.sqrt(expected * (1 - expected) / within.size)
+    shared = 1.3  # neighbouring bins are correlated by 0.45, so whether they are covered by less than 0.45² = 0.2
+    assert abs(within.mean() - expected) < CHANCE * binomial * shared
+
+
+def test_neighbouring_bins_share_errors_as_stated(responses):
+    _, found, bins = responses
+    error = np.array([((r.value - stiffness(r.frequency)) / r.stderr)[:bins] for r in found])
+    seen = np.mean(np.real(error[:, 1:] * error[:, :-1].conj())) / 2
+    stated = np.mean([np.real(np.diag(r.correlation, 1)[: bins - 1]) for r in found])
+    assert stated == pytest.approx(0.45, abs=0.05)
+    assert seen == pytest.approx(stated, abs=CHANCE * 1.5 / np.sqrt(error.size))  # E|e|⁴ = 2 (E|e|²)²: 0.7 to 1.5 a pair
+
+
+def test_coherence_is_that_of_theory(responses):
+    _, found, bins = responses
+    _, _, (x, poles) = drawn(1, 0.2)
+    f = found[0].frequency[:bins]
+    given = np.abs(scipy.signal.freqz(x, poles, 2 * np.pi * f / RATE)[1]) ** 2
+    noise = 0.2**2 * np.abs(scipy.signal.freqz([1], [1, -AR], 2 * np.pi * f / RATE)[1]) ** 2
+    follows = np.abs(stiffness(f)) ** 2 * given
+    truth = follows / (follows + noise)
+    averages = FINE.degrees_of_freedom(FINE.segments(round(SECONDS * RATE))) / 2
+    seen = np.array([r.coherence[:bins] for r in found])
+    expected = truth + (1 - truth) ** 2 / averages  # Bendat & Piersol 2010, section 9.2: the bias, and the spread below
+    spread = np.sqrt(2 * truth) * (1 - truth) / np.sqrt(averages)
+    offset = (seen.mean(0) - expected) / (spread / np.sqrt(SEEDS))
+    assert np.all(np.abs(offset) < 4.8)  # 50 bins, one draw in 10 000
+    assert truth.min() < 0.8 < 0.95 < truth.max()
+
+
+def test_periodic_input_has_honest_errors():
+    """A multisine whose period is a segment: overlapping segments repeat the input, and so are worth less."""
+    settings = jm.SpectrumSettings(window="boxcar", filter_cutoff=None)
+    tones, time = np.arange(1, 25), np.arange(6000) / RATE
+    f = tones * settings.resolution
+    rng = np.random.default_rng(5)
+    phases = np.exp(2j * np.pi * (f[:, None] * time + rng.uniform(size=(24, 1))))
+    x, force = phases.real.sum(0), (stiffness(f)[:, None] * phases).real.sum(0)
+    noise = scipy.signal.lfilter([300], [1, -AR], rng.standard_normal((60, 6500)))[:, 500:]
+    error = np.array([((r := response_of(x, force + n, settings)).value - stiffness(f)) / r.stderr for n in noise])
+    assert np.mean(np.abs(error) ** 2) / 2 == pytest.approx(1, abs=CHANCE * 1.5 / np.sqrt(error.size) + 0.03)
+
+
+def test_second_order_and_its_errors(responses):
+    recordings, found, _ = responses
+    fits = [second_order_fit(r, False) for r in found]
+    offset = np.array([(fit.value - (K, B, INERTIA)) / fit.stderr for fit in fits])
+    # chi² of so many numbers, the errors being known to a few per cent themselves
+    assert scipy.stats.chi2.sf(np.sum(offset**2) / 1.1, offset.size) > 1e-4
+    assert scipy.stats.chi2.cdf(np.sum(offset**2), offset.size) > 1e-4
+    assert np.mean([fit.chi2 for fit in fits]) == pytest.approx(1, abs=0.1)
+    named = recordings[0].second_order(FINE)
+    np.testing.assert_array_equal([m.value for m in named.values()], fits[0].value)
+    assert [m.unit for m in named.values()] == ["N/m", "N s/m", "kg"]
+
+
+def test_two_parts_in_series_are_not_of_second_order():
+    """The numbers of docs/perturbed.md: a misfit that chi² shows, and a delay that is none."""
+    f = jm.SpectrumSettings().frequency
+    s = 2j * np.pi * f
+    inner, outer = 0.5 * s**2 + 60 * s + 200, 5 * s + 200
+    exact = inner * outer / (inner + outer) + 0.5 * s**2
+    response = Response(f, exact, 0.02 * np.abs(exact), np.ones(f.size), np.eye(f.size) + 0j, np.ones(f.size))
+    fit = second_order_fit(response, True)
+    assert f"{fit.value[0]:.0f} {fit.stderr[0]:.0f}" == "144 4"
+    assert f"{1e3 * fit.value[3]:.1f} {1e3 * fit.stderr[3]:.1f}" == "-1.2 0.4"
+    assert second_order_fit(response, False).chi2 == pytest.approx(19, abs=0.5)
+
+
+def test_a_delay_is_found_and_taken_out():
+    moved, force, _ = drawn(1, 0.03, rate=1000.0, seed=3)
+    late = recorded(moved[0, 8:], force[0, :-8], 1000.0)
+    value, stderr = late.delay(FINE)
+    assert abs(value - 8e-3) < CHANCE * stderr < 4e-3
+    whole = recorded(moved[0, 8:], force[0, :-8], 1000.0, delay=8e-3, start=1.0)
+    np.testing.assert_allclose(whole.displacement.whole, moved[0, 8:-8], atol=1e-9)
+    np.testing.assert_array_equal(whole.force.whole, force[0, 8:-8])
+    assert whole.force.start == whole.displacement.start == pytest.approx(1.008)
+    back, error = whole.delay(FINE)
+    assert abs(back) < CHANCE * error
+    assert any("lags by 8 ms" in notice for notice in whole.notices)
+
+
+def test_part_of_a_sample_is_taken_out():
+    time = np.arange(3000) / 200
+    x, force = np.sin(2 * np.pi * 3 * time), np.cos(2 * np.pi * 3 * time)
+    for delay in (0.0123, -0.0123):
+        shifted = recorded(x, force, 200.0, delay=delay, positive="lengthening").displacement
+        at = shifted.start + np.arange(shifted.whole.size) / 200 - delay
+        inner = slice(20, -20)
+        np.testing.assert_allclose(shifted.whole[inner], np.sin(2 * np.pi * 3 * at)[inner], atol=1e-6)
+
+
+def test_sign():
+    moved, force, _ = drawn(1, 0.2)
+    straight, turned = recorded(moved[0], force[0]), recorded(-moved[0], force[0])
+    np.testing.assert_array_equal(straight.displacement.whole, turned.displacement.whole)
+    assert not straight.notices
+    assert any("counts shortening as positive: its sign is turned" in notice for notice in turned.notices)
+    np.testing.assert_array_equal(recorded(moved[0], force[0], positive="shortening").displacement.whole, -moved[0])
+    np.testing.assert_array_equal(recorded(-moved[0], force[0], positive="lengthening").displacement.whole, -moved[0])
+    heavy = force[0] + (1.0 - INERTIA) * np.gradient(np.gradient(moved[0], 1 / RATE), 1 / RATE)  # above 6 Hz a mass
+    np.testing.assert_array_equal(recorded(moved[0], heavy).displacement.whole, moved[0])
+    assert any("mean force is negative" in notice for notice in recorded(moved[0], -force[0]).notices)
+    unrelated = recorded(moved[0], force[0, ::-1])
+    assert any("positive='lengthening' or 'shortening'" in notice for notice in unrelated.notices)
+    short = recorded(moved[0, :300], force[0, :300])
+    assert any("sign of the displacement is not checked" in notice for notice in short.notices)
+    with pytest.raises(ValueError, match="positive='up'"):
+        recorded(moved[0], force[0], positive="up")
+
+
+def test_steady_part_and_window():
+    moved, force, _ = drawn(1, 0.2)
+    ramp = np.linspace(0, MEAN, 300)
+    whole = recorded(np.concatenate([0 * ramp, moved[0], 0 * ramp]), np.concatenate([ramp, force[0], ramp[::-1]]))
+    held = whole.steady()
+    assert held.window is not None
+    assert held.window == held.displacement.window
+    assert 3 <= held.window[0] < 5 < 61 < held.window[1] <= 63
+    assert sum("steady part" in notice for notice in held.notices) == 1
+    given = whole.steady((10, 40))
+    assert given.force.samples.size == given.displacement.samples.size == 3000
+    f = given.frequency_response()
+    assert f.source.endswith("window 10 s to 40 s")
+    np.testing.assert_allclose(np.abs(f.value - stiffness(f.frequency)) / f.stderr, 0, atol=6)
+    with pytest.raises(ValueError, match=r"a frequency response needs 512 at 100 Hz, 5\.12 s; give a longer window"):
+        whole.steady((10, 14)).frequency_response()
+
+
+UNITS = {  # units of the force's and of the displacement's column, lever arm, their scales
+    "plain": ("N", "m", None, 1.0, 1.0),
+    "small": ("mN", "mm", None, 1e3, 1e3),
+    "cm": ("kN", "cm", None, 1e-3, 1e2),
+    "um": ("N", "µm", None, 1.0, 1e6),
+    "angle": ("N", "deg", 0.05, 1.0, 180 / np.pi / 0.05),
+    "torque and angle": ("Nm", "rad", 0.05, 0.05, 1 / 0.05),
+    "torque": ("N cm", "mm", 0.05, 100 * 0.05, 1e3),
+}
+
+
+@pytest.mark.parametrize("case", UNITS)
+@pytest.mark.parametrize("header", [True, False])
+def test_units(case, header, tmp_path):
+    units, moved_units, arm, scale, reach = UNITS[case]
+    time = np.arange(400) / 100
+    x, force = 1e-3 * np.sin(2 * np.pi * time), 50 + 2 * np.sin(2 * np.pi * time)
+    names = f"time,pull [{units}],way [{moved_units}]" if header else "time,pull,way"
+    path = tmp_path / "perturbed.csv"
+    np.savetxt(path, np.c_[time, force * scale, x * reach], delimiter=",", header=names, comments="", fmt="%.15g")
+    stated = {} if header else {"units": units, "displacement_units": moved_units}
+    found = jm.load_recording(path, force="pull", displacement="way", lever_arm=arm, **stated)
+    np.testing.assert_allclose(found.force.whole, force, rtol=1e-12)
+    np.testing.assert_allclose(found.displacement.whole, x, atol=1e-15)
+    assert (found.force.unit, found.displacement.unit, found.rate, found.name) == ("N", "m", 100.0, "perturbed")
+
+
+def save(path, **columns):
+    np.savetxt(path, np.stack(list(columns.values()), axis=1), delimiter=",", header=",".join(columns), comments="")
+    return path
+
+
+@pytest.fixture(scope="module")
+def file(tmp_path_factory):
+    moved, force, _ = drawn(1, 0.2)
+    path = tmp_path_factory.mktemp("perturbed") / "perturbed.csv"
+    return save(path, time=np.arange(6000) / 100, force_N=force[0], displacement_mm=1e3 * moved[0], angle_deg=moved[0],
+                plain=moved[0], still_mm=0 * moved[0])  # fmt: skip
+
+
+def test_every_format_with_columns(file, tmp_path):
+    wanted = jm.load_recording(file, force="force_N", displacement="displacement_mm")
+    columns = dict(zip(("force", "displacement"), (wanted.force.whole, 1e3 * wanted.displacement.whole), strict=True))
+    np.savez(tmp_path / "a.npz", fs=100.0, **columns)
+    np.save(tmp_path / "a.npy", np.stack(list(columns.values()), axis=1))
+    for name, (force, displacement), options in (("a.npz", columns, {}), ("a.npy", (0, 1), {"rate": 100})):
+        found = jm.load_recording(
+            tmp_path / name, force=force, displacement=displacement, units="N", displacement_units="mm", **options
+        )
+        np.testing.assert_allclose(found.displacement.whole, wanted.displacement.whole, rtol=1e-12, atol=1e-18)
+        np.testing.assert_array_equal(found.force.whole, wanted.force.whole)
+
+
+def test_gaps_are_closed_in_both(tmp_path):
+    moved, force, _ = drawn(1, 0.2)
+    holes = force[0].copy()
+    holes[:4], holes[100:103] = np.nan, np.nan
+    path = save(tmp_path / "a.csv", time=np.arange(6000) / 100, force_N=holes, way_mm=1e3 * moved[0])
+    found = jm.load_recording(path, force="force", displacement="way")
+    assert found.force.whole.size == found.displacement.whole.size == 5996
+    assert found.displacement.start == 0.04
+    assert any("closed by straight lines" in notice for notice in found.notices)
+
+
+REFUSED = {
+    "only one": ({"force": "force_N"}, "give `force` and `displacement`"),
+    "no such column": ({"force": "force_N", "displacement": "way"}, "no displacement 'way'"),
+    "the time": ({"force": "force_N", "displacement": "time"}, "displacement='time' is the time; choose one of"),
+    "twice the same": ({"force": "force_N", "displacement": "force_N"}, "are one column"),
+    "lever arm missing": ({"force": "force_N", "displacement": "angle_deg"}, "in m, as lever_arm=0.1"),
+    "lever arm of nothing": (
+        {"force": "force_N", "displacement": "displacement_mm", "lever_arm": 0.1}, "lever_arm=0.1: leave it out"),
+    "no unit": ({"force": "force_N", "displacement": "plain"}, "give `displacement_units`, as displacement_units='mm'"),
+    "wrong unit": (
+        {"force": "force_N", "displacement": "plain", "displacement_units": "V"}, "unit of a displacement or of its angle"),
+    "force in mm": ({"force": "displacement_mm", "displacement": "plain", "displacement_units": "m"}, "unit of a force"),
+    "constant": ({"force": "force_N", "displacement": "still_mm"}, "displacement: samples: constant at"),
+    "column as well": ({"column": "force_N", "force": "force_N", "displacement": "displacement_mm"}, "column='force_N'"),
+    "lever arm alone": ({"column": "force_N", "lever_arm": 0.1}, "belongs to recordings of two channels"),
+    "delay too long": ({"force": "force_N", "displacement": "displacement_mm", "delay": 40.0}, "delay=40.0"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_refused(case, file):
+    options, words = REFUSED[case]
+    with pytest.raises(ValueError) as error:
+        jm.load_recording(file, **options)
+    assert words in str(error.value)
+
+
+def test_channels_must_be_alike():
+    x = np.sin(np.arange(400.0))
+    force, moved = jm.Recording(x, 100), jm.Recording(x, 100, unit="m")
+    for other, words in (
+        (force, "displacement.unit='N'"),
+        (jm.Recording(x, 50, unit="m"), "displacement.rate=50.0"),
+        (jm.Recording(x, 100, unit="m", window=(0, 2)), "displacement.window"),
+        (jm.Recording(x[1:], 100, unit="m"), "399 samples"),
+    ):
+        with pytest.raises(ValueError) as error:
+            jm.PerturbedRecording(force, other)
+        assert words in str(error.value)
+    assert jm.PerturbedRecording(force, moved, name="anna").name == "anna"
+    with pytest.raises(ValueError, match="displacement='399 samples'"):
+        recorded(x[1:], x)
+
+
+def test_text_and_figure(file):
+    recording = jm.load_recording(file, force="force_N", displacement="displacement_mm")
+    text = str(recording)
+    assert "columns force_N and displacement_mm" in text
+    assert "mm rms" in text
+    figure = recording.plot()
+    labels = [ax.get_ylabel() for ax in figure.axes]
+    assert {"Force (N)", "Lengthening (mm)", "Gain (N/m)", "Phase (deg)", "Coherence γ²"} <= set(labels)
+
+
+def analyse(*arguments):
+    found = CliRunner().invoke(app, ["-q", "analyse", *map(str, arguments)])
+    return found.exit_code, " ".join(found.output.split())
+
+
+def test_the_command(file, tmp_path):
+    columns = "--force-column", "force_N", "--displacement", "displacement_mm", "--out", tmp_path
+    code, text = analyse(file, *columns)
+    assert code == 0, text
+    assert "H = K + iωB - ω²I" in text
+    assert "analysis.json, response.csv, analysis.png" in text
+    found = json.loads((tmp_path / "analysis.json").read_text())
+    response = jm.FrequencyResponse.from_table(found["response"])
+    held = jm.load_recording(file, force="force_N", displacement="displacement_mm").steady()
+    np.testing.assert_allclose(response.value, held.frequency_response().value, rtol=1e-10)
+    np.testing.assert_allclose(jm.load_frequency_response(tmp_path / "response.csv").value, response.value)
+    wanted = {name: (m.value, m.stderr, m.unit) for name, m in held.second_order().items()}
+    for name, numbers in wanted.items():
+        assert tuple(found["second_order"][name].values()) == pytest.approx(numbers)
+    assert found["second_order"]["delay"]["unit"] == "s"
+    code, text = analyse(file, *columns)
+    assert code == 2
+    assert "overwrite it with --force" in text
+    assert analyse(file, *columns, "--force", "--window", "5:55", "--positive", "lengthening")[0] == 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--force-column", "force_N"], "give --force-column and --displacement"),
+        (["--force-column", "force_N", "--displacement", "angle_deg"], "as --lever-arm 0.1"),
+        (
+            ["--force-column", "force_N", "--displacement", "plain"],
+            "give --displacement-units, as --displacement-units 'mm'",
+        ),
+        (["--force-column", "force_N", "--displacement", "displacement_mm", "--mvc", "100"], "belong to spectra"),
+        (["--force-column", "force_N", "--displacement", "displacement_mm", "--column", "plain"], "--column 'plain'"),
+    ],
+)
+def test_mistakes_at_the_command_line(arguments, words, file, tmp_path):
+    code, text = analyse(file, *arguments, "--out", tmp_path / "out")
+    assert code == 2
+    assert words in text
+
+
+def test_the_page(file, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "perturbed.csv").write_bytes(file.read_bytes())
+    page = (pages.ROOT / "docs" / "perturbed.md").read_text(encoding="utf-8")
+    rows = [
+        line.strip()
+        for line in page.splitlines()
+        if line.startswith(("    frequency_hz,", "    0.5,", "    1.0,", "    2.0,"))
+    ]
+    (tmp_path / "figure.csv").write_text("\n".join(rows))
+    names = pages.run("docs/perturbed.md")
+    assert names["published"].frequency.size == 3
+    np.testing.assert_allclose(jm.load_frequency_response("response.csv").value, names["response"].value)
+    assert (tmp_path / "perturbed.png").stat().st_size > 20_000
