@@ -16,6 +16,7 @@ from jaxmuscle.objective._arguments import FitOptions, at_mean, planned
 from jaxmuscle.objective._least_squares import least_squares
 from jaxmuscle.objective._starts import starting_points
 from jaxmuscle.response._input_response import dynamic_stiffness
+from jaxmuscle.simulation._driven import driven
 
 STARTS, STEPS, ROUNDS, KEPT = 16, 20, 2, 2
 
@@ -27,6 +28,22 @@ def aimed(given: Any, task: AbstractTask | None = None, options: FitOptions | No
         return as_target(given)
     with jax.enable_x64(True):
         return analysed(recordings, PrescribedLength() if task is None else task, options or FitOptions())
+
+
+def seen_with(muscle: AbstractTask, recordings: Sequence[PerturbedRecording]) -> Target:
+    """The target with the response of a task's nonlinear muscle taken off; of the linear one where that cannot be had."""
+    assert isinstance(muscle, PrescribedLength)
+
+    def stiffness(f: np.ndarray) -> np.ndarray:
+        return np.asarray(dynamic_stiffness(muscle, f))
+
+    def predicted(motion: np.ndarray, interval: float) -> np.ndarray:
+        return driven(muscle, -motion, interval)
+
+    try:
+        return perturbed_target(recordings, stiffness, predicted=predicted)
+    except ValueError:
+        return perturbed_target(recordings, stiffness)
 
 
 def recordings_of(given: object) -> tuple[PerturbedRecording, ...]:
@@ -50,5 +67,5 @@ def analysed(recordings: Sequence[PerturbedRecording], task: AbstractTask, optio
             break
         (muscle,) = problem.tasks_at(np.asarray(problem.coordinates.theta(found.s[found.best])))
         points = found.s[np.argsort(np.where(np.isfinite(found.cost), found.cost, np.inf))[:KEPT]]
-        target = perturbed_target(recordings, lambda f, muscle=muscle: np.asarray(dynamic_stiffness(muscle, f)))
+        target = seen_with(muscle, recordings)
     return target
