@@ -11,6 +11,8 @@ from jaxmuscle.data._as_target import as_target
 from jaxmuscle.data._perturbed import PerturbedRecording
 from jaxmuscle.data._perturbed_target import perturbed_target
 from jaxmuscle.data._target import Target
+from jaxmuscle.model._parameters import HARMONIC
+from jaxmuscle.model._rungs import is_base
 from jaxmuscle.model._tasks import AbstractTask, PrescribedLength
 from jaxmuscle.objective._arguments import FitOptions, at_mean, planned
 from jaxmuscle.objective._least_squares import least_squares
@@ -28,6 +30,18 @@ def aimed(given: Any, task: AbstractTask | None = None, options: FitOptions | No
         return as_target(given)
     with jax.enable_x64(True):
         return analysed(recordings, PrescribedLength() if task is None else task, options or FitOptions())
+
+
+def without_rhythm(task: AbstractTask, options: FitOptions) -> AbstractTask:
+    """The task without its harmonic, where the fit may leave that out: nobody asked for it, and the model is a base one.
+
+    A harmonic whose frequency is sought in the noise of the spectrum bends that. The errors of what the perturbation
+    determines hold without (docs/perturbed.md).
+    """
+    asked = options.free is not None or not set(HARMONIC).isdisjoint(options.fix or {})
+    if asked or options.method != "linear" or not is_base(task):
+        return task
+    return task.replace(harmonic_amplitude=0.0)
 
 
 def seen_with(muscle: AbstractTask, recordings: Sequence[PerturbedRecording]) -> Target:
