@@ -128,7 +128,7 @@ SECTIONS = (
         Shown("gallery/moments.png", "summary.plot()", "Moments of 2000 seeds, none of them kept", "ensembles.md"),
         Shown("gallery/sweep.png", "ax", "A sweep: three dampings, the same noise", "ensembles.md"),
         Shown("gallery/sensitivity.png", "jm.sensitivity(result.task).plot()", "Every bin, every parameter", "model.md"),
-        Shown("gallery/static.png", "jm.static_characteristics(result.task).plot()", "Stiffness, damping, force at rest",
+        Shown("gallery/static.png", "jm.response.static_characteristics(result.task).plot()", "Stiffness, damping, force at rest",
               "scaling.md"),
     )),
     Section("How sure is it, and is it right", SURE, (
@@ -138,6 +138,8 @@ SECTIONS = (
         Shown("gallery/predictive.png", "found.plot_predictive()", "The spectra that it predicts", "uncertainty.md"),
         Shown("identifiability.png", "jm.identifiability(result).plot()", "What further measurements would determine",
               "identifiability.md"),
+        Shown("perturbed-design.png", "jm.design_input(result).plot()", "A motion made to measure stiffness",
+              "perturbed-design.md"),
         Shown("gallery/goodness.png", "jm.goodness(result).plot()", "Residuals, and what is usual", "goodness.md"),
         Shown("gallery/bootstrap.png", "jm.bootstrap(result).plot()", "Refits against the stated errors", "goodness.md"),
         Shown("gallery/comparison.png", "jm.compare_noise(jm.Isometric(), target).plot()", "Which noise", "noise-colour.md"),

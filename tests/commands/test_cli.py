@@ -685,6 +685,42 @@ def test_steadiness_of_trials(tmp_path):
         assert wrong.exit_code == 2 and message in wrong.stderr
 
 
+@pytest.mark.slow
+def test_a_designed_motion(tmp_path):
+    preset = tmp_path / "muscle.toml"
+    jm.save_preset(preset, jm.Isometric())
+    asked = (
+        "--quantity",
+        "K_w0,C_w0",
+        "--rms",
+        "0.5",
+        "--peak",
+        "0.9",
+        "--band",
+        "0.2:4",
+        "--seconds",
+        "20",
+        "--rate",
+        "50",
+    )
+    result = run("design", preset, *asked, "--out", tmp_path / "out", "--json")
+    assert result.exit_code == 0
+    found = jm.design_input(jm.Isometric(), ("K_w0", "C_w0"), rms=5e-4, peak=9e-4, band=(0.2, 4.0), seconds=20.0, rate=50.0)
+    table = json.loads(result.stdout)
+    assert table == json.loads((tmp_path / "out" / "design.json").read_text())
+    assert table["gain"] == pytest.approx(found.gain) and table["quantity"] == ["K_w0", "C_w0"]
+    signal = np.loadtxt(tmp_path / "out" / "motor.csv", delimiter=",", skiprows=3)
+    np.testing.assert_allclose(signal[:, 1], 1e3 * found.displacement, rtol=1e-6, atol=1e-9)
+    assert (tmp_path / "out" / "design.png").stat().st_size > 10_000
+    for arguments, message in (
+        (("--out", tmp_path / "out"), "motor.csv: is there already; overwrite it with --force"),
+        (("--band", "5", "--out", tmp_path / "new"), "--band 5: give lowest and highest frequency in Hz, 0.1:5 say"),
+        (("--quantity", "K", "--out", tmp_path / "new"), "quantity 'K' is unknown"),
+    ):
+        wrong = run("design", preset, *arguments)
+        assert wrong.exit_code == 2 and message in wrong.stderr
+
+
 COMMANDS = sorted(typer.main.get_group(app).commands)
 
 

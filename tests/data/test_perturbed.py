@@ -208,7 +208,7 @@ def test_sign():
     assert any("counts shortening as positive: its sign is turned" in notice for notice in turned.notices)
     np.testing.assert_array_equal(recorded(moved[0], force[0], positive="shortening").displacement.whole, -moved[0])
     np.testing.assert_array_equal(recorded(-moved[0], force[0], positive="lengthening").displacement.whole, -moved[0])
-    heavy = force[0] + (1.0 - INERTIA) * np.gradient(np.gradient(moved[0], 1 / RATE), 1 / RATE)  # above 6 Hz a mass
+    heavy = force[0] + (7.5 - INERTIA) * np.gradient(np.gradient(moved[0], 1 / RATE), 1 / RATE)  # above 2.3 Hz a mass
     np.testing.assert_array_equal(recorded(moved[0], heavy).displacement.whole, moved[0])
     assert any("mean force is negative" in notice for notice in recorded(moved[0], -force[0]).notices)
     unrelated = recorded(moved[0], force[0, ::-1])

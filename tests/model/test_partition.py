@@ -24,7 +24,7 @@ def loss(task):
     "task", [jm.Isometric(), jm.PrescribedForce(), jm.PrescribedMotion()], ids=lambda t: type(t).__name__
 )
 def test_values_are_arrays_by_name_and_rebuild_the_task(x64, task):
-    values, rebuild = jm.partition(task, task.parameter_names)
+    values, rebuild = jm.model.partition(task, task.parameter_names)
     assert tuple(values) == task.parameter_names
     assert all(isinstance(value, jax.Array) and value.shape == () for value in values.values())
     again = rebuild(values)
@@ -35,16 +35,16 @@ def test_values_are_arrays_by_name_and_rebuild_the_task(x64, task):
 
 def test_precision_is_the_callers():
     """Also for a whole number, which `jax.grad` would refuse."""
-    values, _ = jm.partition(TASK.replace(P_w=5), NAMES)
+    values, _ = jm.model.partition(TASK.replace(P_w=5), NAMES)
     assert {value.dtype.name for value in values.values()} == {"float32"}
     with jax.enable_x64(True):
-        values, _ = jm.partition(TASK, NAMES)
+        values, _ = jm.model.partition(TASK, NAMES)
         assert {value.dtype.name for value in values.values()} == {"float64"}
 
 
 @pytest.mark.slow
 def test_slopes_by_name_against_differences_and_against_replace(x64):
-    values, rebuild = jm.partition(TASK, NAMES)
+    values, rebuild = jm.model.partition(TASK, NAMES)
     slopes = jax.jit(jax.grad(lambda v: loss(rebuild(v))))(values)
     assert set(slopes) == set(NAMES)
     direct = jax.jit(jax.jacfwd(lambda v: loss(TASK.replace(**dict(zip(NAMES, v, strict=True))))))
@@ -61,7 +61,7 @@ def test_slopes_by_name_against_differences_and_against_replace(x64):
 def test_what_filter_grad_says_of_numbers_and_of_arrays(x64):
     """The reason for `partition`: None for a Python number, and the slope where all numbers have become arrays."""
     assert eqx.filter_grad(loss)(TASK).muscle.stiffness_w.k is None
-    values, rebuild = jm.partition(TASK, NAMES)
+    values, rebuild = jm.model.partition(TASK, NAMES)
     whole = eqx.filter_jit(eqx.filter_grad(loss))(jax.tree.map(jnp.asarray, TASK))
     slopes = jax.jit(jax.grad(lambda v: loss(rebuild(v))))(values)
     np.testing.assert_allclose(whole.muscle.stiffness_w.k, slopes["k_w"], rtol=1e-9)
@@ -74,7 +74,7 @@ def test_a_gradient_step_by_an_optimiser_of_pytrees(x64):
     """`optax` moves such dictionaries: ten steps of plain descent in the logarithm lower the loss at every step."""
     optax = pytest.importorskip("optax")
     target = jnp.log(jm.expected_spectrum(TASK.replace(k_w=4e5, c_w=80.0)).proportional)
-    values, rebuild = jm.partition(TASK, ("k_w", "c_w"))
+    values, rebuild = jm.model.partition(TASK, ("k_w", "c_w"))
 
     def misfit(logs):
         found = jm.expected_spectrum(rebuild(jax.tree.map(jnp.exp, logs))).proportional
@@ -94,7 +94,7 @@ def test_a_gradient_step_by_an_optimiser_of_pytrees(x64):
 
 @pytest.mark.slow
 def test_a_rebuilt_task_is_simulated_and_saved(x64, tmp_path):
-    values, rebuild = jm.partition(TASK, NAMES)
+    values, rebuild = jm.model.partition(TASK, NAMES)
     again = rebuild(values)
     runs = [jm.simulate(task, jax.random.key(0), duration=0.5).output for task in (TASK, again)]
     np.testing.assert_allclose(runs[1], runs[0], rtol=1e-12)
@@ -104,9 +104,9 @@ def test_a_rebuilt_task_is_simulated_and_saved(x64, tmp_path):
 
 def test_wrong_names_and_values_are_refused():
     with pytest.raises(ValueError, match="unknown parameter 'k'"):
-        jm.partition(TASK, ("k",))
+        jm.model.partition(TASK, ("k",))
     with pytest.raises(ValueError, match=r"names = 'k_w' is one text: give a list of names, \['k_w'\]"):
-        jm.partition(TASK, "k_w")
-    _, rebuild = jm.partition(TASK, ("k_w",))
+        jm.model.partition(TASK, "k_w")
+    _, rebuild = jm.model.partition(TASK, ("k_w",))
     with pytest.raises(ValueError, match=r"k_w = -1.0 N/m\^3 is outside"):
         rebuild({"k_w": -1.0})

@@ -24,6 +24,7 @@ def test_the_notebooks_are_all_there_with_their_titles():
         "05-uncertainty-and-noise-colour": "# How sure, and which noise?",
         "06-gradients-and-design": "# Gradients, and an experiment designed with them",
         "07-your-own-muscle": "# Your own muscle",
+        "08-perturb-and-measure": "# Perturb and measure",
     }
 
 

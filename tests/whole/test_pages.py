@@ -20,7 +20,8 @@ from jaxmuscle.uncertainty import _posterior_checks as _mixing
 TRUTH = jm.Isometric().replace(harmonic_frequency=6.0, harmonic_amplitude=0.012)
 ELSEWHERE = {
     "docs/digitise.md": "data/test_digitised.py", "docs/own-muscle.md": "whole/test_hill.py",
-    "docs/perturbed.md": "data/test_perturbed.py", "docs/study.md": "fits/test_study.py",
+    "docs/perturbed.md": "data/test_perturbed.py", "docs/perturbed-design.md": "uncertainty/test_input_design.py",
+    "docs/study.md": "fits/test_study.py",
 }  # fmt: skip
 BELOW = {"docs/gallery.md"}  # its program is read instead
 RUN_HERE = {

@@ -64,7 +64,9 @@ def analyse(
         if perturbed(reading):
             if save_target is not None or mvc is not None:
                 raise ValueError("--save-target and --mvc belong to spectra; this is a perturbation experiment")
-            return _write_perturbed(read_perturbed(paths, reading, window), str(spectrum), output)
+            if len(paths) > 1:
+                raise ValueError(f"{len(paths)} files with force and displacement: give one at a time")
+            return _write_perturbed(read_perturbed(paths, reading, window)[0], str(spectrum), output)
         _write(read_trials(paths, reading, window), str(spectrum), mvc, output, save_target)
 
 

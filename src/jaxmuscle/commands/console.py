@@ -156,11 +156,19 @@ def save_figure(figure: Any, path: Path) -> None:
 
 
 def write_fit(result: "FitResult", folder: Path, *, figure: bool = True) -> None:
-    """fit.json, spectrum.csv and fit.png, each whole or not there."""
+    """fit.json, fit.png, and spectrum.csv and stiffness.csv of what was fitted, each whole or not there."""
     from jaxmuscle._common.files import remove, write_text
 
-    remove(folder, "fit.png")
+    remove(folder, "fit.png", *(tables := fit_tables(result)))
     result.save(folder / "fit.json")
-    write_text(folder / "spectrum.csv", csv_text(result.only.columns()))
+    for name, columns in tables.items():
+        if columns:
+            write_text(folder / name, csv_text(columns))
     if figure:
         save_figure(result.plot(), folder / "fit.png")
+
+
+def fit_tables(result: "FitResult") -> dict[str, dict[str, Any]]:
+    """The tables of a fit of one target by file, those without rows being empty."""
+    part = result.only
+    return {"spectrum.csv": part.columns() if part.fitted.size else {}, "stiffness.csv": part.stiffness_columns()}

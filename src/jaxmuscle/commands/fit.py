@@ -15,6 +15,7 @@ from .console import (
     aim_of,
     aimed,
     err,
+    fit_tables,
     out,
     plain,
     record,
@@ -40,10 +41,10 @@ from .options import (
     fixed_values,
     names_in,
 )
-from .recordings import read_trials, reads_recordings
+from .recordings import moved, read_perturbed, read_trials, reads_perturbed
 
 
-@reads_recordings
+@reads_perturbed
 def fit(
     target: Annotated[
         list[str],
@@ -102,6 +103,10 @@ def fit(
     Recordings are trials of one person in one condition. Their spectra are averaged. Options such as --column say how they
     are read.
 
+    A moved insertion: recordings with a column of force (or torque) and one of displacement (or angle), or a frequency
+    response (CSV with the columns frequency, gain, phase, and coherence or stderr). Then DIR/stiffness.csv holds the dynamic
+    stiffness, measured and fitted.
+
     Several spectra are those of several people. They are fitted together in linear response, without the checks on
     simulated seeds.
 
@@ -120,6 +125,8 @@ def fit(
         jaxmuscle fit fdi-abduction-45mvc --fix m_w=0.1 --free c_w,noise_K_w
 
         jaxmuscle fit trial1.csv trial2.csv trial3.csv --column force --rate 1000
+
+        jaxmuscle fit perturbed.csv --task prescribed-length
 
         jaxmuscle fit people/*.toml --groups groups.csv --out out/cohort
 
@@ -162,7 +169,12 @@ def fit(
         if any(recorded):
             if segments is not None or dataset is not None:
                 raise ValueError("--segments and --dataset belong to spectra; these are recordings")
-            aim = aimed(read_trials(target, reading, window).target(quantity=quantity), task)
+            if moved(target, reading, task):
+                aim = read_perturbed(target, reading, window), jm.model.TASKS[task or "prescribed-length"]()
+            else:
+                aim = aimed(read_trials(target, reading, window).target(quantity=quantity), task)
+        elif jm.data.is_frequency_response(target[0]):
+            aim = aim_of(target[0], task, {"segments": segments, "lever_arm": reading["lever_arm"]})
         else:
             aim = aim_of(target[0], task, read)
         writable(output, "fit.json", force=force)
@@ -179,7 +191,7 @@ def _fit_one(target: Any, model: Any, folder: Path, options: dict[str, Any], *, 
         printed.append(result)
 
     try:
-        with told(True, f"fitting {target.name}") as tell:
+        with told(True, f"fitting {target[0].name if isinstance(target, list) else target.name}") as tell:
             result = jm.fit(model, target, progress=tell, answer=answer, **options)
             tell("writing", 1.0)
             write_fit(result, folder, figure=not quick)
@@ -195,5 +207,6 @@ def _fit_one(target: Any, model: Any, folder: Path, options: dict[str, Any], *, 
     for sentence in (*result.remarks, *(f"note: {notice}" for notice in result.notices)):
         if sentence.removeprefix("note: ") not in told_before:
             out.print(plain(sentence), highlight=False)
-    out.print(f"Written: {folder}/fit.json, {'' if quick else 'fit.png, '}spectrum.csv", highlight=False, soft_wrap=True)
+    files = ["fit.json", *["fit.png"] * (not quick), *(name for name, columns in fit_tables(result).items() if columns)]
+    out.print(f"Written: {folder}/{', '.join(files)}", highlight=False, soft_wrap=True)
     return result.success

@@ -16,6 +16,7 @@ from jaxmuscle._common.bundled import describe_presets, describe_targets
 from .analyse import analyse
 from .compare import compare
 from .console import out, plain, record, reporting
+from .design import design
 from .ensemble import ensemble
 from .fit import fit
 from .options import Json
@@ -35,6 +36,7 @@ app.command()(ensemble)
 app.command()(analyse)
 app.command()(steadiness)
 app.command()(posterior)
+app.command()(design)
 app.command()(compare)
 app.command()(reproduce)
 app.command()(speed)

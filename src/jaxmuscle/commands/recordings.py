@@ -46,12 +46,26 @@ def perturbed(reading: dict[str, Any]) -> bool:
     return reading["force_column"] is not None or reading["displacement"] is not None
 
 
-def read_perturbed(paths: Sequence[str], reading: dict[str, Any], window: str | None = None) -> "PerturbedRecording":
-    """The recording of force and displacement in a file, with its steady part as window."""
-    if len(paths) > 1:
-        raise ValueError(f"{len(paths)} files with force and displacement: give one at a time")
-    options = {"force" if name == "force_column" else name: value for name, value in reading.items()}
-    return read(paths[0], options, window)
+def moved(paths: Sequence[str], reading: dict[str, Any], task: str | None) -> bool:
+    """Whether files are to be fitted as perturbation experiments: by the options, else by the task and their columns."""
+    if perturbed(reading):
+        return True
+    if task not in (None, "prescribed-length") or reading["column"] is not None:
+        return False
+    return all(channels(path, reading) for path in paths)
+
+
+def channels(path: str, reading: dict[str, Any]) -> dict[str, Any]:
+    """The columns of force and displacement in a file; nothing where it has not both."""
+    named = {"force": reading["force_column"], "displacement": reading["displacement"]}
+    return jm.data.two_channels(path, **named, time=reading["time"], skip_rows=reading["skip_rows"])
+
+
+def read_perturbed(paths: Sequence[str], reading: dict[str, Any], window: str | None = None) -> "list[PerturbedRecording]":
+    """The recordings of force and displacement in files, each with its steady part as window."""
+    options = {name: value for name, value in reading.items() if name not in ("force_column", "displacement")}
+    named = {"force": reading["force_column"], "displacement": reading["displacement"]}
+    return [read(path, options | (channels(path, reading) or named), window) for path in paths]
 
 
 def read_trials(paths: Sequence[str], reading: dict[str, Any], window: str | None = None) -> "Trials":

@@ -3,6 +3,7 @@
 from ._as_target import as_target as as_target
 from ._as_target import is_recording as is_recording
 from ._frequency_response import FrequencyResponse as FrequencyResponse
+from ._frequency_response_files import is_frequency_response as is_frequency_response
 from ._frequency_response_files import load_frequency_response as load_frequency_response
 from ._perturbed import PerturbedRecording as PerturbedRecording
 from ._recording import Recording as Recording
@@ -15,3 +16,4 @@ from ._target import Target as Target
 from ._target import load_target as load_target
 from ._trials import Trials as Trials
 from ._trials import load_recordings as load_recordings
+from ._two_channels import two_channels as two_channels

@@ -8,14 +8,14 @@ from typing import Any
 from jaxmuscle._common.errors import TargetError
 
 from ._frequency_response import FrequencyResponse
+from ._frequency_response_files import is_frequency_response, is_response, load_frequency_response
 from ._perturbed import PerturbedRecording
 from ._recording import Recording
 from ._recording_files import KINDS
 from ._target import Target, load_target
-from ._text_tables import SIGNS, TEXT, cells_of, is_number, lines_of
+from ._text_tables import TEXT, beginning, cells_of, is_number
 from ._trials import Trials, load_recordings
 
-LOOK = 1 << 16  # bytes of a text file that say what it is
 # Rows that the shortest recording has, and more than a figure of a spectrum does.
 ROWS, POINTS = 90, 500
 
@@ -25,9 +25,10 @@ def as_target(given: Any, **options: Any) -> Target:
 
     `given`: a `Target` is taken as it is. A `Recording`, `Trials` or several recordings of one condition give theirs
     (`Trials.target`), in the windows that they have. The path of a recording, or several of trials, is read, and the steady
-    part of each found (`Recording.steady`). Another path, or the name of a bundled target, is read as a spectrum.
+    part of each found (`Recording.steady`). The path of a frequency response is read by `load_frequency_response`. Another
+    path, or the name of a bundled target, is read as a spectrum.
 
-    **Arguments:** `options`, how files are read: as in `load_recording` or as in `load_target`.
+    **Arguments:** `options`, how files are read: as in `load_recording`, `load_frequency_response` or `load_target`.
 
     **Raises:** `TargetError`, a `ValueError`, for anything else, with the remedy.
     """
@@ -35,6 +36,8 @@ def as_target(given: Any, **options: Any) -> Target:
         return given
     if isinstance(given, Recording | Trials | PerturbedRecording):
         return given.target()
+    if isinstance(given, str | os.PathLike) and is_frequency_response(given):
+        given = load_frequency_response(given, **options)
     if isinstance(given, FrequencyResponse):
         return Target(given.name, None, source=given.source, stiffness=given, notices=given.notices)
     if isinstance(given, str | os.PathLike):
@@ -68,13 +71,11 @@ def is_recording(path: str | os.PathLike[str]) -> bool:
     kind = path.suffix.lower()
     if kind not in TEXT or not path.is_file():
         return kind in KINDS and kind != ".csv"
-    with path.open("rb") as file:
-        text = file.read(LOOK).decode("utf-8", errors="replace")
-    rows = [line.body for line in lines_of(text) if line.body.strip()]
+    rows, names, delimiter = beginning(path)
     if not rows:
         return kind != ".csv"
-    delimiter = next((sign for sign in SIGNS if sign in rows[0]), None)
-    names = [cell.casefold() for cell in cells_of(rows[0], delimiter)]
+    if is_response(names):
+        return False
     if all(is_number(name, delimiter) for name in names):
         return len(rows) > (POINTS if kind == ".csv" else ROWS)
     spectral = any(name.startswith(("freq", "proportional", "power")) or name in ("f", "hz") for name in names)

@@ -2,6 +2,7 @@
 
 import os
 import re
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from jaxmuscle.spectra._settings import require
 from ._frequency_response import COLUMNS, FrequencyResponse
 from ._recording_files import read_table
 from ._recording_table import Table
+from ._text_tables import TEXT, beginning
 
 STIFFNESS = {"n/m": 1.0, "n/cm": 1e2, "n/mm": 1e3, "kn/m": 1e3, "mn/mm": 1.0}
 ROTATION = {"nm/rad": 1.0, "nm/deg": 180 / np.pi, "mnm/rad": 1e-3, "mnm/deg": 0.18 / np.pi}
@@ -64,6 +66,18 @@ def load_frequency_response(
         )  # fmt: skip
     except ValueError as error:
         raise ValueError(f"{table.file}: {_at_its_line(str(error), table)}") from None
+
+
+def is_frequency_response(path: str | os.PathLike[str]) -> bool:
+    """Whether the text at `path` has columns called frequency, gain and phase, as `load_frequency_response` reads them."""
+    path = Path(path).expanduser()
+    return path.suffix.lower() in TEXT and path.is_file() and is_response(beginning(path)[1])
+
+
+def is_response(names: Iterable[str]) -> bool:
+    """Whether columns of these names are those of a frequency response."""
+    found = {match[1] for name in names if (match := _HEADER.fullmatch(name))}
+    return {"gain", "phase"} <= found and bool(found & {"frequency", "freq", "f"})
 
 
 def _columns(table: Table) -> dict[str, tuple[str, str]]:

@@ -1,6 +1,5 @@
 """Recordings of two channels: the insertion is moved, the force that answers is read."""
 
-import math
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
@@ -10,19 +9,19 @@ import scipy
 from jaxtyping import Complex, Float
 
 from jaxmuscle import plot
-from jaxmuscle._common.text import folded, rounded
+from jaxmuscle._common.text import folded
 from jaxmuscle.spectra._cross_spectrum import Response, response_of
 from jaxmuscle.spectra._settings import SpectrumSettings, require
 
 from ._frequency_response import FrequencyResponse
 from ._perturbed_target import perturbed_target
 from ._recording import Recording, recorded_settings
-from ._second_order import SecondOrder, second_order_fit
+from ._second_order import SecondOrder, lengthens, second_order_fit
 from ._steadiness import Measure
 from ._target import Target
 from ._units import scale_to_si
 
-SURE = 3.0  # standard errors from which on the sign of the displacement is found
+SURE = 4.0  # standard errors from which on the sign of the displacement is found
 UNITS = ("N/m", "N s/m", "kg", "s")
 
 
@@ -101,8 +100,8 @@ class PerturbedRecording(eqx.Module):
           mm, um; deg, rad); `rate` [Hz].
         - `lever_arm` [m]: from the axis to the insertion; needed for a torque and for an angle.
         - `positive`: what the displacement counts as positive, `"lengthening"` or `"shortening"`. `None`: found from the
-          data. If the response has a negative real part below half of the excited band, the sign of the displacement is
-          turned, and a notice says so.
+          data. If a spring, a damper and a mass describe the response better with the other sign, that of the displacement
+          is turned, and a notice says so.
         - `delay` [s]: by which the force channel lags behind the displacement channel; the displacement is shifted by it.
         - `name`, `source`, `start`, `window`, `notices`: as in `Recording`.
 
@@ -217,7 +216,7 @@ class PerturbedRecording(eqx.Module):
         the nonparametric one (`frequency_response`), which takes some of the fluctuations with it.
 
         **Arguments:** `stiffness`, the dynamic stiffness H [N/m] as a function of frequencies [Hz]: with a muscle's own,
-        `lambda f: jaxmuscle.dynamic_stiffness(task, f)`; others as in `Recording.target`.
+        `lambda f: jaxmuscle.response.dynamic_stiffness(task, f)`; others as in `Recording.target`.
 
         **Raises:** `ValueError` for a window of less than 8 s besides 2 s of recording before and after it.
         """
@@ -286,25 +285,16 @@ def _response(force: Recording, displacement: Recording, settings: SpectrumSetti
 
 
 def _sign(force: Recording, displacement: Recording, positive: str | None) -> tuple[float, list[str]]:
-    """1 or -1, so that the displacement counts lengthening as positive, and a notice.
-
-    The response is weighted with the input's power: Σ P_k Re H_k over the lower half of the excited band.
-    """
+    """1 or -1, so that the displacement counts lengthening as positive, and a notice: as a passive body would move."""
     if positive is not None:
         return {"lengthening": 1.0, "shortening": -1.0}[positive], []
     try:
-        found = _response(force, displacement, SpectrumSettings(filter_cutoff=None))
+        found = lengthens(_response(force, displacement, SpectrumSettings(filter_cutoff=None)))
     except ValueError as error:
         return 1.0, [f"the sign of the displacement is not checked: {error}"]
-    f = found.frequency
-    weights = found.input_power * (f <= (f[0] + f[-1]) / 2)
-    stiffness = float(weights @ np.real(found.value) / weights.sum())
-    errors = weights * found.stderr / weights.sum()
-    error = math.sqrt(errors @ np.real(found.correlation) @ errors)
-    words = f"stiffness at low frequency {' ± '.join(rounded(abs(stiffness), error))} N/m"
-    if abs(stiffness) < SURE * error:
-        return 1.0, [f"the force hardly follows the displacement ({words}): lengthening is taken as positive; say what is, "
-                     "with positive='lengthening' or 'shortening'"]  # fmt: skip
-    if stiffness < 0:
-        return -1.0, [f"the displacement counts shortening as positive: its sign is turned ({words})"]
+    if abs(found) < SURE**2:
+        return 1.0, ["the force hardly follows the displacement: lengthening is taken as positive; say what is, with "
+                     "positive='lengthening' or 'shortening'"]  # fmt: skip
+    if found < 0:
+        return -1.0, ["the displacement counts shortening as positive: its sign is turned"]
     return 1.0, []

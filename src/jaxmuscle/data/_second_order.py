@@ -34,13 +34,12 @@ def second_order_fit(response: Response, delayed: bool) -> SecondOrder:
     f, weight = response.frequency, 1 / np.concatenate([response.stderr] * 2)
     count = 3 + delayed
     require(2 * f.size > count, "bins", f.size, "too few for a fit; excite a wider band, or take longer segments")
-    scale = np.abs(response.value).max() / (2 * np.pi * f.max()) ** np.arange(3)
+    scale, shapes = _terms(response)
     scale = np.append(scale, 1 / (2 * np.pi * f.max()))[:count]
 
     def residuals(x: Float[np.ndarray, " parameters"]) -> Float[np.ndarray, " twice"]:
         return _parts(second_order_shape(f, x * scale) - response.value) * weight
 
-    shapes = np.stack([_parts(second_order_shape(f, unit * scale[:3])) for unit in np.eye(3)], axis=1) * weight[:, None]
     start = np.linalg.lstsq(shapes, _parts(response.value) * weight)[0]
     found = scipy.optimize.least_squares(residuals, np.append(start, 0.0)[:count], x_scale="jac", jac="3-point")
     inverse = np.linalg.pinv(found.jac.T @ found.jac)
@@ -50,6 +49,25 @@ def second_order_fit(response: Response, delayed: bool) -> SecondOrder:
     expected = 2 * f.size - np.trace(inverse @ found.jac.T @ covariance @ found.jac)
     chi2 = float(2 * found.cost / expected)
     return SecondOrder(found.x * scale, np.sqrt(np.diag(spread) * max(chi2, 1.0)) * scale, chi2)
+
+
+def lengthens(response: Response) -> float:
+    """By how much chi² is lower if the displacement counts lengthening as positive; below 0: if it counts shortening.
+
+    A spring, a damper and a mass, none of them negative, are fitted to H and to -H. Over the chi² of the better one for each
+    number, where that is more than 1.
+    """
+    shapes, values = _terms(response)[1], _parts(response.value) / np.concatenate([response.stderr] * 2)
+    as_it_is, turned = (scipy.optimize.nnls(shapes, sign * values)[1] ** 2 for sign in (1, -1))
+    return float((turned - as_it_is) / max(1.0, min(turned, as_it_is) / values.size))
+
+
+def _terms(response: Response) -> tuple[Float[np.ndarray, " 3"], Float[np.ndarray, "twice 3"]]:
+    """Scales of K, B and I, and the response to one of each, in standard errors."""
+    f = response.frequency
+    scale = np.abs(response.value).max() / (2 * np.pi * f.max()) ** np.arange(3)
+    shapes = np.stack([_parts(second_order_shape(f, unit * scale)) for unit in np.eye(3)], axis=1)
+    return scale, shapes / np.concatenate([response.stderr] * 2)[:, None]
 
 
 def _parts(values: Complex[np.ndarray, " bins"]) -> Float[np.ndarray, " twice"]:

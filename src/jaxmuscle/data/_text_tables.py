@@ -1,10 +1,12 @@
 """Text that holds a table: lines with comments, cells between delimiters, numbers with decimal commas."""
 
 import csv
+from pathlib import Path
 from typing import NamedTuple
 
 SIGNS = ("\t", ";", ",")
 TEXT = (".csv", ".tsv", ".txt", ".dat", ".asc")  # files that hold one
+LOOK = 1 << 16  # bytes of a file that say what it is
 
 
 class Line(NamedTuple):
@@ -58,3 +60,12 @@ def width_remedy(delimiter: str | None) -> str:
     """What helps where a line has another number of columns than the rest."""
     remedy = "write a # before lines that are no data, or leave them out with `skip_rows`"
     return f"decimal commas need a semicolon or tab between the columns; {remedy}" if delimiter == "," else remedy
+
+
+def beginning(path: Path) -> tuple[list[str], list[str], str | None]:
+    """The first lines of a file that are not empty, the cells of the first in small letters, and the delimiter."""
+    with path.open("rb") as file:
+        text = file.read(LOOK).decode("utf-8", errors="replace")
+    rows = [line.body for line in lines_of(text) if line.body.strip()]
+    delimiter = next((sign for sign in SIGNS if rows and sign in rows[0]), None)
+    return rows, [cell.casefold() for cell in cells_of(rows[0], delimiter)] if rows else [], delimiter

@@ -36,6 +36,12 @@ def known_unit(unit: str) -> str | None:
     return exact.get(bare) or _SPELLINGS.get(bare.casefold())
 
 
+def quantity_of(unit: str) -> str | None:
+    """What a unit measures: force, torque, displacement, angle, ...; `None` for an unknown one."""
+    turned = unit.strip(" []()").casefold() in _ANGLES
+    return "angle" if turned else UNITS.get(known_unit(unit) or "")
+
+
 def seconds(unit: str | None) -> float | None:
     """How many seconds a unit of time has, or `None` for another unit."""
     return None if unit is None else SECONDS.get(unit.replace("μ", "µ").strip(" []().").casefold())

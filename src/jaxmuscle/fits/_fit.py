@@ -57,8 +57,10 @@ def fit(
     where the task has one. The reported spectrum comes from `check_seeds` fresh paths of the nonlinear model.
 
     **Arguments:** `task` (its values are the prior's centre; `task_for(target)` makes one) and `target`, whose spectrum
-    settings replace the task's: a `Target`, a `Recording`, the recordings of one condition (a list, `Trials`), or names and
-    paths of these; `free`, names to fit (default: `DEFAULT_FREE`, those of them that the task has);
+    settings replace the task's: a `Target`, a `Recording`, the recordings of one condition (a list, `Trials`), a
+    `PerturbedRecording` or several, a `FrequencyResponse`, or names and paths of these (with a `PrescribedLength` a file of
+    force and displacement is a perturbed recording, see `jaxmuscle.data.two_channels`); `free`,
+    names to fit (default: `DEFAULT_FREE`, those of them that the task has);
     `fix`, values to set, which are then not free; `noise`, a name or an object; `residual`, "log", "linear" or
     "cumulative"; `starts` (100, or 8 for a task without linear response); `seeds` (32, or 48 then; 0: no nonlinear
     correction); `key`, a `jax.random` key or a seed number; `bounds` {name: (low, high)}; `priors` {name: sd in log, or None
@@ -78,7 +80,7 @@ def fit(
     if not isinstance(task, AbstractTask):
         raise ValueError(f"task: this is a {type(task).__name__}; give a task first, as jaxmuscle.Isometric(), then the "
                          "target: fit(task, target)")  # fmt: skip
-    recordings = recordings_of(target)
+    recordings = recordings_of(target, task)
     aim = recordings[0].name if recordings else (target := as_target(target)).name
     with told(progress, f"fitting {aim}") as tell, jax.enable_x64(True):
         options = FitOptions(

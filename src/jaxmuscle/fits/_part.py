@@ -106,6 +106,29 @@ class FittedPart(eqx.Module):
         """Numbers that the fit compares: bins less one, as only their shape counts, and two for each dynamic stiffness."""
         return max(len(self.fitted) - 1, 0) + (0 if self.stiffness is None else 2 * len(self.stiffness))
 
+    @property
+    def stiffness_residual(self) -> Complex[np.ndarray, " points"] | None:
+        """Measured less fitted dynamic stiffness, real and imaginary part in standard errors; None where there is none."""
+        if self.stiffness is None or self.target.stiffness is None:
+            return None
+        measured = self.target.stiffness.known
+        return (measured.value - self.stiffness) / measured.stderr
+
+    @property
+    def chi2_per_point(self) -> float | None:
+        """`Σ |stiffness_residual|² / (2 points)`, about 1 where the model describes the dynamic stiffness; or None."""
+        off = self.stiffness_residual
+        return None if off is None else float(np.mean(np.abs(off) ** 2) / 2)
+
+    def stiffness_columns(self) -> dict[str, Any]:
+        """What `stiffness.csv` holds, by column; nothing where there is no dynamic stiffness."""
+        if self.stiffness is None or self.target.stiffness is None:
+            return {}
+        measured = self.target.stiffness.known
+        return {"frequency_hz": measured.frequency, "real": np.real(measured.value), "imaginary": np.imag(measured.value),
+                "stderr": measured.stderr, "fitted_real": np.real(self.stiffness),
+                "fitted_imaginary": np.imag(self.stiffness)}  # fmt: skip
+
     def columns(self) -> dict[str, Any]:
         """What `spectrum.csv` holds, by column."""
         return {"frequency_hz": self.frequency_hz, "target": self.target.proportional_power, "fitted": self.fitted,

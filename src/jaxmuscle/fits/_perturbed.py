@@ -11,6 +11,7 @@ from jaxmuscle.data._as_target import as_target
 from jaxmuscle.data._perturbed import PerturbedRecording
 from jaxmuscle.data._perturbed_target import perturbed_target
 from jaxmuscle.data._target import Target
+from jaxmuscle.data._two_channels import perturbed_recordings
 from jaxmuscle.model._parameters import HARMONIC
 from jaxmuscle.model._rungs import is_base
 from jaxmuscle.model._tasks import AbstractTask, PrescribedLength
@@ -25,7 +26,7 @@ STARTS, STEPS, ROUNDS, KEPT = 16, 20, 2, 2
 
 def aimed(given: Any, task: AbstractTask | None = None, options: FitOptions | None = None) -> Target:
     """The target of whatever a fit was given; that of perturbed recordings with the response of the task's muscle."""
-    recordings = recordings_of(given)
+    recordings = recordings_of(given, task)
     if not recordings:
         return as_target(given)
     with jax.enable_x64(True):
@@ -56,17 +57,16 @@ def seen_with(muscle: AbstractTask, recordings: Sequence[PerturbedRecording]) ->
 
     try:
         return perturbed_target(recordings, stiffness, predicted=predicted)
-    except ValueError:
+    except ValueError:  # a muscle too stiff for its steps, which so is not finite; whatever else is wrong is said below
         return perturbed_target(recordings, stiffness)
 
 
-def recordings_of(given: object) -> tuple[PerturbedRecording, ...]:
-    """The perturbed recordings that a fit was given; none of anything else."""
-    if isinstance(given, PerturbedRecording):
-        return (given,)
-    if isinstance(given, Sequence) and len(given) > 0 and all(isinstance(one, PerturbedRecording) for one in given):
-        return tuple(given)
-    return ()
+def recordings_of(given: object, task: AbstractTask | None = None) -> tuple[PerturbedRecording, ...]:
+    """The perturbed recordings that a fit was given, for that or any task; none of anything else.
+
+    Files of two channels are read as such only where the task does not say that the insertion is held.
+    """
+    return perturbed_recordings(given, files=task is None or type(task) is PrescribedLength)
 
 
 def analysed(recordings: Sequence[PerturbedRecording], task: AbstractTask, options: FitOptions) -> Target:

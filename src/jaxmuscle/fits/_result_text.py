@@ -28,6 +28,7 @@ def text_of(result: "FitResult") -> str:
     lines += [f"  note: {notice}" for notice in result.notices]
     if single and result.rms_log_error is not None:
         lines.append(f"  {_closeness(result.only)}")
+    lines += [f"  {'' if single else f'{name}: '}{words}" for name, p in result.parts.items() for words in _stiffness(p)]
     lines += [f"  {sentence}" for sentence in result.remarks]
     every, shown = result.as_shown(result.found), result.as_shown(result.determined)
     intervals = any(p.interval is not None for p in shown.values())
@@ -96,3 +97,13 @@ def _closeness(part: FittedPart, before: str = "") -> str:
     said = [] if part.chi2_per_bin is None else [f"chi2 per bin {part.chi2_per_bin:.2f}"]
     said += [] if part.rms_log_error is None else [f"rms log error {part.rms_log_error:.3f}"]
     return before * bool(said) + ", ".join(said)
+
+
+def _stiffness(part: FittedPart) -> list[str]:
+    """How many points of the dynamic stiffness were fitted, and how well."""
+    if part.stiffness is None or part.target.stiffness is None:
+        return []
+    f = part.target.stiffness.known.frequency
+    return [
+        f"dynamic stiffness: {len(f)} points from {f[0]:.2g} to {f[-1]:.2g} Hz, chi2 per point {part.chi2_per_point:.2f}"
+    ]

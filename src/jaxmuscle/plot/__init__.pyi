@@ -5,6 +5,7 @@ from ._checks import bootstrap as bootstrap
 from ._checks import goodness as goodness
 from ._cohort import cohort as cohort
 from ._comparison import comparison as comparison
+from ._designed_input import designed_input as designed_input
 from ._fit import fit as fit
 from ._identifiability import identifiability as identifiability
 from ._moments import moments as moments

@@ -14,6 +14,7 @@ from matplotlib.figure import Figure, SubFigure
 from jaxmuscle._common.text import rounded
 
 from ._spectra import target
+from ._stiffness import gain, phase, stiffness_residuals
 from ._style import BLACK, BLUE, GREEN, GREY, ORANGE, PURPLE, SKY, VERMILLION, canvas, legend, output_label, styled
 
 WIDTH, LINE, FONT = 7.5, 0.165, 7.5  # inches, inches, points
@@ -62,15 +63,29 @@ Panel = Callable[[Axes], None]
 
 def _panels(result: Any) -> list[tuple[float, tuple[Panel, ...]]]:
     """Rows of panels with their heights: of one target in full, of several one row each."""
-    if len(result.parts) > 1:
-        return [(1.9, (partial(_spectra, part=part, log=True, title=f"{name}: {type(part.task).__name__}"),
-                       partial(_residuals, part=part))) for name, part in result.parts.items()]  # fmt: skip
+    parts = result.parts
+    if len(parts) > 1:
+        rows: list[tuple[float, tuple[Panel, ...]]] = [
+            (1.9, (partial(_spectra, part=part, log=True, title=f"{name}: {type(part.task).__name__}"),
+                   partial(_residuals, part=part))) for name, part in parts.items() if part.fitted.size]  # fmt: skip
+        return rows + [row for name, part in parts.items() for row in _moved(part, f"{name}: dynamic stiffness")]
     part = result.only
-    rows: list[tuple[float, tuple[Panel, ...]]] = [
+    rows = [
         (2.35, (partial(_spectra, part=part, log=False), partial(_spectra, part=part, log=True))),
         (1.75, (partial(_residuals, part=part), partial(_stretch, part=part))),
-    ]
+    ] if part.fitted.size else []  # fmt: skip
+    rows += _moved(part, "Dynamic stiffness")
     return rows if result.profile is None else [*rows, (1.35, (partial(_profile, result=result),))]
+
+
+def _moved(part: Any, title: str) -> list[tuple[float, tuple[Panel, ...]]]:
+    """Rows for the dynamic stiffness of a part that has one."""
+    if part.stiffness is None:
+        return []
+    measured, fitted = part.target.stiffness.known, ("fit", part.stiffness)
+    return [(1.9, (partial(gain, response=measured, curve=fitted, title=title),
+                   partial(phase, response=measured, curve=fitted))),
+            (1.5, (partial(stiffness_residuals, part=part),))]  # fmt: skip
 
 
 def _header(result: Any) -> list[_Line]:
@@ -103,7 +118,8 @@ def _about(name: str, part: Any) -> list[_Line]:
         known = f"{name}: {aim.name} ({aim.provenance} {aim.quantity})"
         lines = _wrapped("  ·  ".join([known, model, *_closeness(part)]))
     else:
-        lines = _wrapped(f"{_ORIGIN.get(aim.provenance, '')} {aim.quantity}: {aim.source}", most=2, color=GREY)
+        what = aim.quantity if part.fitted.size else "dynamic stiffness"
+        lines = _wrapped(f"{_ORIGIN.get(aim.provenance, '')} {what}: {aim.source}", most=2, color=GREY)
     if aim.provenance != "reconstructed":
         return lines
     told = _wrapped(f"RECONSTRUCTED, not measured: {aim.reason}", color=VERMILLION, weight="bold")
@@ -116,6 +132,8 @@ def _closeness(part: Any) -> list[str]:
         facts.append(f"χ² per bin {part.chi2_per_bin:.2f}")
     elif part.rms_log_error is not None:
         facts.append("no χ² (spread unknown)")
+    if part.stiffness is not None:
+        facts.append(f"χ² per point of stiffness {part.chi2_per_point:.2f}")
     return facts + ([] if part.rms_log_error is None else [f"rms log error {part.rms_log_error:.2f}"])
 
 

@@ -7,7 +7,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure, SubFigure
 
-from ._style import BLACK, BLUE, GREY, ORANGE, VERMILLION, canvas, legend, log_axis, styled
+from ._stiffness import POINTS, Curve, gain, phase
+from ._style import BLUE, GREY, ORANGE, VERMILLION, canvas, legend, styled
 
 SHOWN = 4.0  # seconds of the window that are drawn larger
 CHANCE = 0.05
@@ -53,38 +54,23 @@ def perturbed(recording: Any, settings: Any = None, ax: Axes | None = None) -> F
     response, classical = recording.frequency_response(settings), recording.second_order(settings)
     panels = right.subplots(3, 1, sharex=True, height_ratios=(1.5, 1.1, 1))
     s = 2j * np.pi * response.frequency
-    line = sum(classical[name].value * s**power for power, name in enumerate("KBI"))
-    _response(panels, response, line)
+    line = np.sum([classical[name].value * s**power for power, name in enumerate("KBI")], axis=0)
+    _response(panels, response, ("spring, damper, mass", line))
     fig.suptitle(f"{recording.name}: {recording.source}", x=0.01, ha="left", fontsize=8.0, parse_math=False)
     return fig
 
 
-def _response(panels: Sequence[Axes] | np.ndarray, response: Any, line: Any = None) -> None:
-    gain, phase, coherence = panels
-    f, known = response.frequency, np.isfinite(response.stderr)
-    style: dict[str, Any] = {"fmt": "o", "ms": 2.8, "lw": 0.8, "color": BLACK, "zorder": 3}
-    low = np.minimum(2 * response.stderr, 0.95 * response.gain)  # a bar to 0 has no end on a logarithmic axis
-    bars = np.where(known, [low, 2 * response.stderr], 0.0)
-    gain.errorbar(f, response.gain, bars, label="± 2 SE", **style)
-    phase.errorbar(f, response.phase, np.where(known, np.minimum(2 * response.phase_stderr, 180.0), 0.0), **style)
-    if line is not None:
-        gain.plot(f, np.abs(line), color=BLUE, lw=1.2, label="spring, damper, mass", zorder=2)
-        phase.plot(f, np.degrees(np.angle(line)), color=BLUE, lw=1.2, zorder=2)
-    log_axis(gain, "y")
-    log_axis(gain)
-    gain.set_ylabel("Gain (N/m)")
-    gain.set_title("Dynamic stiffness")
-    legend(gain, "above")
-    phase.axhline(0, color=GREY, lw=0.6)
-    phase.set_ylabel("Phase (deg)")
-    phase.yaxis.set_major_locator(_every(phase))
+def _response(panels: Sequence[Axes] | np.ndarray, response: Any, line: Curve | None = None) -> None:
+    f, coherence = response.frequency, panels[2]
+    gain(panels[0], response, line)
+    phase(panels[1], response, line)
     if response.coherence is None:
         coherence.text(0.5, 0.5, "no coherence stated", ha="center", transform=coherence.transAxes, color=GREY)
     else:
         k = np.maximum(response.averages, 2.0)
         spread = np.sqrt(2 * response.coherence / k) * (1 - response.coherence)
         ends = [np.minimum(2 * spread, response.coherence), np.minimum(2 * spread, 1 - response.coherence)]
-        coherence.errorbar(f, response.coherence, np.nan_to_num(ends), **style)
+        coherence.errorbar(f, response.coherence, np.nan_to_num(ends), **POINTS)
         chance = 1 - CHANCE ** (1 / (np.maximum(k - 1, 1)))
         coherence.plot(f, chance, color=GREY, lw=0.8, ls="--")
         words = f"without relation {100 * CHANCE:g} % of the bins lie above this"
@@ -94,10 +80,3 @@ def _response(panels: Sequence[Axes] | np.ndarray, response: Any, line: Any = No
     coherence.set_ylim(0, 1.03)
     coherence.set_ylabel("Coherence γ²")
     coherence.set_xlabel("Frequency (Hz)")
-
-
-def _every(ax: Axes) -> Any:
-    from matplotlib.ticker import MultipleLocator
-
-    low, high = ax.get_ylim()
-    return MultipleLocator(45 if high - low > 100 else 15 if high - low > 30 else 5)

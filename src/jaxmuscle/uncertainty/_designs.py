@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from jaxmuscle._common.text import choices
 from jaxmuscle.data._target import Target
-from jaxmuscle.model._tasks import AbstractTask, Isometric, PrescribedForce
+from jaxmuscle.model._tasks import AbstractTask, Isometric, PrescribedForce, PrescribedLength
 from jaxmuscle.objective._arguments import INPUTS
 from jaxmuscle.objective._consequences import Expansion, expand
 from jaxmuscle.objective._coordinates import Coordinates
@@ -20,10 +20,13 @@ from jaxmuscle.response._linearised import has_response
 from jaxmuscle.response._scaling import FORCES
 from jaxmuscle.spectra._settings import SpectrumSettings
 
+from ._lengthening import Lengthening
+
 AMPLITUDES = ("noise_K_w", "noise_K_z", "noise_C_w", "noise_C_z", "harmonic_amplitude")
 MEAN_ERROR = 0.02
 LEVELS = (2.0, 0.5)
 LONGER = 10
+MOVED = ((1e-4, (0.1, 10.0)), (1e-3, (0.1, 5.0)))  # rms [m] and band [Hz] of standard perturbations
 MOST_VARIATION = 1e3
 VAGUE = 1e-6  # prior precision of what is separate
 
@@ -45,6 +48,8 @@ class Design(eqx.Module):
     - `mean`: relative standard error with which the mean output is measured, 0.02 say; None if it is not.
     - `separate`: names of free parameters that have another value in this measurement, of which nothing is known before.
     - `target`: of a fit with several targets, the one whose task, segments and settings it takes over; the first by default.
+    - `lengthening`: how a motor moves the insertion meanwhile, a `Lengthening`. The response of the force is then measured
+      beside the spectrum of its fluctuations. The task must be `PrescribedLength` or `Isometric`.
 
     **Raises:** `ValueError` for a measurement of nothing, segments below 0, a `mean` that is not positive.
     """
@@ -57,13 +62,15 @@ class Design(eqx.Module):
     mean: float | None = eqx.field(static=True, default=None, kw_only=True)
     separate: tuple[str, ...] = eqx.field(static=True, default=(), kw_only=True)
     target: str | None = eqx.field(static=True, default=None, kw_only=True)
+    lengthening: Lengthening | None = eqx.field(default=None, kw_only=True)
 
     def __check_init__(self):
         if any(k < 0 for k in self.counts):
             raise ValueError(f"{self.name}: segments = {self.segments} must not be negative; 0 for no new spectrum")
         if self.mean is not None and not self.mean > 0:
             raise ValueError(f"{self.name}: mean = {self.mean} must be a positive relative standard error, 0.02 say")
-        if not self.spectral and not self.coefficient_of_variation and self.mean is None:
+        nothing = not self.spectral and not self.coefficient_of_variation and self.mean is None
+        if nothing and self.lengthening is None:
             raise ValueError(f"{self.name}: measures nothing: give segments, coefficient_of_variation=True or mean=0.02")
 
     @property
@@ -83,7 +90,9 @@ class Design(eqx.Module):
             data.append(_spectrum_in_words(self.counts or segments_of(like.target)))
         data += ["coefficient of variation"] if self.coefficient_of_variation else []
         data += [] if self.mean is None else [f"mean to {100 * self.mean:.2g} %"]
-        return _task_in_words(like.task if self.task is None else self.task), ", ".join(data)
+        data += [] if self.lengthening is None else [f"response to a {self.lengthening}"]
+        kind = None if self.lengthening is None else PrescribedLength
+        return _task_in_words(like.task if self.task is None else self.task, kind), ", ".join(data)
 
     def like(self, problem: FitProblem) -> Part:
         """The part of a fit that it resembles. Raises `ValueError` for an unknown target."""
@@ -106,10 +115,10 @@ def told_data(problem: FitProblem) -> tuple[str, str]:
     return "; ".join(tasks), "; ".join(told)
 
 
-def _task_in_words(task: AbstractTask) -> str:
+def _task_in_words(task: AbstractTask, kind: type[AbstractTask] | None = None) -> str:
     inputs = [f"{n} = {float(task[n]):.3g} {'m' if n == 'x_z' else 'N'}" for n in INPUTS
               if n in task.parameter_names and float(task[n]) != 0]  # fmt: skip
-    return ", ".join([type(task).__name__, *inputs])
+    return ", ".join([(kind or type(task)).__name__, *inputs])
 
 
 def _spectrum_in_words(counts: tuple[int, ...]) -> str:
@@ -161,7 +170,7 @@ def _amplitudes(problem: FitProblem, part: Part) -> tuple[str, ...]:
 
 
 def _designs_for(part: Part, moments: Moments, factors: tuple[float, ...], separate: tuple[str, ...]) -> list[Design]:
-    """Of one target: what it does not state, the other output, other force levels, a longer recording."""
+    """Of one target: what it does not state, the other output, a moved insertion, other force levels, a longer recording."""
     task, mean = part.task, float(moments.mean)
     steady = float(np.sqrt(moments.variance)) < MOST_VARIATION * abs(mean)
     varying = part.variation is not None
@@ -173,6 +182,9 @@ def _designs_for(part: Part, moments: Moments, factors: tuple[float, ...], separ
     if isinstance(task, Isometric):
         held = task.as_task(PrescribedForce, P_w=task.P_w, F_ext=mean)
         designs.append(Design(f"the displacement under a load of {mean:.3g} N", held))
+    if isinstance(task, PrescribedLength):
+        designs += [moved_insertion(Lengthening.flat(*given), part.target.settings, coefficient_of_variation=steady)
+                    for given in MOVED]  # fmt: skip
     if isinstance(task, PrescribedForce):
         fixed = task.as_task(Isometric, P_w=task.P_w)
         designs.append(Design("the force with the insertion held", fixed, coefficient_of_variation=True))
@@ -186,6 +198,17 @@ def _designs_for(part: Part, moments: Moments, factors: tuple[float, ...], separ
     more = tuple((LONGER - 1) * k for k in segments_of(part.target))
     designs.append(Design(f"a recording {LONGER} times as long", segments=more, coefficient_of_variation=varying))
     return designs
+
+
+def moved_insertion(
+    lengthening: Lengthening, settings: SpectrumSettings, *, coefficient_of_variation: bool, target: str | None = None
+) -> Design:
+    """A recording with the insertion moved: its response, and the spectrum of the fluctuations beside it."""
+    top = lengthening.frequency[-1]
+    name = f"{lengthening.seconds:g} s with the insertion moved by {1e3 * lengthening.rms:.3g} mm rms to {top:.3g} Hz"
+    segments = settings.segments(round(lengthening.seconds * settings.rate))
+    return Design(name, segments=segments, coefficient_of_variation=coefficient_of_variation and segments > 0,
+                  lengthening=lengthening, target=target)  # fmt: skip
 
 
 def without_further(problem: FitProblem) -> FitProblem:
@@ -209,23 +232,28 @@ def design_information(
 ) -> Float[np.ndarray, "free free"]:
     """Fisher information about a fit's θ in a design; what is separate in it is eliminated, without a prior of its own.
 
-    Raises `ValueError` for a task without linear response, unknown names in `separate`, and a coefficient of variation or
-    mean of an output that is zero.
+    Raises `ValueError` for a task without linear response or whose insertion cannot be moved as the design says, unknown
+    names in `separate`, and a coefficient of variation or mean of an output that is zero.
     """
     names, like = problem.coordinates.names, design.like(problem)
     given = like.task if design.task is None else design.task
     for name in design.separate:
         if name not in names:
             raise ValueError(f"{design.name}: separate: {name!r} is not free in the fit; free are {', '.join(names)}")
+    if design.lengthening is not None and not isinstance(given, PrescribedLength):
+        raise ValueError(f"{design.name}: lengthening: in {type(given).__name__} no motor moves the insertion; give "
+                         "task=jaxmuscle.PrescribedLength(...)")  # fmt: skip
     settings = like.target.settings if design.settings is None else design.settings
-    task = given.with_parts(settings=settings)
+    task: Any = given.with_parts(settings=settings)
     has_response(task, required=True)
-    own, coordinates = _coordinates(like, theta, task)
+    own, coordinates = coordinates_of(like, theta, task)
     local = _local(like, coordinates, task, design)
     here = dataclasses.replace(problem, parts=(local,), coordinates=coordinates, prior=problem.prior[own])
     seen = seen_here(here, theta[own])
     (moments,) = seen.moments
     found = _information(dataclasses.replace(here, parts=(_with_data(local, design, moments),)), design, seen)
+    if design.lengthening is not None:
+        found = found + design.lengthening.information(task, coordinates, theta[own])
     kept = np.array([names[i] not in design.separate for i in own])
     whole = np.zeros((len(names), len(names)))
     if not np.all(kept):
@@ -235,7 +263,7 @@ def design_information(
     return whole
 
 
-def _coordinates(like: Part, theta: np.ndarray, task: Any) -> tuple[np.ndarray, Coordinates]:
+def coordinates_of(like: Part, theta: np.ndarray, task: Any) -> tuple[np.ndarray, Coordinates]:
     """Which of the fit's coordinates the task has, and these: the same θ stands for the task's own values."""
     c = like.coordinates
     has = [i for i, n in enumerate(c.names) if n in task.parameter_names and (float(task[n]) > 0 or not c.positive[i])]

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure, SubFigure
 
 
-COLUMNS = 6
+COLUMNS = 5
 PAIRS_TOLD = 3
 TOGETHER = " together with "
 SAME = 1e-6

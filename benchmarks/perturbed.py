@@ -1,0 +1,186 @@
+"""Perturbation experiments, simulated with NumPy alone, and what is found in them; the tables of docs/perturbed.md.
+
+    python benchmarks/perturbed.py classical|amplitude|reflex|inertia|seconds [--count N]
+
+Takes a minute to a quarter of an hour each.
+"""
+
+import argparse
+import warnings
+from collections.abc import Callable
+
+import jax
+import numpy as np
+import scipy.integrate
+import scipy.interpolate
+from perturbed_muscle import DT, Sines, force, recorded
+
+import jaxmuscle as jm
+
+TASK = jm.PrescribedLength()
+NAMES = ("K_w0", "K_z0", "C_w0", "C_z0")
+QUICK = {"rungs": 0, "seeds": 0, "check_seeds": 0, "starts": 16}
+
+
+def stiffness(task: jm.PrescribedLength, f: float) -> complex:
+    """The dynamic stiffness [N/m] at one frequency [Hz]."""
+    return complex(np.asarray(jm.response.dynamic_stiffness(task, np.array([f])))[0])
+
+
+def truth(task: jm.PrescribedLength = TASK) -> dict[str, float]:
+    """Base stiffness and damping of both tissues."""
+    return {f"{c.upper()}_{j}0": float(task[f"{c}_{j}"]) * float(task[f"{'x' if c == 'k' else 'v'}_ref_{j}"]) ** 2
+            for c in "kc" for j in "wz"}  # fmt: skip
+
+
+def spread(name: str, values: list[float], stated: list[float], true: float) -> None:
+    """A row: what was found on the average, how far the repeats scatter, what error was stated."""
+    found, sd = np.mean(values), np.std(values, ddof=1)
+    errors = np.array(stated if len(stated) else np.nan)
+    inside = 100 * np.mean(np.abs(np.array(values) - true) < 1.96 * errors)
+    print(f"{name:34s} true {true:8.4g}  mean {found:8.4g} ({100 * (found / true - 1):+5.1f} %)  scatter {sd:7.2g}", end="")
+    print(f"  stated {np.mean(errors):7.2g}  within 1.96 errors {inside:3.0f} %", flush=True)
+
+
+def classical(count: int) -> None:
+    """Nonparametric, spring-damper-mass and muscle, of the same recordings of a minute."""
+    runs = recorded(TASK, np.random.default_rng(1), count)
+    responses = [run.frequency_response("slow") for run in runs]
+    for f in (0.5, 1.0, 2.0, 4.0):
+        k = int(np.argmin(np.abs(responses[0].frequency - f)))
+        at = responses[0].frequency[k]
+        for part, words in ((np.real, "Re"), (np.imag, "Im")):
+            spread(f"nonparametric {words} H({at:.2f} Hz)", [float(part(r.value[k])) for r in responses],
+                   [float(r.stderr[k]) for r in responses], float(part(stiffness(TASK, at))))  # fmt: skip
+    second = [run.second_order("slow") for run in runs]
+    tangent = stiffness(TASK, 1e-4).real
+    damping = stiffness(TASK, 1e-4).imag / (2e-4 * np.pi)
+    for name, true in (("K", tangent), ("B", damping), ("I", float(TASK["m_z"]))):
+        spread(f"second order {name}", [s[name].value for s in second], [float(s[name].stderr or 0) for s in second], true)
+    fits = [jm.fit(TASK, run, **QUICK) for run in runs]
+    muscles = [fit.task for fit in fits]
+    spread("muscle H(0)", [stiffness(task, 1e-4).real for task in muscles], [], tangent)
+    for f in (0.5, 1.0, 2.0, 4.0):
+        for part, words in ((np.real, "Re"), (np.imag, "Im")):
+            spread(f"muscle {words} H({f:.2f} Hz)", [float(part(stiffness(task, f))) for task in muscles], [],
+                   float(part(stiffness(TASK, f))))  # fmt: skip
+    told(fits)
+
+
+def told(fits: list[jm.fits.FitResult], task: jm.PrescribedLength = TASK) -> None:
+    """Rows of the four numbers of the muscle, and how often the verdict accepts."""
+    for name, true in truth(task).items():
+        known = [fit[name] for fit in fits if fit[name].stderr is not None]
+        if len(known) > 1:
+            spread(f"muscle {name} (known {len(known)}/{len(fits)})", [p.value for p in known],
+                   [float(p.stderr or 0) for p in known], true)  # fmt: skip
+    print(f"  described: {sum(bool(fit.adequate) for fit in fits)}/{len(fits)}; p "
+          + " ".join(f"{fit.adequacy_p:.2g}" for fit in fits))  # fmt: skip
+    print("  " + "; ".join(sorted({fit.verdict.partition("; ")[2] for fit in fits} - {""})), flush=True)
+
+
+def described(task: jm.PrescribedLength, rms: float, rng: np.random.Generator, band: float) -> tuple[np.ndarray, float]:
+    """Departure of the describing function (mean of 64 draws of phases) from H over |H|, by line, and of the mean force."""
+    sines = Sines(rng, 20.0, 64, high=band)
+    x, v, a = (sines(rms * (2j * np.pi * sines.f) ** n) for n in range(3))
+    periods = [np.tile(part, (3, 1)) for part in (x, v, a)]
+    none = np.zeros_like(periods[0])
+    F = force(task, *periods, none, none, none)[-(len(x) // 2) :]
+    moved = np.fft.rfft(-x[::2], axis=0)[np.rint(20 * sines.f).astype(int)]
+    answer = np.fft.rfft(F, axis=0)[np.rint(20 * sines.f).astype(int)]
+    found = np.mean(answer / moved, axis=1)
+    linear = np.array([stiffness(task, f) for f in sines.f])
+    resting = force(task, *(np.zeros((len(x), 1)) for _ in range(6)))[-1, 0]
+    return np.stack(
+        [np.abs(found - linear) / np.abs(linear), np.abs(found), np.abs(linear), sines.f]
+    ), F.mean() / resting - 1
+
+
+def agreement(rms: float) -> str:
+    """The integrator of these programs, and `jaxmuscle.simulate`, against `scipy.integrate.solve_ivp`."""
+    sines = Sines(np.random.default_rng(6), 10.0, 1)
+    s = 2j * np.pi * sines.f
+    signals = [sines(rms * s**n) for n in range(3)]
+    time = DT * np.arange(sines.samples)
+    x, v, _ = (scipy.interpolate.CubicSpline(time, part[:, 0]) for part in signals)
+    m_w, P_w, k_w, k_z, c_w, c_z = (float(TASK[n]) for n in ("m_w", "P_w", "k_w", "k_z", "c_w", "c_z"))
+
+    def passive(t: float, y: np.ndarray) -> float:
+        return k_z * (TASK["x_ref_z"] ** 2 + x(t) ** 2) * (x(t) - y[0]) + c_z * (1 + v(t) ** 2) * (v(t) - y[1])
+
+    def slope(t: float, y: np.ndarray) -> list[float]:
+        own = k_w * (TASK["x_ref_w"] ** 2 + y[0] ** 2) * y[0] + c_w * (1 + y[1] ** 2) * y[1]
+        return [y[1], (P_w - own + passive(t, y)) / m_w]
+
+    at = time[time >= 3.0][:-8:8]
+    path = scipy.integrate.solve_ivp(slope, (0, 10), [0.01, 0.0], "DOP853", at, rtol=1e-10, atol=1e-12)
+    wanted = np.array([-passive(t, y) for t, y in zip(at, path.y.T, strict=True)]) - 0.5 * signals[2][time >= 3.0][:-8:8, 0]
+    none = np.zeros_like(signals[0])
+    own = np.interp(at, time[::2], force(TASK, *signals, none, none, none)[:, 0])
+    moved = TASK.replace(noise_K_w=0.0, noise_K_z=0.0, noise_C_w=0.0, noise_C_z=0.0, harmonic_amplitude=0.0)
+    moved = moved.with_parts(x_z=jm.model.Sampled.through(time, signals[0][:, 0]))
+    run = jm.simulate(moved, jax.random.key(0), duration=9.9, rate=100, sampling="instant")
+    theirs = np.asarray(run.output)[np.rint(100 * at[at < 9.9]).astype(int)]
+    return ", ".join(f"{name} {np.max(np.abs(f - wanted[: f.size])) / np.std(wanted):.1e}"
+                     for name, f in (("NumPy", own), ("simulate", theirs)))  # fmt: skip
+
+
+def amplitude(count: int) -> None:
+    """From which amplitude on the muscle's response is not the linear one."""
+    for rms in (1e-3, 8e-3):
+        print(f"rms {1e3 * rms:g} mm, largest difference from scipy over the rms of the force: {agreement(rms)}", flush=True)
+    for words, task in (("default, 2.2 N", TASK), ("carried to 40 N", jm.at_force(TASK, 40.0))):
+        for band in (2.0, 5.0):
+            for rms in (0.1e-3, 0.3e-3, 1e-3, 2e-3, 3e-3, 4e-3, 6e-3, 8e-3):
+                (off, _, size, f), mean = described(task, rms, np.random.default_rng(2), band)
+                total = np.sqrt(np.mean((off * size) ** 2) / np.mean(size**2))
+                worst = f"largest {100 * off.max():6.2f} % at {f[off.argmax()]:.2f} Hz"
+                print(f"{words:18s} to {band:g} Hz, rms {1e3 * rms:4.1f} mm: {worst}, rms {100 * total:5.2f} %, mean force "
+                      f"{100 * mean:+.2f} %", flush=True)  # fmt: skip
+
+
+def reflex(count: int) -> None:
+    """A drive that follows the lengthening, late, through the twitch: the reflex."""
+    for late in (0.03, 0.05):
+        for strength in (0.0, 0.1, 0.3, 1.0):
+
+            def pull(s: np.ndarray, late: float = late, strength: float = strength) -> np.ndarray:
+                return 100.0 * strength * (1 + 0.1 * s) * np.exp(-s * late) / (1 + 0.04 * s) ** 2
+
+            runs = recorded(TASK, np.random.default_rng(3), count, reflex=pull)
+            print(f"reflex {strength:g} of the stiffness at rest, late by {1e3 * late:g} ms")
+            told([jm.fit(TASK, run, **QUICK) for run in runs])
+
+
+def inertia(count: int) -> None:
+    """A rig whose mass is not in m_z, and in it."""
+    for mass in (0.02, 0.1):
+        runs = recorded(TASK, np.random.default_rng(4), count, mass=mass)
+        for fixed in (0.5, 0.5 + mass):
+            print(f"rig {mass:g} kg, fitted with m_z = {fixed:g} kg; second order I: "
+                  f"{np.mean([run.second_order('slow')['I'].value for run in runs]):.3f}")  # fmt: skip
+            told([jm.fit(TASK, run, fix={"m_z": fixed}, **QUICK) for run in runs])
+
+
+def seconds(count: int) -> None:
+    """Errors over the length of the recording, and over the amplitude."""
+    for length, rms in ((30.0, 1e-3), (60.0, 1e-3), (120.0, 1e-3), (60.0, 0.5e-3), (60.0, 2e-3)):
+        print(f"{length:g} s, {1e3 * rms:g} mm rms")
+        told([jm.fit(TASK, run, **QUICK) for run in recorded(TASK, np.random.default_rng(5), count, length, rms)])
+
+
+PARTS: dict[str, Callable[[int], None]] = {part.__name__: part for part in (classical, amplitude, reflex, inertia, seconds)}
+
+
+def main() -> None:
+    """Run one part."""
+    arguments = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    arguments.add_argument("part", choices=PARTS)
+    arguments.add_argument("--count", type=int, default=20, help="recordings")
+    given = arguments.parse_args()
+    warnings.simplefilter("ignore")
+    PARTS[given.part](given.count)
+
+
+if __name__ == "__main__":
+    main()

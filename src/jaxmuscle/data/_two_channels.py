@@ -1,0 +1,70 @@
+"""Which columns of a file are the force and the displacement of a perturbation experiment."""
+
+import os
+import re
+from collections.abc import Sequence
+from typing import Any
+
+from jaxmuscle.spectra._settings import require
+
+from ._as_target import is_recording
+from ._perturbed import PerturbedRecording
+from ._recording_choice import signals
+from ._recording_files import load_recording, read_table
+from ._recording_table import bare, find, listed
+from ._units import quantity_of
+
+CALLED = {
+    "force": re.compile(r"force|torque|moment|kraft|drehmoment|f_?[xyz]?"),
+    "displacement": re.compile(r"disp(lacement)?|length|position|pos|angle|way|weg|auslenkung|winkel|x_z"),
+}
+MEASURED = {"force": ("force", "torque"), "displacement": ("displacement", "angle")}
+
+
+def two_channels(
+    path: str | os.PathLike[str],
+    force: str | int | None = None,
+    displacement: str | int | None = None,
+    *,
+    time: str | int | None = None,
+    skip_rows: int = 0,
+) -> dict[str, str]:
+    """The columns of a recording that are the force, or torque, and the displacement, or angle, of a moved insertion.
+
+        jaxmuscle.load_recording(path, **two_channels(path))
+
+    A column is found by its name (`force_N`, `Torque [Nm]`; `displacement_mm`, `length`, `position`, `angle_deg`), or by its
+    unit.
+
+    **Arguments:** `path`, the file; `force`, `displacement`, a column that is known; `time`, `skip_rows` as in
+    `load_recording`.
+
+    **Returns:** their names by role; nothing where the file does not hold both.
+
+    **Raises:** `ValueError` that names the columns where several may be meant, and as `load_recording` does.
+    """
+    table = read_table(path, skip_rows)
+    others, found = signals(table, time), dict[str, list[str]]()
+    for role, given in (("force", force), ("displacement", displacement)):
+        named = [name for name in others if CALLED[role].fullmatch(bare(name))]
+        meant = [name for name in others if quantity_of(table.units.get(name, "")) in MEASURED[role]]
+        found[role] = [find(table, given, role)] if given is not None else named if len(named) == 1 else meant or named
+    if not all(found.values()):
+        return {}
+    for role, names in found.items():
+        remedy = f"{table.file} holds several that may be meant; give `{role}`, the name of one"
+        require(len(names) == 1, f"{role} columns", listed(names), remedy)
+    return {role: names[0] for role, names in found.items()}
+
+
+def perturbed_recordings(given: Any, *, files: bool) -> tuple[PerturbedRecording, ...]:
+    """Perturbed recordings: one, several, or with `files` the paths of such, their steady parts found; none of else."""
+    several = given if isinstance(given, Sequence) and not isinstance(given, str) else (given,)
+    if len(several) > 0 and all(isinstance(one, PerturbedRecording) for one in several):
+        return tuple(several)
+    if not files or not all(isinstance(one, str | os.PathLike) and is_recording(one) for one in several):
+        return ()
+    channels = [two_channels(one) for one in several]
+    if not channels or not all(channels):
+        return ()
+    return tuple(load_recording(path, **names).steady() for path, names in zip(several, channels, strict=True))

@@ -1,0 +1,71 @@
+"""Panels of a dynamic stiffness: gain and phase with their errors, a curve through them, and what the curve misses."""
+
+from typing import Any
+
+import numpy as np
+import scipy
+from jaxtyping import Complex
+from matplotlib.axes import Axes
+from matplotlib.ticker import MultipleLocator
+
+from ._style import BLACK, BLUE, GREY, ORANGE, legend, log_axis
+
+Curve = tuple[str, Complex[np.ndarray, " bins"]]
+POINTS: dict[str, Any] = {"fmt": "o", "ms": 2.8, "lw": 0.8, "color": BLACK, "zorder": 3}
+
+
+def gain(ax: Axes, response: Any, curve: Curve | None = None, title: str = "Dynamic stiffness") -> None:
+    """The gain with two standard errors either way, and the gain of a curve with its name, at the same frequencies."""
+    f, known = response.frequency, np.isfinite(response.stderr)
+    low = np.minimum(2 * response.stderr, 0.95 * response.gain)  # a bar to 0 has no end on a logarithmic axis
+    ax.errorbar(f, response.gain, np.where(known, [low, 2 * response.stderr], 0.0), label="measured ± 2 SE", **POINTS)
+    if curve is not None:
+        name, values = curve
+        fine, smooth = _smooth(f, values)
+        ax.plot(fine, np.abs(smooth), color=BLUE, lw=1.2, label=name, zorder=2)
+    log_axis(ax, "y")
+    log_axis(ax)
+    ax.set_ylabel("Gain (N/m)")
+    ax.set_title(title, parse_math=False)
+    legend(ax, "above")
+
+
+def phase(ax: Axes, response: Any, curve: Curve | None = None) -> None:
+    """The phase with two standard errors either way, and that of a curve."""
+    f, known = response.frequency, np.isfinite(response.stderr)
+    ax.errorbar(f, response.phase, np.where(known, np.minimum(2 * response.phase_stderr, 180.0), 0.0), **POINTS)
+    if curve is not None:
+        fine, smooth = _smooth(f, curve[1])
+        ax.plot(fine, np.degrees(np.unwrap(np.angle(smooth))), color=BLUE, lw=1.2, zorder=2)
+    ax.axhline(0, color=GREY, lw=0.6)
+    ax.set_ylabel("Phase (deg)")
+    low, high = ax.get_ylim()
+    ax.yaxis.set_major_locator(MultipleLocator(45 if high - low > 100 else 15 if high - low > 30 else 5))
+    log_axis(ax)
+
+
+def stiffness_residuals(ax: Axes, part: Any) -> None:
+    """Measured less fitted stiffness in standard errors, of the real and of the imaginary part."""
+    f, off = part.target.stiffness.known.frequency, part.stiffness_residual
+    for deviations, shade in ((2, "0.94"), (1, "0.87")):
+        ax.axhspan(-deviations, deviations, color=shade, lw=0, zorder=0)
+    for values, marker, colour, name in ((np.real(off), "o", BLUE, "real (spring, mass)"),
+                                         (np.imag(off), "^", ORANGE, "imaginary (damping)")):  # fmt: skip
+        ax.plot(f, values, color=colour, lw=0.6, marker=marker, ms=3.5, label=name, zorder=3)
+    reach = 1.1 * float(np.max(np.abs([np.real(off), np.imag(off)]), initial=3.0))
+    ax.axhline(0, color=BLACK, lw=0.6, zorder=2)
+    log_axis(ax)
+    ax.set(xlabel="Frequency (Hz)", ylabel="Residual (SE)", ylim=(-reach, reach))
+    ax.set_title("Stiffness: measured less fitted")
+    legend(ax, "above")
+
+
+def _smooth(f: np.ndarray, values: Any) -> tuple[np.ndarray, np.ndarray]:
+    """The values, and between them a curve without swings of its own."""
+    if len(f) < 3:
+        return f, values
+    fine = np.unique(np.concatenate([f, np.geomspace(f[0], f[-1], 200)]))
+    real, imaginary = (
+        scipy.interpolate.PchipInterpolator(np.log(f), part(values))(np.log(fine)) for part in (np.real, np.imag)
+    )
+    return fine, real + 1j * imaginary

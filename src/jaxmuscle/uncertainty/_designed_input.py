@@ -1,0 +1,143 @@
+"""A motion that was designed: the signal for a motor, and what its record is expected to tell."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Float
+
+from jaxmuscle import plot
+from jaxmuscle._common.files import replacing, write_json
+from jaxmuscle._common.text import folded
+
+from ._identifiability_report import BASE
+from ._lengthening import Lengthening
+from ._multisine import speed_of
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure, SubFigure
+
+SHOWN = 2.0  # times the even density: where a design moves the most
+OF_MUSCLE = tuple(BASE.values())
+
+
+class DesignedInput(eqx.Module):
+    """A periodic motion of the insertion, made by `design_input`, and what one record of it is expected to tell.
+
+    `quantity`, the names of what it was made for; `lengthening`, its lines; `even`, those of a flat motion: of even density
+    in the band and as large as the same limits allow; `displacement` [m] at `time` [s], one period at
+    `rate` [Hz], positive where the muscle gets longer (the motor pulls away from it: x_z = -displacement); `values` and
+    `units` of every free parameter and derived quantity, and their standard errors in these units: `now`, without the
+    record; `flat`, with the flat motion; `stderr`, with this one.
+    """
+
+    quantity: tuple[str, ...] = eqx.field(static=True)
+    lengthening: Lengthening
+    even: Lengthening
+    displacement: Float[np.ndarray, " samples"]
+    rate: float
+    values: dict[str, float]
+    units: dict[str, str] = eqx.field(static=True)
+    now: dict[str, float]
+    flat: dict[str, float]
+    stderr: dict[str, float]
+
+    @property
+    def time(self) -> Float[np.ndarray, " samples"]:
+        """Time of every sample [s]."""
+        return np.arange(len(self.displacement)) / self.rate
+
+    @property
+    def frequency(self) -> Float[np.ndarray, " lines"]:
+        """Frequencies of its lines [Hz]."""
+        return self.lengthening.frequency
+
+    @property
+    def density(self) -> Float[np.ndarray, " lines"]:
+        """One-sided density of the displacement [m²/Hz]."""
+        return self.lengthening.power * self.lengthening.seconds
+
+    @property
+    def rms(self) -> float:
+        """Root of the mean square of the displacement [m]."""
+        return self.lengthening.rms
+
+    @property
+    def peak(self) -> float:
+        """Largest displacement to either side [m]."""
+        return float(np.max(np.abs(self.displacement)))
+
+    @property
+    def speed(self) -> float:
+        """Largest speed [m/s]."""
+        return float(np.max(np.abs(speed_of(self.displacement, self.lengthening.seconds))))
+
+    @property
+    def gain(self) -> float:
+        """Sum of the relative variances of the quantities with the flat motion, over that with this one."""
+        flat, own = (sum((e[n] / (self.values[n] or 1.0)) ** 2 for n in self.quantity) for e in (self.flat, self.stderr))
+        return flat / own
+
+    @property
+    def moves(self) -> tuple[tuple[float, float, float], ...]:
+        """Where the density is more than twice the even one: lowest and highest frequency [Hz], share of the mean square."""
+        power = self.lengthening.power
+        high = np.flatnonzero(power > SHOWN * np.mean(power))
+        runs = [run for run in np.split(high, np.flatnonzero(np.diff(high) > 1) + 1) if len(run)]
+        return tuple((float(self.frequency[r[0]]), float(self.frequency[r[-1]]), float(np.sum(power[r]) / np.sum(power)))
+                     for r in runs)  # fmt: skip
+
+    @property
+    def told(self) -> list[str]:
+        """The quantities to be told of: those of the muscle, and what it was made for."""
+        return list(dict.fromkeys([*self.quantity, *(n for n in self.values if n.partition("@")[0] in OF_MUSCLE)]))
+
+    def percent(self, name: str, errors: dict[str, float]) -> float:
+        """A standard error in percent of the value."""
+        return 100 * errors[name] / abs(self.values[name])
+
+    def to_dict(self) -> dict[str, Any]:
+        """As nested tables of numbers and strings, without the signal."""
+        errors = {"now": self.now, "flat": self.flat, "stderr": self.stderr}
+        known = {n: {"value": v, "unit": self.units[n]} | {which: e[n] for which, e in errors.items()}
+                 for n, v in self.values.items()}  # fmt: skip
+        return {
+            "format": 1, "quantity": list(self.quantity), "gain": self.gain, "seconds": self.lengthening.seconds,
+            "rate": self.rate, "rms": self.rms, "peak": self.peak, "speed": self.speed,
+            "frequency_hz": self.frequency.tolist(), "density": self.density.tolist(), "quantities": known,
+        }  # fmt: skip
+
+    def save(self, path: str | Path) -> None:
+        """Write the signal for the motor as CSV (`time_s`, `displacement_mm`); `to_dict` where the name ends in .json."""
+        if Path(path).suffix == ".json":
+            return write_json(path, self.to_dict())
+        head = (f"one period of a lengthening of {self.lengthening.seconds:g} s, to be repeated; positive: the muscle gets "
+                f"longer\nrms {1e3 * self.rms:.4g} mm, peak {1e3 * self.peak:.4g} mm, {1e3 * self.speed:.4g} mm/s; designed "
+                f"by jaxmuscle for {', '.join(self.quantity)}")  # fmt: skip
+        with replacing(path) as temporary, temporary.open("w", encoding="utf-8") as file:
+            file.write("".join(f"# {line}\n" for line in head.splitlines()) + "time_s,displacement_mm\n")
+            np.savetxt(file, np.stack([self.time, 1e3 * self.displacement], axis=1), "%.7g", ",")
+        return None
+
+    def plot(self, ax: Any = None) -> "Figure | SubFigure":
+        """Density, the beginning of the motion, and the expected errors, beside those of the flat one."""
+        return plot.designed_input(self, ax)
+
+    def __str__(self) -> str:
+        low, high = self.frequency[0], self.frequency[-1]
+        best = ", ".join(f"{n} to {self.percent(n, self.stderr):.2g} %" for n in self.quantity)
+        flat = ", ".join(f"{self.percent(n, self.flat):.2g} %" for n in self.quantity)
+        most = " and ".join(f"{100 * share:.0f} % at {a:.2g} to {b:.2g} Hz" for a, b, share in self.moves)
+        rows = [f"    {n:<22}" + "".join(f"{self.percent(n, e):>10.2g}" for e in (self.now, self.flat, self.stderr))
+                for n in self.told]  # fmt: skip
+        return folded([
+            f"designed input: one record of {self.lengthening.seconds:g} s would tell {best}",
+            f"  a flat input of {1e3 * self.even.rms:.3g} mm rms: {flat}; its variance is {self.gain:.2g} times as large",
+            f"  lengthening of the muscle: {1e3 * self.rms:.3g} mm rms, peak {1e3 * self.peak:.3g} mm, "
+            f"{1e3 * self.speed:.3g} mm/s, {low:.2g} to {high:.2g} Hz",
+            f"  most of the motion: {most}" if most else "  the density is nearly even",
+            "  expected standard errors, in percent of the value:",
+            f"    {'':<22}{'now':>10}{'flat':>10}{'designed':>10}",
+            *rows,
+        ])  # fmt: skip

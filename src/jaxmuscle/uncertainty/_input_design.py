@@ -1,0 +1,203 @@
+"""The motion of the insertion from which a quantity becomes best known."""
+
+import dataclasses
+from collections.abc import Iterable
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+import scipy
+from jaxtyping import Float, PRNGKeyArray
+
+from jaxmuscle._common.arrays import as_numbers, require
+from jaxmuscle._common.keys import key_of
+from jaxmuscle._common.text import choices
+from jaxmuscle.data._target import Target
+from jaxmuscle.fits._result import FitResult
+from jaxmuscle.model._tasks import AbstractTask, PrescribedLength
+from jaxmuscle.objective._arguments import FitOptions, planned
+from jaxmuscle.objective._consequences import derived_names
+from jaxmuscle.objective._problem import FitProblem
+from jaxmuscle.response._expected_spectrum import expected_spectrum
+
+from ._designed_input import DesignedInput
+from ._designs import coordinates_of, design_information, moved_insertion, seen_here
+from ._identifiability import Here, fitted_problem
+from ._identifiability_report import BASE
+from ._lengthening import Lengthening, information_of_lines, lines_in, require_positive
+from ._multisine import multisine, speed_of
+
+WIDTH, FEWEST = 0.15, 5  # of a step of the density: relative to its frequency; lines in it at least
+TRIES = 4  # how often the density follows the crest factors of its motion
+CREST = (1.6, 2.0)  # of position and velocity, to begin with
+ENOUGH = 1e-6
+NOTHING = 1e-4  # of the relative variance, by which a motion must lower it
+
+
+def design_input(
+    result: FitResult | AbstractTask,
+    quantity: str | Iterable[str] = "K_w0",
+    *,
+    rms: float = 1e-3,
+    band: tuple[float, float] = (0.1, 5.0),
+    seconds: float = 60.0,
+    rate: float = 1000.0,
+    peak: float | None = None,
+    speed: float | None = None,
+    spread: float = 0.1,
+    target: str | None = None,
+    key: PRNGKeyArray | int = 0,
+) -> DesignedInput:
+    """The motion of the insertion, within limits, whose record makes a quantity best known.
+
+    The density S_x(f) of the displacement that minimises the sum of the relative variances of the quantities q,
+
+        Σ_q g_qᵀ (I_0 + I[S_x])⁻¹ g_q / q²,    I[S_x] = 2T ∫ Re(∂H* ∂Hᵀ) S_x(f) / S(f) df,    ∫ S_x df <= rms²
+
+    I_0 is the information that is there without the motion: the fit's data and prior, and the fluctuations of the new
+    record. H is the `dynamic_stiffness`, S the `noise_density`, T the length of the record. The problem is convex. S_x is
+    constant in steps 0.15 f wide, or of five lines. It is then realised as a multisine, periodic in T, with phases that keep
+    the peaks low. Everything reported is of this motion.
+
+    **Arguments:** `result` of a fit, or a task, whose usual free parameters are then free with their prior; `quantity`, a
+    free parameter or a derived quantity such as K_w0, K_z0, C_w0, C_z0, or several; `rms` [m], `peak` [m] and `speed` [m/s],
+    at most; where the motion would pass `peak` or `speed` it gets smaller or slower; `band` [Hz]; `seconds`, length of the
+    record and period; `rate` [Hz] of the motion; `key` of its phases; `spread`, the share of the mean square that is even
+    over the band (a motion of few lines could be foreseen, and would not test the model); `target`, which one of a fit with
+    several.
+
+    **Raises:** `ValueError` for an unknown quantity or one that is fixed, or of which no motion tells; for limits that are
+    not positive, a band that holds no line or reaches beyond half the rate, seconds that are no whole number of samples;
+    `OperatingPointError` for a task without linear response.
+    """
+    for name, value, unit in (("rms", rms, "m"), ("peak", peak, "m"), ("speed", speed, "m/s"), ("rate", rate, "Hz")):
+        require_positive(name, np.float64(1.0) if value is None else value, unit)
+    require(0 <= spread <= 1, f"spread = {spread} must be a share, from 0 to 1")
+    frequency, samples = lines_in(band, seconds), round(seconds * rate)
+    require(abs(samples - seconds * rate) < ENOUGH * samples,
+            f"seconds = {seconds}: rate = {rate} Hz makes no whole number of samples of it")  # fmt: skip
+    require(2 * frequency[-1] < rate, f"band = {band} Hz reaches beyond half of rate = {rate} Hz: raise the rate")
+    quantities = (quantity,) if isinstance(quantity, str) else tuple(quantity)
+    limits, crest = np.array([np.inf if limit is None else limit for limit in (peak, speed)]), np.array(CREST)
+    rng = np.random.default_rng(np.asarray(jax.random.key_data(key_of(key) if isinstance(key, int) else key)).tolist())
+
+    def realised(power: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """A motion of these lines, made smaller where it must be, and the crest factors of position and velocity."""
+        motion = multisine(frequency * seconds, power, seconds, samples, limits, rng)
+        moved = np.stack([motion, speed_of(motion, seconds)])
+        tops = np.max(np.abs(moved), axis=1)
+        return motion * min(1.0, *(limits / tops)), tops / np.sqrt(np.mean(moved**2, axis=1))
+
+    with jax.enable_x64(True):
+        even = Lengthening.flat(rms, band, seconds)
+        experiment = Experiment.of(result, quantities, even, target)
+        motion = realised(even.power)[0]
+        even = even.of_motion(motion)
+        for _ in range(TRIES if np.isfinite(min(limits)) else 1):
+            allowed = limits / crest
+            motion, crest = realised(experiment.best(min(rms, allowed[0]), allowed[1], spread))
+    own = even.of_motion(motion)
+    known = experiment.here.values
+    values, units = {n: value for n, (value, _) in known.items()}, {n: unit for n, (_, unit) in known.items()}
+    errors = [experiment.errors(p) for p in (None, even.power, own.power)]
+    return DesignedInput(quantities, own, even, motion, float(rate), values, units, *errors)
+
+
+class Experiment(NamedTuple):
+    """What is known without the motion: `start` of all data, information `apart` from the response; that of its lines."""
+
+    here: Here
+    quantity: tuple[str, ...]
+    start: Float[np.ndarray, "free free"]
+    apart: Float[np.ndarray, "free free"]
+    frequency: Float[np.ndarray, " lines"]
+    lines: Float[np.ndarray, "lines free free"]
+
+    @classmethod
+    def of(
+        cls, given: FitResult | AbstractTask, quantity: Iterable[str], record: Lengthening, target: str | None
+    ) -> "Experiment":
+        """Of a record, at the values of a fit or task. Needs double precision."""
+        problem, theta, derived = _problem(given)
+        seen = seen_here(problem, theta)
+        here = Here.of(problem, seen, derived)
+        for name in quantity:
+            if name not in here.gradients:
+                fixed = name.partition("@")[0] in (*problem.parts[0].task.parameter_names, *BASE.values())
+                raise ValueError(f"quantity {name!r} " + ("is fixed: leave its parameter free" if fixed else
+                                 f"is unknown: {choices(name, here.gradients)}"))  # fmt: skip
+        design = moved_insertion(record, problem.parts[0].target.settings, coefficient_of_variation=True, target=target)
+        like = design.like(problem)
+        task: Any = _moved(like.task).with_parts(settings=like.target.settings)
+        start = np.diag(problem.prior) + (here.information if isinstance(given, FitResult) else 0.0)
+        still = dataclasses.replace(design, task=task, lengthening=None)
+        own, coordinates = coordinates_of(like, theta, task)
+        lines = np.zeros((len(record.frequency), *start.shape))
+        lines[:, own[:, None], own] = information_of_lines(task, coordinates, theta[own], record.frequency, record.seconds)
+        return cls(here, tuple(quantity), start, start + design_information(problem, theta, still), record.frequency, lines)
+
+    @property
+    def rows(self) -> Float[np.ndarray, "quantities free"]:
+        """Relative slopes of the quantities; those of what has either sign in its unit."""
+        rows = [self.here.gradients[n] / (self.here.values[n][0] or 1.0) for n in self.quantity]
+        return np.stack(rows)
+
+    def best(self, rms: float, speed: float, spread: float) -> Float[np.ndarray, " lines"]:
+        """Mean square of every line [m²] such that the quantities become best known, at most of that rms and rms speed.
+
+        Convex, in shares of steps of the density.
+        """
+        steps = steps_of(self.frequency)
+        steps = (1 - spread) * steps + spread / len(self.frequency)
+        each = rms**2 * np.tensordot(steps, self.lines, 1)
+        fast = (rms / speed) ** 2 * steps @ (2 * np.pi * self.frequency) ** 2
+
+        def height(share: np.ndarray) -> tuple[float, np.ndarray]:
+            reached = np.linalg.solve(self.apart + np.tensordot(share, each, 1), self.rows.T)
+            sum_of_variances = np.sum(self.rows.T * reached)
+            return np.log(sum_of_variances), -np.einsum("iq,kij,jq->k", reached, each, reached) / sum_of_variances
+
+        within = [scipy.optimize.LinearConstraint(row, -np.inf, 1.0) for row in (np.ones(len(steps)), fast)]
+        begin = np.full(len(steps), 1 / len(steps)) / max(1.0, np.mean(fast))
+        if np.max(-height(begin)[1]) < NOTHING:
+            raise ValueError(f"quantity: no motion within these limits tells of {' and '.join(self.quantity)}: raise rms, "
+                             "or choose another band")  # fmt: skip
+        found = scipy.optimize.minimize(height, begin, jac=True, method="SLSQP", bounds=[(0, 1)] * len(steps),
+                                        constraints=within, options={"maxiter": 500, "ftol": 1e-12})  # fmt: skip
+        return rms**2 * np.maximum(found.x, 0) @ steps
+
+    def errors(self, power: Float[np.ndarray, " lines"] | None) -> dict[str, float]:
+        """Standard errors of all quantities with a motion; without the record if there is none."""
+        known = self.start if power is None else self.apart + np.tensordot(power, self.lines, 1)
+        after = np.linalg.pinv(known, hermitian=True)
+        return {name: float(np.sqrt(g @ after @ g)) for name, g in self.here.gradients.items()}
+
+
+def steps_of(frequency: Float[np.ndarray, " lines"]) -> Float[np.ndarray, "steps lines"]:
+    """Where the density may be raised: neighbouring lines, each with an equal share."""
+    starts, n = [0], len(frequency)
+    while (following := max(starts[-1] + FEWEST, int(np.searchsorted(frequency, (1 + WIDTH) * frequency[starts[-1]])))) < n:
+        starts.append(following)
+    if n - starts[-1] < FEWEST and len(starts) > 1:
+        starts.pop()
+    ends = [*starts[1:], n]
+    inside = [(np.arange(n) >= a) & (np.arange(n) < b) for a, b in zip(starts, ends, strict=True)]
+    return np.stack([one / np.sum(one) for one in inside])
+
+
+def _moved(task: Any) -> AbstractTask:
+    """The experiment with the muscle of a task, at the same P_w."""
+    if isinstance(task, PrescribedLength):
+        return task
+    return task.as_task(PrescribedLength, **({"P_w": task.P_w} if hasattr(task, "P_w") else {}))
+
+
+def _problem(given: FitResult | AbstractTask) -> tuple[FitProblem, Float[np.ndarray, " free"], Iterable[str]]:
+    """A fit's problem, or that of a task with the data that it would give; θ, and what can be derived."""
+    if isinstance(given, FitResult):
+        return *fitted_problem(given, None), given.derived_names
+    task = as_numbers(_moved(given))
+    power = np.asarray(expected_spectrum(task).proportional)
+    target = Target(type(task).__name__, power, segments=1, settings=task.settings)
+    problem = planned(task, target, FitOptions(coefficient_of_variation=False)).problem
+    return problem, np.zeros(len(problem.coordinates.names)), derived_names(task)

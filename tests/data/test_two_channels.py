@@ -1,0 +1,78 @@
+"""Files of force and displacement are recognised by their columns, those of a frequency response by theirs."""
+
+import numpy as np
+import pytest
+
+from jaxmuscle.data._as_target import as_target, is_recording
+from jaxmuscle.data._frequency_response_files import is_frequency_response
+from jaxmuscle.data._two_channels import perturbed_recordings, two_channels
+
+ROWS = 3000
+FORCE = 40 + np.sin(np.arange(ROWS) / 7.0)
+MOVED = 1e-3 * np.sin(np.arange(ROWS) / 7.0)
+
+
+def written(folder, *names, name="x.csv"):
+    """A file with a time and these columns: force where a name begins so, else displacement."""
+    columns = [np.arange(ROWS) / 100, *(FORCE if n.casefold().startswith(("f", "t", "k", "b")) else MOVED for n in names)]
+    head = ",".join(("time_s", *names))
+    np.savetxt(folder / name, np.stack(columns, axis=1), delimiter=",", header=head, comments="", fmt="%.6g")
+    return folder / name
+
+
+@pytest.mark.parametrize("names", [
+    ("force_N", "displacement_mm"), ("displacement_mm", "force_N"), ("Force [N]", "Length [mm]"), ("Torque_Nm", "angle_deg"),
+    ("Kraft / N", "Weg / mm"), ("F", "x_z"), ("board_N", "motor_mm"), ("force_N", "position", "battery_V"),
+    ("force_N", "board_kN", "pos_mm"),
+])  # fmt: skip
+def test_columns_are_found_by_name_and_by_unit(tmp_path, names):
+    found = two_channels(written(tmp_path, *names))
+    moved = {"Length [mm]", "displacement_mm", "angle_deg", "Weg / mm", "x_z", "motor_mm", "position", "pos_mm"}
+    pulled = next(n for n in names if n not in moved)
+    assert found == {"force": pulled, "displacement": next(n for n in names if n in moved)}
+
+
+@pytest.mark.parametrize("names", [("force_N",), ("force_N", "battery_V"), ("displacement_mm", "angle_deg")])
+def test_a_file_without_both_is_none(tmp_path, names):
+    path = written(tmp_path, *names)
+    assert two_channels(path) == {}
+    assert perturbed_recordings(path, files=True) == ()
+
+
+def test_several_that_may_be_meant_are_named(tmp_path):
+    path = written(tmp_path, "force_N", "motor_mm", "target_mm")
+    with pytest.raises(ValueError, match=r"displacement columns='motor_mm, target_mm'.*give `displacement`"):
+        two_channels(path)
+    assert two_channels(path, displacement="motor_mm") == {"force": "force_N", "displacement": "motor_mm"}
+    with pytest.raises(ValueError, match="no displacement 'rod'"):
+        two_channels(path, displacement="rod")
+
+
+def test_paths_are_read_as_what_they_are(tmp_path):
+    path = written(tmp_path, "force_N", "displacement_mm")
+    (found,) = perturbed_recordings(str(path), files=True)
+    assert found.window is not None
+    np.testing.assert_allclose(found.displacement.whole, 1e-3 * MOVED, rtol=1e-4, atol=1e-9)
+    assert perturbed_recordings([found, found], files=False) == (found, found)
+    assert len(perturbed_recordings([path, path], files=True)) == 2
+    assert perturbed_recordings(path, files=False) == ()
+    assert perturbed_recordings("vastus-lateralis-26mvc", files=True) == ()
+
+
+def test_an_angle_needs_its_lever_arm(tmp_path):
+    with pytest.raises(ValueError, match="lever_arm"):
+        perturbed_recordings(written(tmp_path, "force_N", "angle_deg"), files=True)
+
+
+def test_a_frequency_response_is_recognised(tmp_path):
+    path = tmp_path / "figure.csv"
+    path.write_text("frequency_hz,gain_N/mm,phase_deg,coherence\n0.5,1.5,4,0.93\n1,1.5,7,0.95\n", encoding="utf-8")
+    assert is_frequency_response(path) and not is_recording(path)
+    target = as_target(path, segments=40)
+    assert target.stiffness is not None and len(target.proportional_power) == 0
+    np.testing.assert_allclose(target.stiffness.gain, [1500, 1500])
+    with pytest.raises(ValueError, match="segments=40"):
+        as_target(path)
+    spectrum = tmp_path / "spectrum.csv"
+    spectrum.write_text("frequency_hz,power\n0.5,1\n1,2\n", encoding="utf-8")
+    assert not is_frequency_response(spectrum) and not is_frequency_response(tmp_path / "none.csv")

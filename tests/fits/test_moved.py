@@ -1,0 +1,122 @@
+"""A fitted dynamic stiffness: what is stored, printed and drawn of it, from Python and from the command line."""
+
+import csv
+
+import jax
+import matplotlib.pyplot as plt
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+import jaxmuscle as jm
+from jaxmuscle.commands.main import app
+
+TASK = jm.PrescribedLength()
+F = np.geomspace(0.2, 8.0, 17)
+
+
+def response(seed=0, segments=40):
+    """That of the default muscle with errors of 2 %."""
+    with jax.enable_x64(True):
+        true = np.asarray(jm.response.dynamic_stiffness(TASK, F))
+    sd = 0.02 * np.abs(true)
+    noise = np.random.default_rng(seed).standard_normal((2, F.size))
+    return jm.FrequencyResponse(F, true + sd * (noise[0] + 1j * noise[1]), sd, name="figure")
+
+
+@pytest.fixture(scope="module")
+def fitted(tmp_path_factory):
+    """The folder that the command wrote, and what it printed."""
+    folder = tmp_path_factory.mktemp("moved")
+    response().save(folder / "figure.csv")
+    options = ["--rungs", "0", "--starts", "8", "--out", str(folder / "out")]
+    found = CliRunner().invoke(app, ["fit", str(folder / "figure.csv"), *options], env={"COLUMNS": "1000"})
+    assert found.exit_code == 0, found.output
+    return folder / "out", found.output
+
+
+def read(path):
+    with path.open() as file:
+        rows = list(csv.DictReader(file))
+    return {name: np.array([float(row[name]) for row in rows]) for name in rows[0]}
+
+
+@pytest.mark.slow
+def test_a_response_alone_is_fitted_from_the_command_line(fitted):
+    folder, said = fitted
+    assert {path.name for path in folder.iterdir()} == {"fit.json", "fit.png", "stiffness.csv"}
+    assert f"dynamic stiffness: {F.size} points from 0.2 to 8 Hz, chi2 per point" in said
+    assert "fit.json, fit.png, stiffness.csv" in said
+    result, table, given = jm.load_result(folder / "fit.json"), read(folder / "stiffness.csv"), response()
+    np.testing.assert_allclose(table["frequency_hz"], F, rtol=1e-7)
+    np.testing.assert_allclose(table["real"] + 1j * table["imaginary"], given.value, rtol=1e-7)
+    np.testing.assert_allclose(table["stderr"], given.stderr, rtol=1e-7)
+    with jax.enable_x64(True):
+        own = np.asarray(jm.response.dynamic_stiffness(result.task, F))
+    np.testing.assert_allclose(table["fitted_real"] + 1j * table["fitted_imaginary"], own, rtol=1e-6)
+    off = (given.value - own) / given.stderr
+    np.testing.assert_allclose(result.only.stiffness_residual, off, rtol=1e-5, atol=1e-5)
+    assert result.only.chi2_per_point == pytest.approx(np.sum(np.abs(off) ** 2) / (2 * F.size), rel=1e-5)
+    assert result["K_w0"].stderr is not None and "chi2 per datum" in result.verdict
+
+
+@pytest.mark.slow
+def test_its_figure_shows_gain_phase_and_residuals(fitted):
+    result, given = jm.load_result(fitted[0] / "fit.json"), response()
+    figure = result.plot()
+    panels = {ax.get_ylabel(): ax for ax in figure.axes if ax.get_ylabel()}
+    assert set(panels) == {"Gain (N/m)", "Phase (deg)", "Residual (SE)"}
+    gain, phase, rest = panels.values()
+    (points, _, _), curve = gain.containers[0], gain.lines[-1]
+    np.testing.assert_allclose(points.get_ydata(), given.gain)
+    x, y = curve.get_data()
+    np.testing.assert_allclose(np.interp(F, x, y), np.abs(result.only.stiffness), rtol=1e-6)
+    assert gain.get_xscale() == gain.get_yscale() == phase.get_xscale() == "log"
+    np.testing.assert_allclose(phase.containers[0][0].get_ydata(), given.phase)
+    lines = {line.get_label(): line.get_ydata() for line in rest.lines}
+    np.testing.assert_allclose(lines["real (spring, mass)"], np.real(result.only.stiffness_residual))
+    np.testing.assert_allclose(lines["imaginary (damping)"], np.imag(result.only.stiffness_residual))
+    assert any("dynamic stiffness: figure.csv" in text.get_text() for ax in figure.axes for text in ax.texts)
+    plt.close(figure)
+
+
+def moved(folder, seconds=40.0):
+    """A file of both channels of the simulated muscle."""
+    rng, rate = np.random.default_rng(3), 100
+    time = np.arange(round((seconds + 8) * rate) + 1) / rate
+    lines = np.arange(5, round(5 * seconds)) / seconds
+    phase = rng.uniform(0, 2 * np.pi, lines.size)
+    length = 1e-3 * np.sqrt(2 / lines.size) * np.cos(2 * np.pi * np.outer(time, lines) + phase).sum(axis=1)
+    task = TASK.with_parts(x_z=jm.model.Sampled.through(time, -length))
+    force = np.asarray(jm.simulate(task, jax.random.key(1), duration=time[-1], rate=rate).output)
+    table = np.stack([time, force, 1e3 * length], axis=1)[3 * rate :]
+    path = folder / "perturbed.csv"
+    np.savetxt(path, table, delimiter=",", header="time,force_N,displacement_mm", comments="", fmt="%.8g")
+    return path
+
+
+@pytest.mark.slow
+def test_a_file_of_both_channels_is_fitted_from_the_command_line_alone_and_with_a_hold(tmp_path):
+    path, folder = moved(tmp_path), tmp_path / "out"
+    options = ["--task", "prescribed-length", "--rungs", "0", "--starts", "8", "--quick", "--out", str(folder)]
+    said = CliRunner().invoke(app, ["fit", str(path), *options], env={"COLUMNS": "1000"})
+    assert said.exit_code == 0, said.output
+    assert {file.name for file in folder.iterdir()} == {"fit.json", "spectrum.csv", "stiffness.csv"}
+    result = jm.load_result(folder / "fit.json")
+    for name, true in {"K_w0": 200.0, "K_z0": 200.0, "C_w0": 60.0, "C_z0": 5.0}.items():
+        assert abs(result[name].value - true) < 4.5 * result[name].stderr  # 4 for chance, 0.5 for the muscle's curvature
+    figure = result.plot()
+    shown = [ax.get_ylabel() for ax in figure.axes]
+    assert {"Gain (N/m)", "Phase (deg)", "Residual (SE)", "Residual (SD)"} <= set(shown)
+    plt.close(figure)
+    hold = tmp_path / "hold.csv"
+    force = np.asarray(jm.simulate(jm.Isometric(), jax.random.key(2), duration=40.0, rate=100).output)
+    table = np.stack([np.arange(force.size) / 100, force], axis=1)[300:]
+    np.savetxt(hold, table, delimiter=",", header="time,force_N", comments="", fmt="%.8g")
+    joint = jm.fit_joint({"pull": str(path), "hold": str(hold)}, starts=8, seeds=0)
+    assert joint.parts["pull"].stiffness is not None and joint.parts["hold"].stiffness is None
+    assert "pull: dynamic stiffness: " in str(joint)
+    figure = joint.plot()
+    titles = [ax.get_title(loc="left") for ax in figure.axes]
+    assert {"pull: PrescribedLength", "hold: Isometric", "pull: dynamic stiffness"} <= set(titles)
+    plt.close(figure)

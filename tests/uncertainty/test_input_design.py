@@ -1,0 +1,318 @@
+"""Designed motions: their information against closed forms and repeats, the optimum against its theorem, limits, files."""
+
+import functools
+import json
+
+import jax
+import matplotlib.pyplot as plt
+import numpy as np
+import pages
+import pytest
+import scipy.optimize
+import scipy.stats
+from test_identify import MOVED, SEGMENTS, STEP, TRUTH, fitted
+
+import jaxmuscle as jm
+from jaxmuscle.data import FrequencyResponse
+from jaxmuscle.objective._coordinates import Coordinates
+from jaxmuscle.uncertainty import Lengthening
+from jaxmuscle.uncertainty._designs import information_of, seen_here
+from jaxmuscle.uncertainty._identifiability import fitted_problem
+from jaxmuscle.uncertainty._input_design import Experiment, steps_of
+
+BASE = ("k_w", "k_z", "c_w", "c_z")
+SECONDS, BAND = 60.0, (0.1, 5.0)
+REPEATS, DOUBTFUL = 300, 1e-4  # chance of a test to fail by scatter alone
+
+
+# --- the two-mass muscle of design section 2 at x_z = 0, by hand
+
+
+def point(p):
+    """x_w of the static equilibrium."""
+    static = lambda x: p["k_w"] * (p["x_ref_w"] ** 2 + x**2) * x + p["k_z"] * p["x_ref_z"] ** 2 * x - p["P_w"]  # noqa: E731
+    return scipy.optimize.brentq(static, 0.0, 1.0, xtol=1e-15)
+
+
+def parts(p, f):
+    """(K_z + C_z s), the active tissue's impedance, their sum."""
+    s = 2j * np.pi * f
+    active = p["m_w"] * s**2 + p["c_w"] * p["v_ref_w"] ** 2 * s + p["k_w"] * (p["x_ref_w"] ** 2 + 3 * point(p) ** 2)
+    passive = p["k_z"] * p["x_ref_z"] ** 2 + p["c_z"] * p["v_ref_z"] ** 2 * s
+    return passive, active, active + passive
+
+
+def stiffness(p, f):
+    passive, active, both = parts(p, f)
+    return active * passive / both + p["m_z"] * (2j * np.pi * f) ** 2
+
+
+def density(p, f):
+    """One-sided, of noise on both stiffnesses, band-limited at 50 Hz by a second-order Butterworth filter."""
+    passive, _, both = parts(p, f)
+    gains = passive / both, 1 - passive / both
+    scales = [p[f"noise_K_{j}"] * p[f"k_{j}"] * p[f"x_ref_{j}"] ** 2 * point(p) for j in "wz"]
+    each = sum((scale * np.abs(gain)) ** 2 for scale, gain in zip(scales, gains, strict=True))
+    return 2 * each / 100.0 / (1 + (f / 50.0) ** 4)
+
+
+VALUES = {name: float(value) for name, value in TRUTH.parameters.items()}
+
+
+def changed(log_change):
+    return VALUES | {n: VALUES[n] * np.exp(d) for n, d in zip(BASE, log_change, strict=True)}
+
+
+def slopes(f):
+    """d H / d ln parameter by central differences."""
+    columns = [(stiffness(changed(STEP * e), f) - stiffness(changed(-STEP * e), f)) / (2 * STEP) for e in np.eye(4)]
+    return np.stack(columns, axis=-1)
+
+
+def information(lengthening):
+    """`Σ_k |∂F_k|² / (variance of real or imaginary part)`, F_k = DFT / samples, from white noise of known density."""
+    f, ordinate = lengthening.frequency, np.sqrt(2 * lengthening.power) / 2
+    rows = slopes(f) * ordinate[:, None]
+    variance = density(VALUES, f) / (4 * lengthening.seconds)
+    return np.einsum("ki,kj,k->ij", rows.conj(), rows, 1 / variance).real
+
+
+def test_the_information_is_that_of_the_closed_form(x64):
+    lengthening = Lengthening.flat(1e-3, BAND, SECONDS)
+    assert len(lengthening.frequency) == 295 and lengthening.rms == pytest.approx(1e-3, rel=1e-12)
+    coordinates = Coordinates.of({n: VALUES[n] for n in BASE}, {}, dict.fromkeys(BASE, 1.0))
+    expected = information(lengthening)
+    size = np.sqrt(np.diag(expected))
+    found = lengthening.information(TRUTH, coordinates, np.zeros(4))
+    np.testing.assert_allclose(found / np.outer(size, size), expected / np.outer(size, size), atol=1e-6)
+
+
+def estimates(displacement, rate, lines, seed):
+    """ln of k_w, k_z, c_w, c_z by least squares of whitened ordinates, in repeats: white noise, coloured."""
+    rng, n = np.random.default_rng(seed), len(displacement)
+    places = np.rint(lines * SECONDS).astype(int)
+    root, moved = np.sqrt(density(VALUES, lines)), (np.fft.rfft(displacement) / n)[places]
+    reply = stiffness(VALUES, lines) * moved
+    slope = slopes(lines) * (moved / root)[:, None]
+    inverse = np.linalg.pinv(np.concatenate([slope.real, slope.imag]))
+    found = np.zeros((REPEATS, 4))
+    for x in found:
+        white = rng.standard_normal(n) * np.sqrt(rate / 2)  # one-sided density 1
+        force = reply + root * (np.fft.rfft(white) / n)[places]
+        for _ in range(8):
+            off = (stiffness(changed(x), lines) * moved - force) / root
+            x -= inverse @ np.concatenate([off.real, off.imag])
+    return found
+
+
+@functools.cache
+def designed(**given):
+    return jm.design_input(fitted(), **({"seconds": SECONDS, "band": BAND, "rate": 50.0} | given))
+
+
+@pytest.mark.slow
+def test_repeats_scatter_as_said_and_the_designed_motion_beats_the_flat_one():
+    """By the law of the ordinates alone: no prior, no fluctuations, noise known."""
+    made = designed(band=(0.1, 10.0))
+    rng = np.random.default_rng(5)
+    flat = np.zeros(made.displacement.size // 2 + 1, complex)
+    places = np.rint(made.frequency * SECONDS).astype(int)
+    flat[places] = np.exp(2j * np.pi * rng.random(len(places)))
+    flat = np.fft.irfft(flat)
+    flat *= made.rms / np.sqrt(np.mean(flat**2))
+    spread = {}
+    for name, motion, lengthening in (("flat", flat, made.even), ("designed", made.displacement, made.lengthening)):
+        np.testing.assert_allclose(lengthening.of_motion(motion).power, lengthening.power, rtol=1e-9)
+        found = estimates(motion, made.rate, made.frequency, 7)
+        expected = np.linalg.inv(information(lengthening))
+        spread[name] = np.var(found[:, 0], ddof=1)
+        low, high = scipy.stats.chi2.ppf([DOUBTFUL / 16, 1 - DOUBTFUL / 16], REPEATS - 1) / (REPEATS - 1)
+        ratio = np.var(found, axis=0, ddof=1) / np.diag(expected)
+        # ln k_w with a standard error of 0.1 is curved: its variance is up to 0.1 larger than to first order.
+        assert np.all((low < ratio) & (ratio < high + 0.1)), (name, ratio)
+    assert spread["flat"] / spread["designed"] > 1.5
+    assert made.gain > 1.5
+
+
+# --- the optimum
+
+
+def criterion(made, power):
+    """Sum of relative variances with a motion of these lines, from the same start as the design's."""
+    errors = experiment(made.quantity).errors(power)
+    return sum((errors[n] / made.values[n]) ** 2 for n in made.quantity)
+
+
+@functools.cache
+def experiment(quantity):
+    with jax.enable_x64(True):
+        return Experiment.of(fitted(), quantity, Lengthening.flat(1e-3, BAND, SECONDS), None)
+
+
+@pytest.mark.parametrize("quantity", [("K_w0",), ("C_z0",), ("K_w0", "K_z0", "C_w0", "C_z0")])
+def test_the_optimum_obeys_the_equivalence_theorem(quantity):
+    """No direction towards any step of the density lowers the variance, and those that are used leave it as it is."""
+    made = designed(quantity=quantity, spread=0.0)
+    power, step = experiment(quantity).best(1e-3, np.inf, 0.0), 1e-5
+    here = criterion(made, power)
+    np.testing.assert_allclose(power.sum(), 1e-6, rtol=1e-6)
+    for one in steps_of(made.frequency):
+        towards = (1 - step) * power + step * 1e-6 * one
+        slope = (criterion(made, towards) - here) / step / here
+        assert slope > -1e-3
+        if power[one > 0].sum() > 1e-2 * power.sum():
+            assert abs(slope) < 1e-3
+    assert here < criterion(made, made.even.power)
+
+
+def test_what_is_reported_is_of_the_motion():
+    made = designed()
+    spectrum = np.abs(np.fft.rfft(made.displacement)) / made.displacement.size
+    places = np.rint(made.frequency * SECONDS).astype(int)
+    np.testing.assert_allclose(2 * spectrum[places] ** 2, made.lengthening.power, rtol=1e-9)
+    spectrum[places] = 0
+    assert spectrum.max() < 1e-15
+    assert made.rms == pytest.approx(1e-3) == pytest.approx(np.sqrt(np.mean(made.displacement**2)))
+    assert np.sum(made.density) / SECONDS == pytest.approx(1e-6)
+    errors = experiment(("K_w0",)).errors(made.lengthening.power)
+    assert made.stderr == pytest.approx(errors)
+    assert made.gain == pytest.approx((made.flat["K_w0"] / made.stderr["K_w0"]) ** 2)
+    assert made.peak / made.rms < 2.0  # random phases: about 3.5
+
+
+def test_limits_are_kept():
+    made = designed(quantity="K_z0", peak=1.2e-3, speed=8e-3, rate=1000.0)
+    velocity = np.gradient(np.append(made.displacement, made.displacement[0]), 1e-3)
+    assert np.max(np.abs(made.displacement)) <= 1.2e-3 * (1 + 1e-9) and np.max(np.abs(velocity)) <= 8e-3 * (1 + 1e-3)
+    assert made.speed == pytest.approx(np.max(np.abs(velocity)), rel=1e-2)
+    assert max(made.peak / 1.2e-3, made.speed / 8e-3) > 0.95  # and used
+    assert made.gain > 1.0 and made.even.rms < made.rms
+
+
+def test_an_even_design_is_the_flat_one():
+    made = designed(spread=1.0)
+    assert made.gain == pytest.approx(1.0)
+    assert not made.moves and "nearly even" in str(made)
+
+
+def test_the_same_key_the_same_motion():
+    again = jm.design_input(fitted(), seconds=SECONDS, band=BAND, rate=50.0, key=jax.random.key(0))
+    np.testing.assert_array_equal(again.displacement, designed().displacement)
+    assert not np.allclose(designed(key=1).displacement, designed().displacement)
+    assert designed(key=1).stderr == pytest.approx(designed().stderr)
+
+
+@pytest.mark.slow
+def test_a_task_instead_of_a_fit():
+    """Its usual parameters are free, and there are no data: the start is the prior."""
+    made = jm.design_input(TRUTH, rate=50.0)
+    assert made.now["K_w0"] == pytest.approx(made.values["K_w0"])
+    assert made.stderr["K_w0"] >= designed().stderr["K_w0"] * (1 - 1e-6)
+    loose = jm.design_input(TRUTH.as_task(jm.PrescribedForce, P_w=TRUTH.P_w), rate=50.0)
+    assert loose.stderr == pytest.approx(made.stderr)
+
+
+# --- among the designs of a report
+
+
+@pytest.mark.slow
+def test_the_standard_designs_know_what_a_flat_motion_tells():
+    report = jm.identifiability(
+        fitted(), designs=[d for d in jm.uncertainty.standard_designs(fitted()) if d.lengthening is not None]
+    )
+    assert [d.name for d in report.designs] == MOVED
+    (small, large), made = report.designs, designed()
+    assert {"K_w0", "K_z0", "C_w0", "C_z0"} <= set(large.gained)
+    for name in ("K_w0", "K_z0", "C_w0", "C_z0"):
+        assert large.quantities[name].stderr == pytest.approx(made.flat[name], rel=1e-6)
+        assert small.quantities[name].stderr > large.quantities[name].stderr
+    assert large.task == "PrescribedLength, P_w = 5 N"
+    assert large.data.endswith("response to a lengthening of 1 mm rms, 0.1 to 5 Hz, for 60 s")
+
+
+@pytest.mark.slow
+def test_a_measured_stiffness_with_these_errors_tells_the_same(x64):
+    """The likelihood of a fit and the information of a design are one."""
+    lengthening = Lengthening.flat(1e-3, BAND, SECONDS)
+    sd = np.sqrt(density(VALUES, lengthening.frequency) / (2 * SECONDS * lengthening.power))
+    measured = FrequencyResponse(lengthening.frequency, stiffness(VALUES, lengthening.frequency), sd)
+    found = {}
+    for given in (None, measured):
+        problem, theta = fitted_problem(fitted(stiffness=given), None)
+        found[given is None] = information_of(problem, seen_here(problem, theta))
+    added = (found[False] - found[True])[:4, :4]
+    expected = information(lengthening)
+    size = np.sqrt(np.diag(expected))
+    np.testing.assert_allclose(added / np.outer(size, size), expected / np.outer(size, size), atol=1e-5)
+
+
+# --- files, words, figure, mistakes
+
+
+def test_the_file_for_the_motor(tmp_path):
+    made = designed()
+    made.save(tmp_path / "out" / "motor.csv")
+    assert [p.name for p in (tmp_path / "out").iterdir()] == ["motor.csv"]
+    lines = (tmp_path / "out" / "motor.csv").read_text().splitlines()
+    assert lines[0].startswith("# one period of a lengthening of 60 s") and lines[2] == "time_s,displacement_mm"
+    table = np.loadtxt(tmp_path / "out" / "motor.csv", delimiter=",", skiprows=3)
+    np.testing.assert_allclose(table[:, 0], made.time, atol=1e-12)
+    np.testing.assert_allclose(table[:, 1], 1e3 * made.displacement, rtol=1e-6)
+    made.save(tmp_path / "design.json")
+    kept = json.loads((tmp_path / "design.json").read_text())
+    assert kept["quantities"]["K_w0"]["stderr"] == made.stderr["K_w0"] and kept["gain"] == made.gain
+
+
+def test_the_page(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    made = pages.run("docs/perturbed-design.md", {"result": fitted(), "jm": jm})["made"]
+    plt.close("all")
+    assert made.gain == pytest.approx(designed().gain) and (tmp_path / "motor.csv").exists()
+
+
+def test_in_words():
+    text = str(designed())
+    assert max(map(len, text.splitlines())) <= 80
+    said = " ".join(text.split())
+    assert f"would tell K_w0 to {100 * designed().stderr['K_w0'] / designed().values['K_w0']:.2g} %" in said
+    assert "1 mm rms, peak" in said and "most of the motion: 81 % at 0.7 to 0.93 Hz" in said
+
+
+def test_the_figure():
+    figure = designed().plot()
+    try:
+        density_axes, errors, motion = figure.axes
+        assert [label.get_text() for label in errors.get_xticklabels()] == ["K_w0", "K_z0", "C_w0", "C_z0"]
+        assert np.max(np.abs(motion.lines[0].get_ydata())) <= 1e3 * designed().peak
+        assert density_axes.get_yscale() == "log"
+    finally:
+        plt.close(figure)
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"quantity": "K_w"}, "quantity 'K_w' is unknown: did you mean 'k_w'"),
+        ({"quantity": "m_w"}, "quantity 'm_w' is fixed: leave its parameter free"),
+        ({"rms": 0.0}, r"rms = 0.0 m must be a positive number"),
+        ({"peak": -1e-3}, r"peak = -0.001 m must be a positive number"),
+        ({"speed": 0.0}, "speed = 0.0 m/s must be a positive number"),
+        ({"band": (0.0, 5.0)}, r"band = \(0, 5\) Hz must lie above 0 Hz"),
+        ({"band": (5.0, 1.0)}, r"band = \(5, 1\) Hz must lie above 0 Hz"),
+        ({"band": (0.1, 26.0)}, r"band = \(0.1, 26.0\) Hz reaches beyond half of rate = 50.0 Hz"),
+        ({"seconds": 59.99}, "seconds = 59.99: rate = 50.0 Hz makes no whole number of samples"),
+        ({"spread": 2.0}, "spread = 2.0 must be a share"),
+        ({"rms": 1e-9}, "no motion within these limits tells of K_w0"),
+        ({"target": "other"}, "target: the fit has none called 'other'"),
+    ],
+)
+def test_mistakes(given, message):
+    with pytest.raises(ValueError, match=message):
+        designed(**given)
+
+
+def test_a_motor_needs_an_insertion_to_move():
+    loose = TRUTH.as_task(jm.PrescribedForce, P_w=0.0)
+    design = jm.Design("moved", loose, lengthening=Lengthening.flat(1e-3, BAND))
+    with pytest.raises(ValueError, match="moved: lengthening: in PrescribedForce no motor moves the insertion"):
+        jm.identifiability(fitted(segments=SEGMENTS), designs=[design])
