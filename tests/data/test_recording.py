@@ -228,7 +228,7 @@ def test_spectra_by_name():
     recording = Recording(noisy(rate=200), 200)
     for name in ("standard", "slow", "multitaper"):
         target = recording.target(settings=name)
-        assert target.settings == SpectrumSettings.named(name).replace(filter_direction="both")
+        assert target.settings == SpectrumSettings.named(name).replace(filter_direction="both", sampling="filtered")
         assert f"  spectrum  {name}\n" in str(target)
         power = recording.spectrum(target.settings).power
         np.testing.assert_allclose(target.proportional_power, power / np.sum(power), rtol=EXACT)

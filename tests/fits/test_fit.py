@@ -103,8 +103,13 @@ def test_welch_operator_refuses_a_window_shorter_than_a_segment():
 @pytest.mark.parametrize(
     ("task", "colour_free"),
     [
-        (jm.Isometric(settings=jm.SpectrumSettings(sampling="average")), False),
-        (jm.PrescribedForce(noise=jm.OrnsteinUhlenbeckNoise(), F_ext=2.0), True),
+        (jm.Isometric(settings=jm.SpectrumSettings(sampling="filtered")), False),
+        (
+            jm.PrescribedForce(
+                noise=jm.OrnsteinUhlenbeckNoise(), F_ext=2.0, settings=jm.SpectrumSettings(sampling="average")
+            ),
+            True,
+        ),
     ],
     ids=["isometric", "force"],
 )

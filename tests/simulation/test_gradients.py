@@ -15,7 +15,9 @@ TASKS = {
     "acceleration": jm.PrescribedForce(
         5.0, 1.0, noise=jm.OrnsteinUhlenbeckNoise(0.05), settings=SETTINGS, observe="acceleration"
     ),
-    "isometric": jm.Isometric(5.0, 0.003, noise=jm.OrnsteinUhlenbeckNoise(0.05), settings=SETTINGS),
+    "isometric": jm.Isometric(
+        5.0, 0.003, noise=jm.OrnsteinUhlenbeckNoise(0.05), settings=SETTINGS.replace(sampling="filtered")
+    ),
     "all": jm.Isometric(
         5.0,
         0.003,

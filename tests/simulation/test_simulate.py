@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import references
+import scipy.signal
 
 import jaxmuscle as jm
 from jaxmuscle._common.arrays import is_concrete
@@ -239,7 +240,8 @@ def test_what_does_not_stay_finite_is_named(x64):
         ({"dt": 0.0}, "must be positive"),
         ({"duration": -1.0}, "must be positive"),
         ({"duration": 1.005}, "duration = 1.005 s is not a whole number of sampling intervals"),
-        ({"sampling": "mean"}, "sampling = 'mean' must be 'instant' or 'average'"),
+        ({"sampling": "mean"}, "sampling = 'mean' must be one of instant, average, filtered"),
+        ({"sampling": "filtered", "dt": 0.01}, "dt = 0.01 s is a whole sampling interval, .*: use half of it or less"),
     ],
 )
 def test_impossible_grids_are_refused(settings, message):
@@ -265,6 +267,9 @@ def test_averages_are_those_of_a_fine_run(x64):
     instant = jm.simulate(task, KEY, duration=1.0)
     np.testing.assert_allclose(instant.output, fine[::10], rtol=1e-12)
     assert np.abs(instant.output - mean.output).max() > 1e-3
+    passed = jm.simulate(task, KEY, duration=1.0, sampling="filtered")
+    np.testing.assert_allclose(passed.output, scipy.signal.resample_poly(fine, 1, 10, padtype="line"), atol=1e-14)
+    np.testing.assert_array_equal(passed.states, mean.states)
     asked = task.with_parts(settings=jm.SpectrumSettings(sampling="average"))
     np.testing.assert_array_equal(jm.simulate(asked, KEY, duration=1.0).output, mean.output)
 

@@ -27,9 +27,11 @@ WIDTH, NARROWEST, WIDEST = 0.12, 0.05, 0.4  # of a group of frequencies: relativ
 EXCITED = 1e-6  # of the largest density of the displacement: below is the sensor's noise
 AROUND, FEWEST = 0.25, 0.1  # over which range the density of the fluctuations is averaged: relative; at least [Hz]
 NODES = 600
+HALF_STEPS = 10  # of the nonlinear muscle in a sampling interval
 
 Stiffness = Callable[[Float[np.ndarray, " frequencies"]], Complex[np.ndarray, " frequencies"]]
-Predicted = Float[np.ndarray, " times"]
+Motion = Float[np.ndarray, "3 times"]
+Reply = Float[np.ndarray, " steps"]
 
 
 class _Ordinates(NamedTuple):
@@ -47,7 +49,7 @@ def perturbed_target(
     stiffness: Stiffness | None = None,
     name: str | None = None,
     *,
-    predicted: "Callable[[PerturbedRecording, np.ndarray], Predicted] | None" = None,
+    predicted: Callable[[Motion, float], Reply] | None = None,
     settings: SpectrumSettings | str | None = None,
     provenance: str = "measured",
 ) -> Target:
@@ -63,8 +65,9 @@ def perturbed_target(
     coefficient of variation are the target's. S_E is the measured density of e.
 
     **Arguments:** `recordings` with their windows; `stiffness` H(f) [N/m] of a vector of frequencies, by default the
-    nonparametric one (`PerturbedRecording.frequency_response`); `predicted`, the response of the force to the displacement
-    at the settings' rate [N], instead of H's; others as in `Recording.target`.
+    nonparametric one (`PerturbedRecording.frequency_response`); `predicted`, which gives the response of the force [N] to
+    lengthening, its velocity and acceleration (at times so far apart [s], every second of which is asked for), by the
+    nonlinear muscle say, instead of H; others as in `Recording.target`.
     """
     settings, pieces = recorded_settings(settings), []
     for recording in recordings:
@@ -101,8 +104,7 @@ def _ordinates(recording: Any, stiffness: Stiffness, predicted: Any, settings: S
     force, inside = _even(recording.force, rate)
     moved, _ = _even(recording.displacement, rate)
     length = moved - np.mean(moved[inside])
-    reply = _response(length, stiffness, rate) if predicted is None else predicted(recording, length)
-    reply = reply - np.mean(reply[inside])
+    reply = _response(length, stiffness, predicted, rate)
     edges = (recording.force.start + inside.start / rate, recording.force.start + inside.stop / rate)
     fluctuation = Recording(force - reply, rate, unit=recording.force.unit, name=recording.name, source=recording.source,
                             start=recording.force.start, window=edges, notices=recording.notices)  # fmt: skip
@@ -112,8 +114,10 @@ def _ordinates(recording: Any, stiffness: Stiffness, predicted: Any, settings: S
     return _Ordinates(f, np.fft.rfft(taper * length[inside]), np.fft.rfft(taper * (rest - np.mean(rest))), fluctuation)
 
 
-def _response(length: Float[np.ndarray, " all"], stiffness: Stiffness, rate: float) -> Float[np.ndarray, " all"]:
-    """What the force does where it follows the lengthening linearly; right from the margin on."""
+def _response(
+    length: Float[np.ndarray, " all"], stiffness: Stiffness, predicted: Any, rate: float
+) -> Float[np.ndarray, " all"]:
+    """What the force does when it follows the lengthening; right from the margin on."""
     edge = round(0.5 * MARGIN * rate)
     ramp = np.sin(0.5 * np.pi * (np.arange(edge) + 0.5) / edge) ** 2
     tapered = length.copy()
@@ -121,11 +125,17 @@ def _response(length: Float[np.ndarray, " all"], stiffness: Stiffness, rate: flo
     tapered[-edge:] *= ramp[::-1]
     f = np.fft.rfftfreq(len(length), 1 / rate)
     where, density = scipy.signal.welch(tapered, rate, nperseg=min(1024, len(length)))
+    excited = np.interp(f, where, density) >= EXCITED * np.max(density)
+    moved = np.where(excited, np.fft.rfft(tapered), 0.0)
+    if predicted is not None:
+        fine, turn = HALF_STEPS * len(length), 2j * np.pi * f
+        motion = np.stack([HALF_STEPS * np.fft.irfft(turn**order * moved, fine) for order in (0, 1, 2)])
+        motion = np.append(motion, motion[:, :1], axis=1)  # which is periodic
+        return predicted(motion, 1 / (HALF_STEPS * rate))[:: HALF_STEPS // 2][: len(length)]
     nodes = np.sinh(np.linspace(0.0, 6.0, NODES)) / np.sinh(6.0) * rate / 2
     value = stiffness(nodes)
     smooth = scipy.interpolate.CubicSpline(nodes, np.stack([np.real(value), np.imag(value)]), axis=1)(f)
-    excited = np.interp(f, where, density) >= EXCITED * np.max(density)
-    return np.fft.irfft(np.where(excited, smooth[0] + 1j * smooth[1], 0.0) * np.fft.rfft(tapered), len(length))
+    return np.fft.irfft((smooth[0] + 1j * smooth[1]) * moved, len(length))
 
 
 def _groups(lowest: float, highest: float) -> Float[np.ndarray, " edges"]:

@@ -25,7 +25,8 @@ from ._target import Target
 from ._target_fields import Quantity
 from ._units import UNITS, known_unit
 
-RECORDED = SpectrumSettings(filter_direction="both")
+AS_RECORDED: dict[str, Any] = {"filter_direction": "both", "sampling": "filtered"}
+RECORDED = SpectrumSettings(**AS_RECORDED)
 LOWEST_RATE = 24.0  # Hz; half of it lies above bin 30
 SEGMENTS = 2  # a steady part holds at least this many
 
@@ -329,9 +330,9 @@ class Recording(eqx.Module):
 
 
 def recorded_settings(settings: SpectrumSettings | str | None) -> SpectrumSettings:
-    """As given, or those of a name, by default the standard; named ones filter as recordings are filtered."""
+    """As given, or those of a name, by default the standard; named ones filter and sample as recordings are."""
     given = isinstance(settings, SpectrumSettings)
-    return settings if given else SpectrumSettings.named(settings or "standard").replace(filter_direction="both")
+    return settings if given else SpectrumSettings.named(settings or "standard").replace(**AS_RECORDED)
 
 
 def _rate(rate: Any) -> float:

@@ -11,13 +11,13 @@ from jaxmuscle.data._as_target import as_target
 from jaxmuscle.data._target import Target
 from jaxmuscle.model._noise import AbstractNoise
 from jaxmuscle.model._noises import with_noise
-from jaxmuscle.model._rungs import RUNGS, is_base
+from jaxmuscle.model._rungs import QUIET, RUNGS, is_base
 from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.model._white_noise import BandLimitedNoise
 from jaxmuscle.objective._arguments import DT, FitOptions, at_mean, planned
 
 from ._ladder import Models, options_for
-from ._perturbed import analysed, recordings_of
+from ._perturbed import analysed, recordings_of, without_rhythm
 from ._result import FitResult
 from ._search import search
 
@@ -91,12 +91,14 @@ def fit(
         task = with_noise(task, noise, fix)
         if recordings:
             tell("taking off the response to the perturbation", 0.01)
-            target = analysed(recordings, task, options)
+            target = analysed(recordings, without_rhythm(task, options), options)
         top = _top(task, target, options, chosen=noise is not None)
         task, options = at_mean(task, target, options)
-        plan = planned(task, target, options)
-        models = Models(task, top, lambda task: planned(task, target, options_for(task, options)))
-        return search(plan, answer, models if top else None)
+        first = task if target.stiffness is None else without_rhythm(task, options)
+        lowest = 0 if first is task else QUIET
+        plan = planned(first, target, options_for(first, options))
+        models = Models(task, top, lambda task: planned(task, target, options_for(task, options)), lowest)
+        return search(plan, answer, models if top > lowest else None)
 
 
 def _top(task: AbstractTask, target: Target, options: FitOptions, *, chosen: bool) -> int:

@@ -13,7 +13,7 @@ from jaxmuscle._common.text import probability
 from jaxmuscle.model._noise import NoiseSum
 from jaxmuscle.model._parameters import HARMONIC, default
 from jaxmuscle.model._resonant_noise import ResonantNoise
-from jaxmuscle.model._rungs import RUNGS, on_rung
+from jaxmuscle.model._rungs import on_rung, rung_name
 from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.objective._arguments import FitOptions, Plan
 from jaxmuscle.objective._covariance import effective_parameters
@@ -72,11 +72,12 @@ Descend = Callable[[Plan, np.ndarray, list[Stage]], Any]
 
 
 class Models(NamedTuple):
-    """The models that may be tried: the base model, up to which rung, and how a task is fitted."""
+    """The models that may be tried: the base model, up to which rung, how a task is fitted, and from which rung on."""
 
     base: AbstractTask
     top: int
     plan_of: Callable[[AbstractTask], Plan]
+    lowest: int = 0
 
 
 def climb(first: Plan, models: Models, descend: Descend, keep: Callable[[Climbed], None]) -> tuple[Rung, ...]:
@@ -87,12 +88,12 @@ def climb(first: Plan, models: Models, descend: Descend, keep: Callable[[Climbed
     """
     tried: list[Climbed] = []
     best: Climbed | None = None
-    for number in range(models.top + 1):
+    for number in range(models.lowest, models.top + 1):
         described = best is not None and best.rung.p >= ADEQUATE
         if described and number < TREMOR:
             continue
-        plan = models.plan_of(on_rung(models.base, number)) if number else first
-        plan.problem.tell(f"model {number}: {RUNGS[number]}", 0.02)
+        plan = models.plan_of(on_rung(models.base, number)) if number > models.lowest else first
+        plan.problem.tell(f"model {number}: {rung_name(number)}", 0.02)
         stages: list[Stage] = []
         known = descend(plan, starting_points(plan.problem, plan.starts) if best is None else _warm(plan, best), stages)
         if known is None:
@@ -134,7 +135,7 @@ def rung_of(ended: Endpoint, number: int) -> Rung:
     (part,) = ended.problem.parts
     aic, parameters = criterion(ended)
     points = 0 if part.points is None else 2 * len(part.points)
-    return Rung(number, RUNGS[number], aic, parameters, verdict.chi2 / (len(part.target.bins) - 1 + points), verdict.p)
+    return Rung(number, rung_name(number), aic, parameters, verdict.chi2 / (len(part.target.bins) - 1 + points), verdict.p)
 
 
 def criterion(ended: Endpoint) -> tuple[float, float]:

@@ -12,11 +12,14 @@ from jaxmuscle.data._perturbed import PerturbedRecording
 from jaxmuscle.data._perturbed_target import perturbed_target
 from jaxmuscle.data._target import Target
 from jaxmuscle.data._two_channels import perturbed_recordings
+from jaxmuscle.model._parameters import HARMONIC
+from jaxmuscle.model._rungs import is_base
 from jaxmuscle.model._tasks import AbstractTask, PrescribedLength
 from jaxmuscle.objective._arguments import FitOptions, at_mean, planned
 from jaxmuscle.objective._least_squares import least_squares
 from jaxmuscle.objective._starts import starting_points
 from jaxmuscle.response._input_response import dynamic_stiffness
+from jaxmuscle.simulation._driven import driven
 
 STARTS, STEPS, ROUNDS, KEPT = 16, 20, 2, 2
 
@@ -28,6 +31,34 @@ def aimed(given: Any, task: AbstractTask | None = None, options: FitOptions | No
         return as_target(given)
     with jax.enable_x64(True):
         return analysed(recordings, PrescribedLength() if task is None else task, options or FitOptions())
+
+
+def without_rhythm(task: AbstractTask, options: FitOptions) -> AbstractTask:
+    """The task without its harmonic, where the fit may leave that out: nobody asked for it, and the model is a base one.
+
+    A harmonic whose frequency is sought in the noise of the spectrum bends that. The errors of what the perturbation
+    determines hold without (docs/perturbed.md).
+    """
+    asked = options.free is not None or not set(HARMONIC).isdisjoint(options.fix or {})
+    if asked or options.method != "linear" or not is_base(task):
+        return task
+    return task.replace(harmonic_amplitude=0.0)
+
+
+def seen_with(muscle: AbstractTask, recordings: Sequence[PerturbedRecording]) -> Target:
+    """The target with the response of a task's nonlinear muscle taken off; of the linear one where that cannot be had."""
+    assert isinstance(muscle, PrescribedLength)
+
+    def stiffness(f: np.ndarray) -> np.ndarray:
+        return np.asarray(dynamic_stiffness(muscle, f))
+
+    def predicted(motion: np.ndarray, interval: float) -> np.ndarray:
+        return driven(muscle, -motion, interval)
+
+    try:
+        return perturbed_target(recordings, stiffness, predicted=predicted)
+    except ValueError:  # a muscle too stiff for its steps, which so is not finite; whatever else is wrong is said below
+        return perturbed_target(recordings, stiffness)
 
 
 def recordings_of(given: object, task: AbstractTask | None = None) -> tuple[PerturbedRecording, ...]:
@@ -50,5 +81,5 @@ def analysed(recordings: Sequence[PerturbedRecording], task: AbstractTask, optio
             break
         (muscle,) = problem.tasks_at(np.asarray(problem.coordinates.theta(found.s[found.best])))
         points = found.s[np.argsort(np.where(np.isfinite(found.cost), found.cost, np.inf))[:KEPT]]
-        target = perturbed_target(recordings, lambda f, muscle=muscle: np.asarray(dynamic_stiffness(muscle, f)))
+        target = seen_with(muscle, recordings)
     return target

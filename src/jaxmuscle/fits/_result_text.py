@@ -41,8 +41,9 @@ def text_of(result: "FitResult") -> str:
     loose = {name: p for name, p in every.items() if name not in shown and p.free}
     lines += _table("not determined (near their defaults by the prior)", loose) if loose else []
     if factor := result.settings.get("carried"):
-        lines += [f"  the muscle was carried to the measured mean force: P_w, masses, stiffness and damping times "
-                  f"{factor:.3g} before the fit (mean_force=False leaves the mean out)"]  # fmt: skip
+        what = "P_w, masses, stiffness" if single and result.only.stiffness is None else "P_w, stiffness"
+        lines += [f"  the muscle was carried to the measured mean force: {what} and damping times {factor:.3g} before the "
+                  "fit (mean_force=False leaves the mean out)"]  # fmt: skip
     if result.per_newton:
         lines += ["  the scale of force is unknown, since no mean in newtons was given: what has newtons in its unit is "
                   "stated per newton of mean force"]  # fmt: skip

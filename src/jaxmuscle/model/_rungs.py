@@ -11,6 +11,12 @@ RUNGS = (
     "with tremor instead of the harmonic",
     "with a second resonance",
 )
+QUIET, NOISE_ALONE = -1, "noise alone"  # below the base model
+
+
+def rung_name(rung: int) -> str:
+    """A model of the ladder in words."""
+    return NOISE_ALONE if rung == QUIET else RUNGS[rung]
 
 
 def on_rung(task: AbstractTask, rung: int) -> AbstractTask:

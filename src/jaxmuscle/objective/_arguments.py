@@ -34,6 +34,7 @@ DT = 2.5e-3
 # muscle, which swings at 8 Hz, would pass for tremor.
 COEFFICIENTS = ("k_w", "k_z", "c_w", "c_z")
 NARROW = 0.5
+MOVED_MASS = "m_z"  # which a perturbation makes known
 
 
 def task_for(
@@ -74,13 +75,14 @@ def free_names(task: AbstractTask, free: Iterable[str] | None, fix: Mapping[str,
     """
     known, bins = task.parameter_names, len(target.bins)
     if free is None and not bins:
-        free = [n for n in COEFFICIENTS if n in known and n not in fix]
+        free = [n for n in (*COEFFICIENTS, MOVED_MASS) if n in known and n not in fix]
     if target.stiffness is not None:
         bins += 2 * len(target.stiffness.known.frequency)
     if free is None:
         # Nothing shows the frequency of what has no amplitude.
         still = [n.removesuffix("amplitude") for n in known if n.endswith("_amplitude") and not float(task[n]) > 0]
-        names = [n for n in USUALLY_FREE if n in known and n not in fix and float(task[n]) > 0
+        usual = USUALLY_FREE if target.stiffness is None else (*USUALLY_FREE, MOVED_MASS)
+        names = [n for n in usual if n in known and n not in fix and float(task[n]) > 0
                  and not n.startswith(tuple(f"{of}{what}" for of in still for what in ("frequency", "width")))]  # fmt: skip
     else:
         names = list(dict.fromkeys(free))
@@ -158,6 +160,8 @@ def at_mean(task: AbstractTask, target: Target, options: FitOptions) -> tuple[Ab
     free = (*options.also_free, level)
     moved = at_force(task, stated[0])
     factor = float(moved["m_w"]) / float(task["m_w"])
+    if target.stiffness is not None:  # masses are not in ratio to forces where displacements are known
+        moved = moved.replace(m_w=task["m_w"], m_z=task["m_z"])
     return moved, dataclasses.replace(options, mean_force=stated, also_free=free, carried=factor)
 
 

@@ -18,6 +18,7 @@ from jaxmuscle.data._recording import Recording
 from jaxmuscle.data._target import Target
 from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.response._expected import Moments, check_line, expected_moments
+from jaxmuscle.response._input_response import parts_of_stiffness
 from jaxmuscle.response._linearised import check_inputs
 from jaxmuscle.response._second_order import warn_beyond
 from jaxmuscle.spectra._bin_law import LEAST, bin_statistics, target_law, trial_samples
@@ -217,9 +218,12 @@ def _gaussian(residuals: Float[Array | np.ndarray, " rows"]) -> Scalar:
 
 
 @kept
-def _target_likelihood(task, bins, chosen, variation, samples):
-    moments = expected_moments(task, task.settings, WINDOW, samples)[0]
-    found = log_marginal(bins, moments.power[chosen], moments.line[chosen])
+def _target_likelihood(task, bins, chosen, variation, samples, stiffness):
+    moments, system = expected_moments(task, task.settings, WINDOW, samples)
+    found = jnp.zeros(()) if bins is None else log_marginal(bins, moments.power[chosen], moments.line[chosen])
+    if stiffness is not None:
+        f, measured, sd = stiffness
+        found += jnp.sum(-0.5 * ((parts_of_stiffness(task, system, f) - measured) / sd) ** 2 - jnp.log(sd))
     if variation is not None:
         found += _gaussian(((jnp.log(moments.variation) - variation[0]) / variation[1])[None]) - jnp.log(variation[1])
     return found
@@ -238,7 +242,8 @@ def log_likelihood(task: AbstractTask, data: Target | Recording) -> Scalar:
 
     A `Target` with segments: its Welch bins are correlated gamma variables about the expected spectrum (`log_density`),
     their unknown total integrated out; with its coefficient of variation as one more datum, Gaussian in the log with the
-    standard deviation that it has under this task, if it states one.
+    standard deviation that it has under this task, if it states one; and with its dynamic stiffness, Gaussian in real and
+    imaginary part with the errors that it states, if it has one.
     A `Recording`: the Whittle likelihood of the periodogram of its window, in its own units, between the first and last
     bin of the task's settings, about the *expected* periodogram of a window of that length (leakage and aliases included:
     debiased Whittle, Sykulski et al. 2019, doi:10.1093/biomet/asy071). With a line L_k in noise N_k,
@@ -256,10 +261,15 @@ def log_likelihood(task: AbstractTask, data: Target | Recording) -> Scalar:
         warn_beyond(task, data.settings if isinstance(data, Target) else None)
     if isinstance(data, Target):
         task = task.with_parts(settings=data.settings)
-        bins = jax.tree.map(jnp.asarray, measured_bins(data))
+        bins = jax.tree.map(jnp.asarray, measured_bins(data)) if len(data.bins) else None
         variation = target_variation(data, task)
         samples = jnp.asarray(trial_samples(data))
-        return _target_likelihood(as_arrays(task), bins, data.bins - data.settings.first_bin, variation, samples)
+        stiffness = None
+        if data.stiffness is not None:
+            known = data.stiffness.known
+            stiffness = as_arrays((known.frequency, np.stack([np.real(known.value), np.imag(known.value)]), known.stderr))
+        chosen = data.bins - data.settings.first_bin
+        return _target_likelihood(as_arrays(task), bins, chosen, variation, samples, stiffness)
     whole = data.fft_spectrum(task.settings.replace(window="boxcar", tapers=1))
     duration = whole.settings.length / whole.settings.rate
     return _whittle(as_arrays(task), whole.settings, jnp.asarray(whole.power), (0.0, duration))

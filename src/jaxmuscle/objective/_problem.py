@@ -20,7 +20,7 @@ from jaxmuscle.response._expected import Moments, log_variation_sd
 from jaxmuscle.response._linearised import has_response
 from jaxmuscle.simulation._batch import draw
 from jaxmuscle.simulation._grid import Grid
-from jaxmuscle.simulation._simulate import DURATION, MAX_RATE_STEP, whole
+from jaxmuscle.simulation._simulate import DURATION, MAX_RATE_STEP, steps_per_sample
 from jaxmuscle.spectra._bin_law import bin_statistics, samples_of, trial_samples
 from jaxmuscle.spectra._settings import WINDOW
 
@@ -180,9 +180,9 @@ class FitProblem:
 
     @property
     def steps_per_sample(self) -> int:
-        """Steps of the noise grid per sampling interval. Raises `ValueError` if dt does not divide it."""
-        interval = 1 / self.parts[0].target.settings.rate
-        return whole(interval / self.dt, f"dt = {self.dt} s does not divide the sampling interval {interval} s")
+        """Steps of the noise grid per sampling interval. Raises `ValueError` if dt does not fit it."""
+        settings = self.parts[0].target.settings
+        return steps_per_sample(settings.rate, self.dt, settings.sampling)
 
     def tasks_at(self, theta: Float[np.ndarray, " free"]) -> tuple[AbstractTask, ...]:
         """Every target's task with the values that θ stands for."""

@@ -1,18 +1,23 @@
 """The autocovariance of a task's sampled output under noise, in linear response and closed form."""
 
+import functools
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy
 from jaxtyping import Array, Float, Int
 
 from jaxmuscle.model._activation import ACTIVE
 from jaxmuscle.model._noise import AbstractNoise, ShapingFilter
 from jaxmuscle.model._tasks import AbstractTask
+from jaxmuscle.spectra._decimation import FINER, REACH, anti_alias
 from jaxmuscle.spectra._settings import SpectrumSettings
 
 from ._linearised import Linearisation
+
+SHORT = 4
 
 
 def _sylvester(A: Array, F: Array, Q: Array) -> Array:
@@ -111,9 +116,12 @@ def _of_groups(
 
 
 class Autocovariance(NamedTuple):
-    """r of the sampled output: r(0), and `r(lΔ) = Σ row powers[0]^(l-1) next` beyond; powers[k] = powers[0]^(2^k)."""
+    """r of the sampled output: its first q values, and `r(lΔ) = Σ row powers[0]^(l-q) next` beyond.
 
-    zero: Float[Array, ""]
+    powers[k] = powers[0]^(2^k).
+    """
+
+    head: Float[Array, " q"]
     rows: Float[Array, "channels all"]
     powers: Float[Array, "doublings all all"]
     next: Float[Array, "channels all"]
@@ -128,14 +136,15 @@ class Autocovariance(NamedTuple):
             if rows.shape[1] * columns.shape[2] >= lags - 1:
                 break
             rows = jnp.concatenate([rows, rows @ power], axis=1)
-        return jnp.concatenate([self.zero[None], jnp.sum(rows @ columns, axis=0).reshape(-1)])[:lags]
+        return jnp.concatenate([self.head, jnp.sum(rows @ columns, axis=0).reshape(-1)])[:lags]
 
     def mean_variance(self, samples: Int[Array | np.ndarray, ""] | int) -> Float[Array, ""]:
         """Variance of the mean of that many successive samples, `Σ_l 2 (n - l) / n² r(lΔ) + r(0) / n`, l = 1 ... n - 1.
 
-        Sums of `Φ^m v` and of `m Φ^m v` double their length from power to power; a block counts if its bit of n - 1 is set.
+        Sums of `Φ^m v` and of `m Φ^m v` double their length from power to power; a block counts if its bit of n - q is set.
         """
-        n, count, zero = jnp.asarray(samples, self.next.dtype), jnp.asarray(samples) - 1, jnp.zeros_like(self.next)
+        q, n, zero = len(self.head), jnp.asarray(samples, self.next.dtype), jnp.zeros_like(self.next)
+        count = jnp.maximum(jnp.asarray(samples) - q, 0)
 
         def double(sums: Array, block: tuple[Array, Array]) -> tuple[Array, None]:
             power, bit = block
@@ -148,12 +157,43 @@ class Autocovariance(NamedTuple):
 
         bits = jnp.arange(len(self.powers), dtype=count.dtype)
         sums, _ = jax.lax.scan(double, jnp.stack([zero, zero, self.next, zero]), (self.powers, bits))
-        return self.zero / n + 2 / n**2 * jnp.sum(self.rows * ((n - 1) * sums[0] - sums[1]))
+        lag = jnp.arange(q, dtype=n.dtype)
+        first = jnp.where(lag > 0, 2.0, 1.0) * jnp.maximum(n - lag, 0.0) @ self.head
+        return (first + 2 * jnp.sum(self.rows * ((n - q) * sums[0] - sums[1]))) / n**2
+
+
+@functools.cache
+def _folded() -> tuple[Float[np.ndarray, "q points"], Float[np.ndarray, "blocks short"]]:
+    """The autocorrelation ρ of the low-pass: folded, for lags 0 ... q - 1, and as it is, in blocks of 2^SHORT.
+
+    `r'(lΔ) = Σ_j ρ_j r(|l - j / FINER| Δ)`: from the lag q on, which ρ reaches, no lag is negative.
+    """
+    spread = scipy.signal.correlate(anti_alias(FINER), anti_alias(FINER))
+    q, reach = 2 * REACH, len(spread) // 2
+    spread = np.pad(spread, (0, -len(spread) % 2**SHORT))
+    head = np.zeros((q, len(spread)))
+    for lag in range(q):
+        np.add.at(head[lag], np.abs(lag * FINER + reach - np.arange(len(spread))), spread)
+    return head, spread.reshape(-1, 2**SHORT)
+
+
+def _decimated(powers: Array, rows: Array, start: Array) -> tuple[Array, Array]:
+    """The first q values of what is low-passed against aliases, and its vector at the lag q; Φ carries to the next point.
+
+    `Σ_j ρ_j Φ^j start` and `rows Φ^j start` with j = 2^SHORT a + b: few short steps, then few long ones.
+    """
+    fold, spread = (jnp.asarray(x, start.dtype) for x in _folded())
+    short, long = powers[0].T, powers[SHORT]
+    _, columns = jax.lax.scan(lambda x, _: (x @ short, x), start, length=2**SHORT)
+    blocks = jnp.tensordot(spread[::-1], columns, 1)
+    both = rows, jnp.zeros_like(start)
+    (_, carried), rows = jax.lax.scan(lambda x, block: ((x[0] @ long, x[1] @ long.T + block), x[0]), both, blocks)
+    return fold @ jnp.einsum("acn,bcn->ab", rows, columns).reshape(-1), carried
 
 
 def _autocovariance(system: Covariances, interval: float, lags: int, sampling: str) -> Autocovariance:
     """Autocovariance of the sampled output, good for that many lags; not finite where it does not decay."""
-    matrix, rows, start = system
+    (matrix, rows, start), finer = system, FINER if sampling == "filtered" else 1
     if sampling == "average":
         # Means over the interval: r(0) = 2/Δ² c ∫(Δ-s) e^(Ms) ds v and r(lΔ) = c J Φ^(l-1) J v / Δ², J = ∫ e^(Ms) ds.
         n = len(matrix)
@@ -161,12 +201,15 @@ def _autocovariance(system: Covariances, interval: float, lags: int, sampling: s
         blocks = jnp.block([[matrix * interval, eye, zero], [zero, zero, eye], [zero, zero, zero]])
         whole = jax.scipy.linalg.expm(blocks)
         step, mean, ramp = whole[:n, :n], whole[:n, n : 2 * n], whole[:n, 2 * n :]
-        first, rows, following = 2 * jnp.sum(rows @ ramp * start), rows @ mean, start @ mean.T
+        first, rows, following = 2 * jnp.sum(rows @ ramp * start)[None], rows @ mean, start @ mean.T
     else:
-        step = jax.scipy.linalg.expm(matrix * interval)
-        first, following = jnp.sum(rows * start), start @ step.T
-    count = (lags - 1).bit_length() + 1
+        step = jax.scipy.linalg.expm(matrix * (interval / finer))
+        first, following = jnp.sum(rows * start)[None], start @ step.T
+    count = (lags - 1).bit_length() + finer.bit_length()
     _, powers = jax.lax.scan(lambda power, _: (power @ power, power), step, length=count)
+    if sampling == "filtered":
+        first, following = _decimated(powers, rows, start)
+        powers = powers[finer.bit_length() - 1 :]
     # The last power carries an unstable system beyond any bound: no stationary covariance, so none is returned.
     stable = jnp.max(jnp.abs(powers[-1])) < 1e3
     return Autocovariance(jnp.where(stable, first, jnp.nan), rows, powers, jnp.where(stable, following, jnp.nan))

@@ -11,6 +11,7 @@ from jaxmuscle._common.programs import kept
 from jaxmuscle.model._signals import Constant
 from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.spectra._bin_law import bin_rows
+from jaxmuscle.spectra._decimation import FINER, anti_alias
 from jaxmuscle.spectra._settings import WINDOW, SpectrumSettings
 from jaxmuscle.spectra._welch import lowpass, spectrum_of
 
@@ -28,9 +29,13 @@ def _low_pass(settings: SpectrumSettings, turn: Complex[Array, ""]) -> Complex[A
     return gain * jnp.conj(gain) if settings.filter_direction == "both" else gain
 
 
-def _sample_mean(angle: Float[Array, ""], sampling: str) -> Complex[Array, ""]:
-    """What averaging over the sampling interval before each sample does to a line that turns by `angle` in it."""
-    return (1 - turn_of(-angle)) / times_i(angle) if sampling == "average" else jnp.ones_like(turn_of(angle))
+def _sampled(angle: Float[Array, ""], sampling: str) -> Complex[Array, ""]:
+    """What sampling does to a line that turns by `angle` in an interval: the average before each sample, or the filter."""
+    if sampling == "average":
+        return (1 - turn_of(-angle)) / times_i(angle)
+    taps = anti_alias(FINER) if sampling == "filtered" else np.ones(1)
+    turns = turn_of(angle * jnp.asarray(np.arange(len(taps)) - len(taps) // 2, angle.dtype) / FINER)
+    return jnp.asarray(taps, turns.dtype) @ turns
 
 
 class LineTable(NamedTuple):
@@ -91,7 +96,7 @@ def line_table(
     Segments are those of the window; its variance is that of so many samples from the window's begin on.
     """
     angle = 2 * jnp.pi * frequency / settings.rate
-    turn, gain = turn_of(angle), _sample_mean(angle, settings.sampling)
+    turn, gain = turn_of(angle), _sampled(angle, settings.sampling)
     start, stop = (round(edge * settings.rate) for edge in window)
     begins = start + settings.step * np.arange(settings.segments(stop - start))
     rows = jnp.asarray(bin_rows(settings), turn.dtype)
@@ -163,7 +168,7 @@ def _enveloped_line(
     first = -jnp.linalg.solve(turning, drive * pairs[0, 0])
     _, later = jax.lax.scan(advance, first, pairs)
     Y = jnp.concatenate([first[None], later])
-    around = turn_of(omega * time + jnp.asarray(harmonic.phase, dtype)) * _sample_mean(omega * interval, settings.sampling)
+    around = turn_of(omega * time + jnp.asarray(harmonic.phase, dtype)) * _sampled(omega * interval, settings.sampling)
     direct = jax.lax.complex(d * level + e * slope, e * omega * level)
     z = jnp.asarray(harmonic.amplitude, dtype) * jnp.imag((Y @ c.astype(Y.dtype) + direct) * around)
     return jnp.asarray(spectrum_of(z, settings, window).power), jnp.var(lowpass(z, settings)[start:stop])

@@ -14,6 +14,7 @@ from jaxtyping import Array, Int, PRNGKeyArray
 from jaxmuscle._common.programs import kept
 from jaxmuscle.model._noise import AbstractNoise, Realisation
 from jaxmuscle.model._tasks import AbstractTask
+from jaxmuscle.spectra._decimation import at_every, decimated
 from jaxmuscle.spectra._measures import coefficient_of_variation
 from jaxmuscle.spectra._settings import SpectrumSettings
 from jaxmuscle.spectra._welch import lowpass, welch
@@ -57,7 +58,7 @@ def _drawn(noise: AbstractNoise, key: PRNGKeyArray, seeds: Int[Array, " seeds"],
 
 
 def respond(task: AbstractTask, path: Realisation, grid: Grid, sampling: str) -> tuple[Array, Array]:
-    """States (samples, states) and sampled output (samples) of one noise path."""
+    """States (samples, states), at instants, and sampled output (samples) of one noise path."""
     from ._integrator import Forcing, observe, solve  # and diffrax, which a program that is loaded does without
 
     given = Forcing.of(task, path, grid)
@@ -67,6 +68,8 @@ def respond(task: AbstractTask, path: Realisation, grid: Grid, sampling: str) ->
     fine = Grid(grid.dt, grid.steps, 1, grid.substeps, grid.reverse)
     states = solve(task, given, fine)
     output = observe(task, given, fine, states)
+    if sampling == "filtered":
+        return states[:: grid.every], decimated(output, grid.every)
     mean = jnp.mean(0.5 * (output[1:] + output[:-1]).reshape(-1, grid.every), axis=1)
     return states[:: grid.every], jnp.concatenate([output[:1], mean])
 
@@ -90,7 +93,8 @@ def _responses(task: AbstractTask, linear: Any, path: Realisation, recipe: Recip
 def _seen(output: Array, recipe: Recipe) -> tuple[Array, Array]:
     """Welch power and coefficient of variation of what the low-pass lets through."""
     assert recipe.edges is not None
-    passed = lowpass(output[:, :: recipe.every], recipe.settings)[:, slice(*recipe.edges)]
+    at_rate = at_every(output, recipe.every, recipe.settings.sampling)
+    passed = lowpass(at_rate, recipe.settings)[:, slice(*recipe.edges)]
     return welch(passed, recipe.settings), coefficient_of_variation(passed)
 
 

@@ -1,7 +1,7 @@
 """Simulation of a task: the grid, the sub-steps that keep it stable, one seed."""
 
 import math
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, get_args
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +15,7 @@ from jaxmuscle._common.text import listed
 from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.response._equilibrium import fastest_rate
 from jaxmuscle.response._linearised import LinearTask, check_equilibrium, check_inputs, linearised
-from jaxmuscle.spectra._settings import WINDOW
+from jaxmuscle.spectra._settings import WINDOW, Sampling
 
 from ._batch import Recipe, run_seeds
 from ._grid import Grid
@@ -46,8 +46,9 @@ def simulate(
     **Arguments:** `task`; `key`, a `jax.random` key, from which seed i takes `fold_in(key, i)`; `seed`; `duration` [s];
     `dt` [s], the grid on which noise is drawn, which must divide the sampling interval; `rate` [Hz] of the samples
     returned, the task's spectrum settings by default; `substeps` per dt (by default as many as stability asks for,
-    a power of two, so that max |eigenvalue| dt / substeps <= 0.5); `sampling`, "instant" or "average" over the sampling
-    interval (the task's settings by default).
+    a power of two, so that max |eigenvalue| dt / substeps <= 0.5); `sampling`, as in `SpectrumSettings` (the task's by
+    default): "filtered" needs two steps of dt or more per sample, and the first and last 10 samples feel the ends; at a
+    higher rate than that of the settings "instant" takes its place, as the spectrum is then low-passed when it is made.
 
     **Returns:** a `Trajectory`. **Raises:** `ValueError` for a grid that does not fit, `SimulationError` if the result is
     not finite (not under a JAX transformation, where it is returned as it is).
@@ -104,20 +105,31 @@ def schedule(
     sampling: str | None,
 ) -> Schedule:
     """The plan of a simulation. Raises `ValueError` for a grid that does not fit."""
-    rate = task.settings.rate if rate is None else rate
-    sampling = task.settings.sampling if sampling is None else sampling
-    if sampling not in ("instant", "average"):
-        raise ValueError(f"sampling = {sampling!r} must be 'instant' or 'average'")
+    own = task.settings
+    if sampling is None:  # a finer run is low-passed when its spectrum is made
+        sampling = "instant" if own.sampling == "filtered" and rate is not None and rate > own.rate else own.sampling
+    rate = own.rate if rate is None else rate
+    if sampling not in get_args(Sampling):
+        raise ValueError(f"sampling = {sampling!r} must be one of {', '.join(get_args(Sampling))}")
     if not (dt > 0 and rate > 0 and duration > 0):
         raise ValueError(f"dt = {dt} s, rate = {rate} Hz and duration = {duration} s must be positive")
-    every = whole(1 / (rate * dt), f"dt = {dt} s does not divide the sampling interval {1 / rate} s: use one of "
-                  f"{', '.join(f'{1 / rate / n:.6g}' for n in (1, 2, 4, 5, 10, 20))} s")  # fmt: skip
+    every = steps_per_sample(rate, dt, sampling)
     samples = whole(duration * rate, f"duration = {duration} s is not a whole number of sampling intervals {1 / rate} s")
     if all_concrete(task):
         task.check_step(dt)
     if substeps is None:
         substeps = stable_substeps(task, dt, duration) if all_concrete(task) else 1
     return Schedule(Grid(dt, samples * every, every, substeps, reverse=not all_concrete(task)), sampling, rate)
+
+
+def steps_per_sample(rate: float, dt: float, sampling: str) -> int:
+    """Steps of dt in a sampling interval. Raises `ValueError` if dt does not divide it, or leaves nothing to be filtered."""
+    choices = f"{', '.join(f'{1 / rate / n:.6g}' for n in (1, 2, 4, 5, 10, 20))} s"
+    every = whole(1 / (rate * dt), f"dt = {dt} s does not divide the sampling interval {1 / rate} s: use one of {choices}")
+    if every == 1 and sampling == "filtered":
+        raise ValueError(f"dt = {dt} s is a whole sampling interval, but sampling = 'filtered' needs points between the "
+                         f"samples: use half of it or less, or sampling = 'instant'")  # fmt: skip
+    return every
 
 
 def whole(value: float, message: str) -> int:

@@ -15,6 +15,7 @@ from jaxmuscle._common.environment import versions
 from jaxmuscle.model._parameters import PARAMETERS
 from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.response._expected import linear_spectrum
+from jaxmuscle.spectra._decimation import at_every
 from jaxmuscle.spectra._mean import SpectrumEstimate, estimated
 from jaxmuscle.spectra._settings import WINDOW, SpectrumSettings
 from jaxmuscle.spectra._welch import Spectrum, lowpass, spectrum_of
@@ -28,8 +29,8 @@ class Trajectory(eqx.Module):
 
     **Fields:** `task`; `states` [m, m/s], shape (seeds, samples, states) or (samples, states); `output` [N or m], shape
     (seeds, samples) or (samples,); `seeds`, the seed numbers; `rate` [Hz]; `dt` [s], `substeps` (integration steps per
-    dt); `sampling`, "instant" or "average" over the sampling interval; `linear`, the output of the linearised task on the
-    same noise paths, or None.
+    dt); `sampling` of the output, as in `SpectrumSettings` (states are always those of the instant); `linear`, the output
+    of the linearised task on the same noise paths, or None.
     """
 
     task: AbstractTask
@@ -81,7 +82,8 @@ class Trajectory(eqx.Module):
 
         Its coefficient of variation is what a `Target` states and what a fit compares (see `Recording.filtered`).
 
-        **Arguments:** `settings` (the task's by default; their rate must divide this trajectory's); `window` [s].
+        **Arguments:** `settings` (the task's by default; their rate must divide this trajectory's, and if it is lower,
+        `sampling="filtered"` low-passes before it); `window` [s].
         """
         settings = self.task.settings if settings is None else settings
         passed = lowpass(self._at_rate_of(settings, self.output), settings)
@@ -133,7 +135,7 @@ class Trajectory(eqx.Module):
             raise ValueError(
                 f"a spectrum at {settings.rate} Hz needs a trajectory at a multiple of that rate, this has {self.rate} Hz"
             )
-        return output[..., ::every]
+        return at_every(output, every, settings.sampling)
 
     def plot(self, ax: Any = None, *, window: tuple[float, float] | None = None) -> Any:
         """Output against time, or in a window [s]: one line, or mean and quantile band over seeds. Returns the axes."""

@@ -18,7 +18,7 @@ from jaxmuscle._common.text import choices
 Window = Literal["hann", "hamming", "boxcar", "dpss"]
 Detrend = Literal["constant", "linear", "none"]
 FilterDirection = Literal["forward", "both"]
-Sampling = Literal["instant", "average"]
+Sampling = Literal["instant", "average", "filtered"]
 _CHOICES = {"window": Window, "detrend": Detrend, "filter_direction": FilterDirection, "sampling": Sampling}
 
 
@@ -64,7 +64,7 @@ class SpectrumSettings(eqx.Module):
     | `detrend` | what is removed from each segment: its mean, its straight line, or nothing |
     | `filter_order`, `filter_cutoff` | Butterworth low-pass; cut-off [Hz], or `None` for no filter |
     | `filter_direction` | `"forward"` (from rest), or `"both"` (zero phase, for recordings) |
-    | `sampling` | `"instant"`, or the `"average"` over a sampling interval (an integrating sensor) |
+    | `sampling` | `"instant"`, the `"average"` over a sampling interval, or `"filtered"`, before, against aliases |
 
     **Raises:** `ValueError` naming the field, its value and the remedy.
     """

@@ -1,0 +1,232 @@
+"""Fits of perturbed muscles, to data that a simulation written here makes: the numbers, their errors, and what follows."""
+
+import dataclasses
+
+import jax
+import numpy as np
+import pytest
+import scipy.signal
+from scipy.interpolate import make_interp_spline
+from scipy.optimize import brentq
+
+import jaxmuscle as jm
+from jaxmuscle.fits._perturbed import seen_with
+
+# The bundled knee extension as fitted, with masses of 0.5 kg.
+TRUE = {"k_w": 4.6e5, "k_z": 7.8e5, "c_w": 114.0, "c_z": 1.8, "P_w": 5.0, "m_w": 0.5, "m_z": 0.5}
+NOISE = {"K_w": 0.27, "K_z": 0.002}
+X_REF, RATE, SECONDS = 0.02, 500, 64
+WHOLE = {"K_w0": TRUE["k_w"] * X_REF**2, "K_z0": TRUE["k_z"] * X_REF**2, "C_w0": TRUE["c_w"], "C_z0": TRUE["c_z"]}
+
+
+def muscle_force(x, generator, noise=True):
+    """F_ext of the nonlinear muscle, x_z prescribed: Runge-Kutta steps of 2 ms, noise by scipy's Butterworth filter."""
+    count, step = len(x), 1 / RATE
+    shaping = scipy.signal.butter(2, 50 / (RATE / 2))
+    kicks = generator.normal(size=(2, count + 1000)) * np.array([[NOISE["K_w"]], [NOISE["K_z"]]]) * np.sqrt(RATE / 100)
+    dk = scipy.signal.lfilter(*shaping, kicks)[:, 1000:] * noise * np.array([[WHOLE["K_w0"]], [WHOLE["K_z0"]]])
+    half = np.arange(2 * count - 1) * step / 2
+    motion = make_interp_spline(np.arange(count) * step, x, k=5)
+    x, v, a = (motion(half, order).tolist() for order in (0, 1, 2))
+    dw, dz = (np.interp(half, np.arange(count) * step, row).tolist() for row in dk)
+    k_w, k_z, c_w, c_z, pull = (TRUE[n] for n in ("k_w", "k_z", "c_w", "c_z", "P_w"))
+
+    def passive(i, w, u):
+        return c_z * (1 + v[i] ** 2) * (v[i] - u) + (k_z * (X_REF**2 + x[i] ** 2) + dz[i]) * (x[i] - w)
+
+    def slope(i, w, u):
+        active = c_w * (1 + u**2) * u + (k_w * (X_REF**2 + w**2) + dw[i]) * w
+        return (pull - active + passive(i, w, u)) / TRUE["m_w"]
+
+    w = brentq(lambda w: k_w * (X_REF**2 + w**2) * w + k_z * X_REF**2 * w - pull, 0.0, 0.1)
+    u, force = 0.0, np.empty(count)
+    for n in range(count):
+        i = 2 * n
+        force[n] = -(passive(i, w, u) + TRUE["m_z"] * a[i])
+        if n < count - 1:
+            b1, a1 = slope(i, w, u), u
+            b2, a2 = slope(i + 1, w + step / 2 * a1, u + step / 2 * b1), u + step / 2 * b1
+            b3, a3 = slope(i + 1, w + step / 2 * a2, u + step / 2 * b2), u + step / 2 * b2
+            b4, a4 = slope(i + 2, w + step * a3, u + step * b3), u + step * b3
+            w, u = w + step / 6 * (a1 + 2 * a2 + 2 * a3 + a4), u + step / 6 * (b1 + 2 * b2 + 2 * b3 + b4)
+    return force
+
+
+def recorded(seed, rms=1e-3, top=5.0):
+    """A minute with the insertion moved by noise up to `top` Hz; lengthening is -x_z."""
+    generator = np.random.default_rng(seed)
+    low = scipy.signal.butter(4, top / (RATE / 2), output="sos")
+    x = scipy.signal.sosfiltfilt(low, generator.normal(size=SECONDS * RATE + 4000))[2000:-2000]
+    x *= rms / np.std(x)
+    return jm.PerturbedRecording.from_array(muscle_force(x, generator), -x, RATE, positive="lengthening", name="minute")
+
+
+@pytest.fixture(scope="module")
+def minute():
+    return recorded(5)
+
+
+@pytest.fixture(scope="module")
+def result(minute):
+    return jm.fit(jm.PrescribedLength(), minute)
+
+
+@pytest.mark.slow
+def test_stiffness_and_damping_are_known(result):
+    """The issue's bounds: within three stated errors, which are at most 15, 3, 8 and 8 %."""
+    assert result.success and result.adequate
+    for (name, true), most in zip(WHOLE.items(), (0.15, 0.03, 0.08, 0.08), strict=True):
+        found = result[name]
+        assert abs(found.value - true) < 3 * found.stderr, name
+        assert found.stderr < most * true, name
+        low, high = found.interval
+        assert low < found.value < high
+    assert abs(result["m_z"].value - TRUE["m_z"]) < 3 * result["m_z"].stderr
+    assert result["m_w"].value == TRUE["m_w"]  # a fact, not carried with the mean force
+
+
+@pytest.mark.slow
+def test_what_a_fit_says_and_keeps(result, tmp_path):
+    text = str(result)
+    assert "Describes the data: chi2 per datum" in text and "PrescribedLength" in text
+    result.save(tmp_path / "fit.json")
+    again = jm.load_result(tmp_path / "fit.json")
+    assert str(again) == text
+    np.testing.assert_array_equal(again.only.stiffness, result.only.stiffness)
+    np.testing.assert_array_equal(again.target.stiffness.value, result.target.stiffness.value)
+    assert len(result.ladder) == 1 and result.ladder[0].model == "noise alone"
+
+
+@pytest.mark.slow
+def test_further_questions_take_it(result):
+    known = jm.identifiability(result)
+    stderr = {n: result[n].stderr / result[n].value for n in ("k_w", "k_z", "c_w")}
+    text = str(known)
+    assert all(name in text for name in stderr)
+    profile = jm.profile(result, "k_z")
+    low, high = result["k_z"].interval
+    np.testing.assert_allclose((profile.low, profile.high), (low, high), rtol=0.02)
+    assert jm.goodness(result, replicates=99).p_value > 0.001
+
+
+@pytest.mark.slow
+def test_the_fitted_muscle_sees_what_it_was_fitted_to(minute, result):
+    """The response that was taken off is that of the muscle found: seen with it the numbers are the same."""
+    with jax.enable_x64(True):
+        again = seen_with(result.task, (minute,))
+    off = (again.stiffness.value - result.target.stiffness.value) / result.target.stiffness.stderr
+    assert np.max(np.abs(off)) < 0.2
+
+
+def test_the_estimate_of_the_stiffness_is_not_biased(minute):
+    """Seen with the true muscle, whatever window, the points scatter about the truth by what they state."""
+    task = jm.PrescribedLength(harmonic=jm.Harmonic(amplitude=0.0)).replace(**TRUE)
+    with jax.enable_x64(True):
+        target = seen_with(task, (minute,))
+        true = np.asarray(jm.dynamic_stiffness(task, target.stiffness.frequency))
+    z = (target.stiffness.value - true) / target.stiffness.stderr
+    chi2, count = np.sum(np.abs(z) ** 2), 2 * len(z)
+    low, high = scipy.stats.chi2.ppf([5e-5, 1 - 5e-5], count)
+    assert low < chi2 < 1.15 * high  # the density of the noise, from 24 ordinates at least, is known to a tenth or so
+    assert target.stiffness.frequency[0] < 0.1 and target.mean_force is not None
+    # The displacement makes most of the force: without it the fluctuations are left.
+    assert np.std(minute.force.samples) > 1.5 * target.coefficient_of_variation[0] * target.mean_force[0]
+
+
+def test_a_window_needs_what_lies_before_it(minute):
+    short = jm.PerturbedRecording.from_array(
+        minute.force.whole[: 9 * RATE], minute.displacement.whole[: 9 * RATE], RATE, positive="lengthening"
+    )
+    with pytest.raises(ValueError, match=r"window.*less than 8 s besides 2 s before and after.*record longer"):
+        short.target()
+
+
+def test_a_task_that_cannot_be_moved(minute):
+    target = minute.target()
+    with pytest.raises(ValueError, match=r"dynamic stiffness, which PrescribedForce cannot give.*PrescribedLength"):
+        jm.fit(jm.PrescribedForce(), target)
+    assert isinstance(jm.task_for(target), jm.PrescribedLength)
+
+
+def test_a_target_keeps_its_stiffness(minute, tmp_path):
+    target = minute.target()
+    target.save(tmp_path / "target.toml")
+    again = jm.load_target(tmp_path / "target.toml")
+    np.testing.assert_array_equal(again.stiffness.value, target.stiffness.value)
+    np.testing.assert_array_equal(again.proportional_power, target.proportional_power)
+
+
+@pytest.fixture(scope="module")
+def published():
+    """A figure of gain, phase and coherence, from 40 averages, of the true muscle."""
+    f = np.geomspace(0.1, 10.0, 25)
+    task = jm.PrescribedLength().replace(**TRUE)
+    with jax.enable_x64(True):
+        true = np.asarray(jm.dynamic_stiffness(task, f))
+    generator, averages = np.random.default_rng(2), 40
+    coherence = np.full(25, 0.95)
+    sd = np.abs(true) * np.sqrt((1 - coherence) / (2 * averages * coherence))
+    seen = true + sd * (generator.normal(size=25) + 1j * generator.normal(size=25))
+    phase = np.degrees(np.angle(seen))
+    return jm.FrequencyResponse.from_gain(f, np.abs(seen), phase, coherence=coherence, segments=averages, name="published")
+
+
+@pytest.mark.slow
+def test_a_published_response_alone(published):
+    result = jm.fit(jm.PrescribedLength().replace(P_w=5.0), published)
+    assert result.success and result.adequate and result.chi2_per_bin is None
+    assert result.target.bins.size == 0 and "mean" not in result.derived and "harmonic_frequency" not in result.free
+    for name, true in WHOLE.items():
+        assert result[name].stderr is None or abs(result[name].value - true) < 4 * result[name].stderr
+    assert result["K_z0"].stderr < 0.05 * WHOLE["K_z0"]
+
+
+@pytest.mark.slow
+def test_a_published_response_with_a_spectrum_of_the_same_muscle(published):
+    still = jm.Isometric(harmonic=jm.Harmonic(amplitude=0.0)).replace(**TRUE, noise_K_w=NOISE["K_w"], noise_K_z=NOISE["K_z"])
+    power = np.asarray(jm.expected_spectrum(still).power)
+    spectrum = jm.Target("held", power, segments=40, settings=still.settings)
+    moved = still.as_task(jm.PrescribedLength, P_w=still.P_w)
+    tasks = {"moved": moved, "held": still}
+    result = jm.fit_joint({"moved": published, "held": spectrum}, tasks=tasks)
+    assert result.success and result.adequate
+    alone = jm.fit(moved, published)
+    for name in ("K_w0", "K_z0", "C_w0"):
+        assert abs(result[name].value - WHOLE[name]) < 4 * result[name].stderr
+        assert result[name].stderr < 1.02 * alone[name].stderr
+
+
+def test_likelihood_of_a_stiffness(published):
+    """Its Gaussian law, written again; and the gradient, forward, reverse and by differences."""
+    target = jm.Target("published", None, stiffness=published)
+    task = jm.PrescribedLength().replace(**TRUE)
+    with jax.enable_x64(True):
+
+        def height(k_z):
+            return jm.log_likelihood(task.replace(k_z=k_z), target)
+
+        model = np.asarray(jm.dynamic_stiffness(task, published.frequency))
+        z = (model - published.value) / published.stderr
+        expected = -0.5 * np.sum(np.abs(z) ** 2) - 2 * np.sum(np.log(published.stderr))
+        np.testing.assert_allclose(height(TRUE["k_z"]), expected, rtol=1e-10)
+        forward, reverse = jax.jacfwd(height)(TRUE["k_z"]), jax.grad(height)(TRUE["k_z"])
+        step = 1e-3 * TRUE["k_z"]
+        between = (height(TRUE["k_z"] + step) - height(TRUE["k_z"] - step)) / (2 * step)
+    np.testing.assert_allclose(reverse, forward, rtol=1e-9)
+    np.testing.assert_allclose(between, forward, rtol=1e-4)
+
+
+def test_points_of_no_use_are_left_out(published):
+    stderr = np.array(published.stderr)
+    stderr[3] = np.inf
+    open_point = dataclasses.replace(published, stderr=stderr) if dataclasses.is_dataclass(published) else published
+    assert len(open_point.known.frequency) == len(published.frequency) - 1
+
+
+@pytest.mark.slow
+def test_two_minutes_know_more(minute, result):
+    both = jm.fit(jm.PrescribedLength(), [minute, recorded(6)])
+    assert both.success and both.adequate
+    for name, true in WHOLE.items():
+        assert abs(both[name].value - true) < 3.9 * both[name].stderr
+        assert 0.5 < both[name].stderr / result[name].stderr < 0.95  # 1 / √2 is expected
