@@ -22,7 +22,8 @@ EVENTS = {
     "/jax/compilation_cache/cache_retrieval_time_sec": "load",  # a compiled program read from the cache
 }
 LONGEST_FIRST = (
-    "test_pages", "test_perturbed_fit", "test_moved", "test_input_design", "test_fit", "test_hill", "test_expected", "test_joint", "test_trials", "test_goodness", "test_ensemble",
+    "test_pages", "test_perturbed_fit", "test_moved", "test_input_design", "test_fit", "test_hill", "test_expected",
+    "test_joint", "test_trials", "test_goodness", "test_ensemble",
     "test_several", "test_compare", "test_posterior", "test_study", "test_control", "test_slow", "test_adequacy",
     "test_ladder", "test_rungs", "test_gradients", "test_drive", "test_tremor", "test_pink", "test_simulate",
     "test_reproduce", "test_scaling", "test_identify", "test_likelihood", "test_cli",
