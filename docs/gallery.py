@@ -128,7 +128,7 @@ SECTIONS = (
         Shown("gallery/moments.png", "summary.plot()", "Moments of 2000 seeds, none of them kept", "ensembles.md"),
         Shown("gallery/sweep.png", "ax", "A sweep: three dampings, the same noise", "ensembles.md"),
         Shown("gallery/sensitivity.png", "jm.sensitivity(result.task).plot()", "Every bin, every parameter", "model.md"),
-        Shown("gallery/static.png", "jm.response.static_characteristics(result.task).plot()",
+        Shown("gallery/static.png", "jm.static_characteristics(result.task).plot()",
               "Stiffness, damping, force at rest", "scaling.md"),
     )),
     Section("How sure is it, and is it right", SURE, (

@@ -266,7 +266,7 @@ def test_separate_parameters_are_eliminated(x64):
 @pytest.mark.slow
 def test_the_load_keeps_the_operating_point(x64):
     result = fitted()
-    design = next(d for d in jm.uncertainty.standard_designs(result) if "displacement" in d.name)
+    design = next(d for d in jm.standard_designs(result) if "displacement" in d.name)
     assert isinstance(design.task, jm.PrescribedForce)
     held, moving = np.asarray(equilibrium(TRUTH)), np.asarray(equilibrium(design.task))
     np.testing.assert_allclose(moving, [held[0], 0, 0, 0], atol=1e-9)
@@ -294,7 +294,7 @@ def test_the_load_keeps_the_operating_point(x64):
 )  # fmt: skip
 @pytest.mark.slow
 def test_the_usual_designs(result, names):
-    designs = jm.uncertainty.standard_designs(result())
+    designs = jm.standard_designs(result())
     assert [design.name for design in designs] == names
     for design in designs:
         assert (design.separate == AMPLITUDES) is design.name.startswith("a second force level")
@@ -448,7 +448,7 @@ def test_a_design_keeps_its_promise(x64):
     result, count = fitted(), 200
     promised = next(d for d in jm.identifiability(result).designs if "displacement" in d.name)
     assert {"K_w0", "K_z0", "C_w0", "C_z0"} <= set(promised.gained)
-    held = next(d.task for d in jm.uncertainty.standard_designs(result) if "displacement" in d.name)
+    held = next(d.task for d in jm.standard_designs(result) if "displacement" in d.name)
     tasks = {"force": TRUTH, "displacement": held}
     targets = {name: jm.Target(name, np.asarray(jm.expected_spectrum(task).proportional), segments=SEGMENTS,
                                quantity=name) for name, task in tasks.items()}  # fmt: skip
@@ -479,7 +479,7 @@ def test_a_design_keeps_its_promise(x64):
 def test_a_joint_fit_reports_the_promised_errors():
     result = fitted()
     promised = next(d for d in jm.identifiability(result).designs if "displacement" in d.name)
-    held = next(d.task for d in jm.uncertainty.standard_designs(result) if "displacement" in d.name)
+    held = next(d.task for d in jm.standard_designs(result) if "displacement" in d.name)
     power = np.asarray(jm.expected_spectrum(held).proportional)
     targets = {"force": result.target, "displacement": jm.Target("x", power, segments=SEGMENTS, quantity="displacement")}
     joint = jm.fit_joint(targets, tasks={"force": TRUTH, "displacement": held}, starts=4, seeds=0)

@@ -217,7 +217,7 @@ def test_a_task_instead_of_a_fit():
 
 @pytest.mark.slow
 def test_the_standard_designs_know_what_a_flat_motion_tells():
-    designs = [d for d in jm.uncertainty.standard_designs(fitted()) if d.lengthening is not None]
+    designs = [d for d in jm.standard_designs(fitted()) if d.lengthening is not None]
     report = jm.identifiability(fitted(), designs=designs)
     assert [d.name for d in report.designs] == MOVED
     (small, large), made = report.designs, designed()
