@@ -138,7 +138,7 @@ SECTIONS = (
         Shown("gallery/predictive.png", "found.plot_predictive()", "The spectra that it predicts", "uncertainty.md"),
         Shown("identifiability.png", "jm.identifiability(result).plot()", "What further measurements would determine",
               "identifiability.md"),
-        Shown("perturbed-design.png", "jm.design_input(result).plot()", "A motion made to measure stiffness",
+        Shown("gallery/designed_input.png", "jm.design_input(result).plot()", "A motion made to measure stiffness",
               "perturbed-design.md"),
         Shown("gallery/goodness.png", "jm.goodness(result).plot()", "Residuals, and what is usual", "goodness.md"),
         Shown("gallery/bootstrap.png", "jm.bootstrap(result).plot()", "Refits against the stated errors", "goodness.md"),

@@ -171,7 +171,7 @@ def test_refits_reach_the_minima_of_a_full_search(x64):
     problem = reopened(fits([power / power.sum()], free=free, base=base)[0])
     (moments,), (part,) = repeated(problem, (base,), 20), problem.parts
     drawn = drawn_spectra(Likelihood.of(problem).bins[0], part.target, moments, jax.random.key(3))
-    found = refitted(problem, problem.theta_of((base,)), Drawn((drawn,), (power / power.sum(),), (None,), (None,)))
+    found = refitted(problem, problem.theta_of((base,)), Drawn((drawn,), (power / power.sum(),), *((None,),) * 3))
     full = fits(list(drawn), free=free, base=base)
     mine = numbers_of(residuals_of(drawn, found.expected[0], part.target, found.share[0]))["chi2_per_bin"]
     theirs = np.array([result.chi2_per_bin for result in full])

@@ -123,7 +123,7 @@ def test_the_estimate_of_the_stiffness_is_not_biased(minute):
     task = jm.PrescribedLength(harmonic=jm.Harmonic(amplitude=0.0)).replace(**TRUE)
     with jax.enable_x64(True):
         target = seen_with(task, (minute,))
-        true = np.asarray(jm.dynamic_stiffness(task, target.stiffness.frequency))
+        true = np.asarray(jm.response.dynamic_stiffness(task, target.stiffness.frequency))
     z = (target.stiffness.value - true) / target.stiffness.stderr
     chi2, count = np.sum(np.abs(z) ** 2), 2 * len(z)
     low, high = scipy.stats.chi2.ppf([5e-5, 1 - 5e-5], count)
@@ -162,7 +162,7 @@ def published():
     f = np.geomspace(0.1, 10.0, 25)
     task = jm.PrescribedLength().replace(**TRUE)
     with jax.enable_x64(True):
-        true = np.asarray(jm.dynamic_stiffness(task, f))
+        true = np.asarray(jm.response.dynamic_stiffness(task, f))
     generator, averages = np.random.default_rng(2), 40
     coherence = np.full(25, 0.95)
     sd = np.abs(true) * np.sqrt((1 - coherence) / (2 * averages * coherence))
@@ -205,7 +205,7 @@ def test_likelihood_of_a_stiffness(published):
         def height(k_z):
             return jm.log_likelihood(task.replace(k_z=k_z), target)
 
-        model = np.asarray(jm.dynamic_stiffness(task, published.frequency))
+        model = np.asarray(jm.response.dynamic_stiffness(task, published.frequency))
         z = (model - published.value) / published.stderr
         expected = -0.5 * np.sum(np.abs(z) ** 2) - 2 * np.sum(np.log(published.stderr))
         np.testing.assert_allclose(height(TRUE["k_z"]), expected, rtol=1e-10)

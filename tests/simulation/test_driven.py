@@ -48,7 +48,7 @@ def at_lines(signal, lines, rate):
 
 def test_the_stiffness_is_that_of_two_tissues_in_series():
     with jax.enable_x64(True):
-        found = np.asarray(jm.dynamic_stiffness(TASK, FREQUENCY))
+        found = np.asarray(jm.response.dynamic_stiffness(TASK, FREQUENCY))
     np.testing.assert_allclose(found, formula(FREQUENCY), rtol=1e-10)
 
 
@@ -56,7 +56,7 @@ def test_forward_reverse_and_differences_agree():
     with jax.enable_x64(True):
 
         def real(k_w):
-            return jnp.sum(jnp.abs(jm.dynamic_stiffness(TASK.replace(k_w=k_w), FREQUENCY)) ** 2)
+            return jnp.sum(jnp.abs(jm.response.dynamic_stiffness(TASK.replace(k_w=k_w), FREQUENCY)) ** 2)
 
         forward, reverse = jax.jacfwd(real)(K_W), jax.grad(real)(K_W)
         step = 1e-4 * K_W
@@ -133,9 +133,9 @@ def test_the_density_of_the_noise():
 
 def test_what_has_no_stiffness_is_refused():
     with pytest.raises(ValueError, match=r"PrescribedForce, in which the insertion is not moved.*as_task"):
-        jm.dynamic_stiffness(jm.PrescribedForce(), FREQUENCY)
+        jm.response.dynamic_stiffness(jm.PrescribedForce(), FREQUENCY)
     moving = TASK.with_parts(x_z=SmoothStep(0.01, start=4.0, rise=10.0))
     with pytest.raises(ValueError, match="x_z of this PrescribedLength moves"):
-        jm.dynamic_stiffness(moving, FREQUENCY)
+        jm.response.dynamic_stiffness(moving, FREQUENCY)
     with pytest.raises(ValueError, match=r"WhiteNoise on K_z .* PrescribedLength"):
         jm.PrescribedLength(noise=jm.WhiteNoise({"K_z": 0.01}))

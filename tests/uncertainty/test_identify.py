@@ -347,16 +347,16 @@ def test_the_report_in_words():
     assert "the displacement under a load of 2.18 N would determine" in said and f"K_w0 to {percent}" in said
     assert "noise_K_w, noise_K_z, harmonic_amplitude of its own" in said
     assert "k_w to" not in said  # K_w0 says it
-    assert "of 8 directions stay open" in said[-400:]
+    assert said.endswith("nothing stays open")  # with the insertion moved by 1 mm
     for sentence in report().present.undetermined:
         assert sentence in said
 
 
 def test_the_numbers_in_the_table_are_those_of_the_report():
-    first, second = (line.split() for line in str(report()).splitlines() if line.split()[:1] == ["K_w0"])
+    first, *others = (line.split() for line in str(report()).splitlines() if line.split()[:1] == ["K_w0"])
     known = [o.quantities["K_w0"] for o in (report().present, *report().designs)]
-    assert first[:4] == second[:4]
-    cells = first[3:] + second[4:]
+    assert all(first[:4] == other[:4] for other in others)
+    cells = [*first[3:], *(cell for other in others for cell in other[4:])]
     assert [cell.startswith("(") for cell in cells] == [not k.determined for k in known]
     for cell, k in zip(cells, known, strict=True):
         assert float(cell.strip("()")) == pytest.approx(100 * k.stderr / k.value, rel=0.06)  # two digits
