@@ -166,7 +166,7 @@ def _stage(problem: FitProblem, stages: list[Stage], objective: Residuals, name:
     return show
 
 
-Known = tuple[FitProblem, list[Float[np.ndarray, " bins"]]]
+Known = tuple[FitProblem, list[Float[np.ndarray, " _"]]]
 
 
 def _descended(plan: Plan, points: np.ndarray, stages: list[Stage]) -> Known | None:
@@ -260,7 +260,7 @@ def _montecarlo(plan: Plan, points: np.ndarray, stages: list[Stage]) -> None:
                   report=_stage(problem, stages, objective, "polishing", (0.4, 0.8), 15))  # fmt: skip
 
 
-def _known(problem: FitProblem, stage: Stage) -> tuple[FitProblem, list[Float[np.ndarray, " bins"]]]:
+def _known(problem: FitProblem, stage: Stage) -> tuple[FitProblem, list[Float[np.ndarray, " _"]]]:
     """What the best point says of how the data scatter: the problem with it, and the line's share of each bin."""
     seen = seen_best(stage.objective, stage.minima)
     shares = [np.clip(np.nan_to_num(moments.line / moments.power), 0.0, 1.0) for moments in seen.moments]
