@@ -1,6 +1,6 @@
 """Perturbation experiments, simulated with NumPy alone, and what is found in them; the tables of docs/perturbed.md.
 
-    python benchmarks/perturbed.py classical|amplitude|reflex|inertia|seconds [--count N]
+    python benchmarks/perturbed.py classical|amplitude|reflex|inertia|seconds|coverage|time [--count N]
 
 Takes a minute to a quarter of an hour each.
 """
@@ -13,12 +13,14 @@ import jax
 import numpy as np
 import scipy.integrate
 import scipy.interpolate
+from measure import seconds as timed
 from perturbed_muscle import DT, Sines, force, recorded
 
 import jaxmuscle as jm
 
 TASK = jm.PrescribedLength()
-NAMES = ("K_w0", "K_z0", "C_w0", "C_z0")
+# The bundled knee extension as fitted, with masses of 0.5 kg
+KNEE = TASK.replace(k_w=4.6e5, k_z=7.8e5, c_w=114.0, c_z=1.8, P_w=5.0, noise_K_w=0.27, noise_K_z=0.002)
 QUICK = {"rungs": 0, "seeds": 0, "check_seeds": 0, "starts": 16}
 
 
@@ -149,7 +151,13 @@ def reflex(count: int) -> None:
 
             runs = recorded(TASK, np.random.default_rng(3), count, reflex=pull)
             print(f"reflex {strength:g} of the stiffness at rest, late by {1e3 * late:g} ms")
-            told([jm.fit(TASK, run, **QUICK) for run in runs])
+            fits = [jm.fit(TASK, run, **QUICK) for run in runs]
+            told(fits)
+            masses = [fit["m_z"] for fit in fits]
+            spread("muscle m_z", [m.value for m in masses], [float(m.stderr or np.nan) for m in masses], float(TASK["m_z"]))
+            if strength == 1.0:
+                print("the same, fitted with the true m_z")
+                told([jm.fit(TASK, run, fix={"m_z": float(TASK["m_z"])}, **QUICK) for run in runs])
 
 
 def inertia(count: int) -> None:
@@ -169,7 +177,44 @@ def seconds(count: int) -> None:
         told([jm.fit(TASK, run, **QUICK) for run in recorded(TASK, np.random.default_rng(5), count, length, rms)])
 
 
-PARTS: dict[str, Callable[[int], None]] = {part.__name__: part for part in (classical, amplitude, reflex, inertia, seconds)}
+def coverage(count: int) -> None:
+    """Are the errors right: those of 64 s of the knee extension, against how far the fits scatter about the truth."""
+    rng, fits = np.random.default_rng(7), list[jm.fits.FitResult]()
+    for first in range(0, count, 20):  # so many simulations at once
+        runs = recorded(KNEE, rng, min(20, count - first), 64.0)
+        fits += [jm.fit(TASK, run, **QUICK) for run in runs]
+    others = {name: float(KNEE[name]) for name in ("m_z", "noise_K_w", "noise_K_z")}
+    for name, true in (truth(KNEE) | others).items():
+        known = [fit[name] for fit in fits if fit[name].stderr is not None]
+        if len(known) < 2:
+            print(f"{name:10s} true {true:8.4g}  known {len(known)}/{count}", flush=True)
+            continue
+        stated = np.array([p.stderr for p in known], float)
+        z = (np.array([p.value for p in known]) - true) / stated
+        held = np.mean([p.interval[0] < true < p.interval[1] for p in known])
+        print(f"{name:10s} true {true:8.4g}  known {len(known)}/{count}  stated {100 * np.median(stated) / true:5.2f} %  "
+              f"over stated: scatter {np.std(z, ddof=1):.2f}, mean {np.mean(z):+.2f}  95 % intervals hold the truth: "
+              f"{100 * held:.0f} %", flush=True)  # fmt: skip
+    p = np.array([fit.adequacy_p for fit in fits], float)
+    print(f"described: {sum(bool(fit.adequate) for fit in fits)}/{count}; p below 0.05: {np.sum(p < 0.05)}", flush=True)
+
+
+def time(count: int) -> None:
+    """Processor time, when warm, of a whole fit of a minute moved, of a minute held and of the bundled spectrum."""
+    (moved,) = recorded(KNEE, np.random.default_rng(8), 1)
+    (held,) = recorded(KNEE, np.random.default_rng(9), 1, rms=1e-9)  # m, which no force shows
+    spectrum = jm.load_target("vastus-lateralis-26mvc")
+    given = {"moved": (TASK, moved), "held": (jm.Isometric(), held.force), "spectrum": (jm.task_for(spectrum), spectrum)}
+    taken = timed({name: lambda pair=pair: jm.fit(*pair) for name, pair in given.items()}, count)
+    for name, found in taken.items():
+        ratio = np.median(taken["moved"].processor / found.processor)
+        print(f"{name:10s} processor time {np.median(found.processor):6.2f} s (wall {np.median(found.wall):6.2f} s), "
+              f"median of {count} turns; that of a minute moved over it {ratio:.2f}", flush=True)  # fmt: skip
+
+
+PARTS: dict[str, Callable[[int], None]] = {
+    part.__name__: part for part in (classical, amplitude, reflex, inertia, seconds, coverage, time)
+}
 
 
 def main() -> None:

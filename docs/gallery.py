@@ -104,6 +104,13 @@ moved *= 1e-3 / np.std(moved)
 speed = np.gradient(moved, 1e-3)
 force = held + 300.0 * moved + 6.0 * speed + 0.1 * np.gradient(speed, 1e-3)  # a spring, damper, mass beside it
 perturbed = jm.PerturbedRecording.from_array(force, moved, 1000, name="anna", window=(2.0, 60.0))
+
+time, lines = np.arange(7200) / 100, np.arange(8, 361) / 72  # a muscle, moved by sines from 0.1 to 5 Hz, 1 mm rms
+phases = np.random.default_rng(1).uniform(0, 2 * np.pi, lines.size)
+length = 1e-3 * np.sqrt(2 / lines.size) * np.cos(2 * np.pi * np.outer(time, lines) + phases).sum(axis=1)
+muscle = jm.PrescribedLength(x_z=jm.model.Sampled.through(time, -length)).replace(harmonic_amplitude=0.0)
+pulled = np.asarray(jm.simulate(muscle, key, duration=71.9, rate=100).output)
+minute = jm.PerturbedRecording.from_array(pulled, length[: pulled.size], 100, name="a minute", window=(6.0, 66.0))
 """
 STUDY = """
 rows = []
@@ -159,6 +166,8 @@ SECTIONS = (
     Section("A moved insertion", MOVED, (
         Shown("gallery/perturbed.png", "perturbed.plot()", "Force and displacement, and the stiffness between them",
               "perturbed.md"),
+        Shown("gallery/fitted_stiffness.png", "jm.fit(jm.PrescribedLength(), minute).plot()",
+              "A muscle fitted to such a minute: its stiffness and its fluctuations", "perturbed.md#fit-it"),
         Shown("gallery/frequency_response.png", "perturbed.frequency_response().plot()", "That stiffness with its errors",
               "perturbed.md"),
     )),

@@ -8,6 +8,9 @@ from typer.testing import CliRunner
 
 import jaxmuscle as jm
 from jaxmuscle.commands.main import app
+from jaxmuscle.commands.options import PERTURBED, READING
+from jaxmuscle.commands.recordings import read_recordings
+from jaxmuscle.data import _recording_files
 
 RATE, LEVEL = 200, 40.5
 
@@ -82,6 +85,36 @@ def test_what_does_not_go_together_is_refused(case, folder, tmp_path):
     given = [name if "." not in name else folder / name for name in names]
     found = run("fit", *given, *options, "--out", tmp_path)
     assert found.exit_code == 2 and message in " ".join(found.stderr.split()), found.stderr
+
+
+@pytest.fixture
+def read(monkeypatch):
+    """The files that are read, in turn."""
+    files, original = [], _recording_files.read_csv
+
+    def counted(data, file, skip_rows):
+        files.append(file)
+        return original(data, file, skip_rows)
+
+    monkeypatch.setattr(_recording_files, "read_csv", counted)
+    return files
+
+
+def test_a_command_reads_a_file_once(folder, tmp_path, read):
+    reading = {name: default for name, (_, default) in (READING | PERTURBED).items()}
+    trials = read_recordings([str(path) for path in paths(folder, 3)], reading, None, None)
+    assert isinstance(trials, jm.Trials) and read == [str(path) for path in paths(folder, 3)]
+    x, noise = np.random.default_rng(9).standard_normal((2, 4000))
+    columns = [np.arange(4000) / RATE, 40 + 0.3 * x + 0.1 * noise, x]
+    path = str(tmp_path / "both.csv")
+    np.savetxt(path, np.stack(columns, axis=1), delimiter=",", header="time,force_N,displacement_mm", comments="")
+    for options in ({}, {"displacement": "displacement_mm"}):
+        read.clear()
+        (found,) = read_recordings([path], reading | options, "2:18", "prescribed-length")
+        assert isinstance(found, jm.PerturbedRecording) and found.window == pytest.approx((2, 18)) and read == [path]
+    read.clear()
+    (force,) = read_recordings([path], reading | {"column": "force_N"}, "all", None)
+    assert force.unit == "N" and read == [path]
 
 
 @pytest.mark.slow

@@ -344,6 +344,15 @@ def test_bad_files(case, tmp_path, monkeypatch):
     assert message in str(caught.value)
 
 
+@pytest.mark.parametrize(("content", "message"), [
+    ("#BEGINCHANNELHEADER\n200,force\n1\n2\n", "no #ENDCHANNELHEADER; save the file again"),
+    ("#BEGINCHANNELHEADER\n200,force\n211,trial.csv\n#ENDCHANNELHEADER\n1\n2\n", "names the file itself for the values"),
+])  # fmt: skip
+def test_a_header_of_channels_that_leads_nowhere(content, message, tmp_path):
+    with pytest.raises(ValueError, match=f"trial.csv: its header.*{message}"):
+        load_recording(write(tmp_path, content), rate=100)
+
+
 SIGNS = ",;\t \n\r.0123456789eE-+naNif#\"'_tm:force()x"
 
 

@@ -3,8 +3,10 @@
 import numpy as np
 import pytest
 
+import jaxmuscle as jm
 from jaxmuscle.data._as_target import as_target, is_recording
 from jaxmuscle.data._frequency_response_files import is_frequency_response
+from jaxmuscle.data._recording_files import read_table
 from jaxmuscle.data._two_channels import perturbed_recordings, two_channels
 
 ROWS = 3000
@@ -46,6 +48,16 @@ def test_several_that_may_be_meant_are_named(tmp_path):
     assert two_channels(path, displacement="motor_mm") == {"force": "force_N", "displacement": "motor_mm"}
     with pytest.raises(ValueError, match="no displacement 'rod'"):
         two_channels(path, displacement="rod")
+
+
+def test_what_was_read_stands_for_its_path(tmp_path):
+    table = read_table(written(tmp_path, "force_N", "displacement_mm"))
+    assert two_channels(table) == {"force": "force_N", "displacement": "displacement_mm"}
+    both, pulled = jm.load_recording(table, **two_channels(table)), jm.load_recording(table, column="force_N")
+    np.testing.assert_allclose(both.displacement.whole, 1e-3 * MOVED, rtol=1e-4, atol=1e-9)
+    np.testing.assert_allclose(pulled.whole, FORCE, rtol=1e-4)
+    assert jm.load_recordings(table, columns=["force_N"])[0].name == "x force_N"
+    assert jm.load_recordings([table], column="force_N")[0].name == "x"
 
 
 def test_paths_are_read_as_what_they_are(tmp_path):

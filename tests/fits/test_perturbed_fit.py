@@ -110,6 +110,15 @@ def test_further_questions_take_it(result):
 
 
 @pytest.mark.slow
+def test_the_posterior_is_as_wide_as_stated(result):
+    found = jm.posterior(result, key=3, chains=2, draws=300, warmup=300)
+    for name, true in WHOLE.items():
+        draws = found.quantities[name]
+        assert 0.67 < np.std(draws) / result[name].stderr < 1.5, name
+        assert abs(np.mean(draws) - true) < 4 * result[name].stderr, name
+
+
+@pytest.mark.slow
 def test_the_fitted_muscle_sees_what_it_was_fitted_to(minute, result):
     """The response that was taken off is that of the muscle found: seen with it the numbers are the same."""
     with jax.enable_x64(True):

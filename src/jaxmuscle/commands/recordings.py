@@ -11,6 +11,7 @@ from .options import PERTURBED, READING
 
 if TYPE_CHECKING:
     from jaxmuscle import PerturbedRecording, Trials
+    from jaxmuscle.data import Table
 
 
 def reads_recordings(command: Callable[..., None], options: Mapping[str, tuple[Any, Any]] = READING) -> Callable[..., None]:
@@ -46,46 +47,59 @@ def perturbed(reading: dict[str, Any]) -> bool:
     return reading["force_column"] is not None or reading["displacement"] is not None
 
 
-def moved(paths: Sequence[str], reading: dict[str, Any], task: str | None) -> bool:
-    """Whether files are to be fitted as perturbation experiments: by the options, else by the task and their columns."""
+def read_recordings(
+    paths: Sequence[str], reading: dict[str, Any], window: str | None, task: str | None
+) -> "list[PerturbedRecording] | Trials":
+    """The recordings of one condition: of force and displacement, by the options, else by the task and the columns."""
     if perturbed(reading):
-        return True
+        return read_perturbed(paths, reading, window)
     if task not in (None, "prescribed-length") or reading["column"] is not None:
-        return False
-    return all(channels(path, reading) for path in paths)
+        return read_trials(paths, reading, window)
+    tables = [table_of(path, reading) for path in paths]
+    both = all(channels(table, reading) for table in tables)
+    return read_perturbed(tables, reading, window) if both else read_trials(tables, reading, window)
 
 
-def channels(path: str, reading: dict[str, Any]) -> dict[str, Any]:
-    """The columns of force and displacement in a file; nothing where it has not both."""
+def channels(table: "Table", reading: dict[str, Any]) -> dict[str, Any]:
+    """The columns of force and displacement; nothing where there are not both."""
     named = {"force": reading["force_column"], "displacement": reading["displacement"]}
-    return jm.data.two_channels(path, **named, time=reading["time"], skip_rows=reading["skip_rows"])
+    return jm.data.two_channels(table, **named, time=reading["time"])
 
 
-def read_perturbed(paths: Sequence[str], reading: dict[str, Any], window: str | None = None) -> "list[PerturbedRecording]":
+def read_perturbed(
+    paths: "Sequence[str | Table]", reading: dict[str, Any], window: str | None = None
+) -> "list[PerturbedRecording]":
     """The recordings of force and displacement in files, each with its steady part as window."""
     options = {name: value for name, value in reading.items() if name not in ("force_column", "displacement")}
     named = {"force": reading["force_column"], "displacement": reading["displacement"]}
-    return [read(path, options | (channels(path, reading) or named), window) for path in paths]
+    tables = [table_of(path, reading) for path in paths]
+    return [read(table, options | (channels(table, reading) or named), window) for table in tables]
 
 
-def read_trials(paths: Sequence[str], reading: dict[str, Any], window: str | None = None) -> "Trials":
+def read_trials(paths: "Sequence[str | Table]", reading: dict[str, Any], window: str | None = None) -> "Trials":
     """The recordings of one condition, each with its steady part: several files, or all columns of one (`--column all`)."""
     if len(paths) > 1 or reading["column"] != "all":
-        return jm.Trials([read(path, {name: reading[name] for name in READING}, window) for path in paths])
+        options = {name: reading[name] for name in READING}
+        return jm.Trials([read(table_of(path, reading), options, window) for path in paths])
     edges = edges_of(window)
     options = {name: reading[name] for name in READING if name not in ("column", "reference")}
-    trials = jm.load_recordings(paths[0], **options)
+    trials = jm.load_recordings(table_of(paths[0], reading), **options)
     return trials if edges == "all" else trials.steady(edges)
 
 
-def read(path: str, reading: dict[str, Any], window: str | None = "all") -> Any:
-    """The recording of a file, its steady part as window: the one that is given, `all`, or None to find it."""
+def read(table: "Table", reading: dict[str, Any], window: str | None) -> Any:
+    """A recording, its steady part as window: the one that is given, `all`, or None to find it."""
     edges = edges_of(window)
+    recording = jm.load_recording(table, **reading)
+    return recording if edges == "all" else recording.steady(edges)
+
+
+def table_of(path: "str | Table", reading: dict[str, Any]) -> "Table":
+    """The columns of a file, which is read here alone."""
     try:
-        recording = jm.load_recording(path, **reading)
+        return jm.data.read_table(path, reading["skip_rows"])
     except ImportError as error:
         raise ValueError(str(error)) from None
-    return recording if edges == "all" else recording.steady(edges)
 
 
 def edges_of(window: str | None) -> Any:

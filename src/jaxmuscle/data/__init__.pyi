@@ -8,7 +8,9 @@ from ._frequency_response_files import load_frequency_response as load_frequency
 from ._perturbed import PerturbedRecording as PerturbedRecording
 from ._recording import Recording as Recording
 from ._recording_files import load_recording as load_recording
+from ._recording_files import read_table as read_table
 from ._recording_quality import RecordingSummary as RecordingSummary
+from ._recording_table import Table as Table
 from ._steadiness import Measure as Measure
 from ._steadiness import Steadiness as Steadiness
 from ._steadiness import steadiness as steadiness

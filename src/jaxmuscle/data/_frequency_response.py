@@ -121,9 +121,8 @@ class FrequencyResponse(eqx.Module):
     def known(self) -> "FrequencyResponse":
         """The response where its error is finite."""
         kept = np.isfinite(self.stderr)
-        return self if np.all(kept) else self._with(kept)
-
-    def _with(self, kept: np.ndarray) -> "FrequencyResponse":
+        if np.all(kept):
+            return self
         shared = None if self.coherence is None else self.coherence[kept]
         fields = {"name": self.name, "source": self.source, "notices": self.notices}
         return FrequencyResponse(self.frequency[kept], self.value[kept], self.stderr[kept], shared, **fields)

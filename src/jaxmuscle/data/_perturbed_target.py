@@ -67,17 +67,15 @@ def perturbed_target(
     **Arguments:** `recordings` with their windows; `stiffness` H(f) [N/m] of a vector of frequencies, by default the
     nonparametric one (`PerturbedRecording.frequency_response`); `predicted`, which gives the response of the force [N] to
     lengthening, its velocity and acceleration (at times so far apart [s], every second of which is asked for), by the
-    nonlinear muscle say, instead of H; others as in `Recording.target`.
+    nonlinear muscle say, instead of H, which stays where that is not finite; others as in `Recording.target`.
     """
-    settings, pieces = recorded_settings(settings), []
-    for recording in recordings:
-        own = _measured(recording, settings) if stiffness is None else stiffness
-        pieces.append(_ordinates(recording, own, predicted, settings))
+    settings = recorded_settings(settings)
+    each = [_measured(recording, settings) if stiffness is None else stiffness for recording in recordings]
+    pieces = [_ordinates(recording, own, predicted, settings) for recording, own in zip(recordings, each, strict=True)]
     fluctuations = [piece.fluctuation for piece in pieces]
     called = recordings[0].name if name is None else name
     target = pooled_target(fluctuations, called, "force", provenance, None, settings)
-    at = _measured(recordings[0], settings) if stiffness is None else stiffness
-    return target.with_stiffness(_pooled(pieces, at, called, target.source, float(settings.frequency[-1])))
+    return target.with_stiffness(_pooled(pieces, each[0], called, target.source, float(settings.frequency[-1])))
 
 
 def _measured(recording: "PerturbedRecording", settings: SpectrumSettings) -> Stiffness:
@@ -89,11 +87,9 @@ def _measured(recording: "PerturbedRecording", settings: SpectrumSettings) -> St
 
 
 def _even(recording: Recording, rate: float) -> tuple[Float[np.ndarray, " all"], slice]:
-    even = recording.resampled(rate)
-    start, stop = (recording.start, recording.stop) if recording.window is None else recording.window
-    span = round((start - recording.start) * rate), round((stop - recording.start) * rate)
-    margin = round(MARGIN * rate)
-    span = max(span[0], margin), min(span[1], even.whole.size - margin)
+    even, margin = recording.resampled(rate), round(MARGIN * rate)
+    first, stop = recording.span(rate)
+    span = max(first, margin), min(stop, even.whole.size - margin)
     require(span[1] - span[0] > 4 * margin, "window", recording.window,
             f"holds less than {4 * MARGIN:g} s besides {MARGIN:g} s before and after it; record longer")  # fmt: skip
     return even.whole, slice(*span)
@@ -131,7 +127,9 @@ def _response(
         fine, turn = HALF_STEPS * len(length), 2j * np.pi * f
         motion = np.stack([HALF_STEPS * np.fft.irfft(turn**order * moved, fine) for order in (0, 1, 2)])
         motion = np.append(motion, motion[:, :1], axis=1)  # which is periodic
-        return predicted(motion, 1 / (HALF_STEPS * rate))[:: HALF_STEPS // 2][: len(length)]
+        reply = predicted(motion, 1 / (HALF_STEPS * rate))[:: HALF_STEPS // 2][: len(length)]
+        if np.all(np.isfinite(reply)):
+            return reply
     nodes = np.sinh(np.linspace(0.0, 6.0, NODES)) / np.sinh(6.0) * rate / 2
     value = stiffness(nodes)
     smooth = scipy.interpolate.CubicSpline(nodes, np.stack([np.real(value), np.imag(value)]), axis=1)(f)

@@ -130,7 +130,7 @@ class Recording(eqx.Module):
         require(self.start - near <= a < b <= self.stop + near, "window", window, remedy)
         return a, b
 
-    def _span(self, rate: float | int) -> tuple[int, int]:
+    def span(self, rate: float | int) -> tuple[int, int]:
         """The window as sample numbers at a rate."""
         a, b = (self.start, self.stop) if self.window is None else self.window
         return max(round((a - self.start) * rate), 0), round((b - self.start) * rate)
@@ -147,12 +147,12 @@ class Recording(eqx.Module):
     @property
     def samples(self) -> Float[np.ndarray, " times"]:
         """The samples in the window [`unit`], as recorded."""
-        return self.whole[slice(*self._span(self.rate))]
+        return self.whole[slice(*self.span(self.rate))]
 
     @property
     def time(self) -> Float[np.ndarray, " times"]:
         """Times of `samples` [s]."""
-        return self.start + np.arange(self.whole.size)[slice(*self._span(self.rate))] / self.rate
+        return self.start + np.arange(self.whole.size)[slice(*self.span(self.rate))] / self.rate
 
     @property
     def duration(self) -> float:
@@ -220,7 +220,7 @@ class Recording(eqx.Module):
     def segments(self, settings: SpectrumSettings | str | None = None) -> int:
         """Number of whole Welch segments in the window."""
         settings = recorded_settings(settings)
-        first, stop = self._span(settings.rate)
+        first, stop = self.span(settings.rate)
         return settings.segments(stop - first)
 
     def filtered(self, settings: SpectrumSettings | str | None = None) -> Float[np.ndarray, " times"]:
@@ -229,7 +229,7 @@ class Recording(eqx.Module):
         even = self.resampled(settings.rate)
         with jax.enable_x64(True):
             signal = np.asarray(lowpass(even.whole, settings))
-        return signal[slice(*even._span(settings.rate))]
+        return signal[slice(*even.span(settings.rate))]
 
     def spectrum(self, settings: SpectrumSettings | str | None = None) -> Spectrum:
         """Welch spectrum of the window, in float64: resampled and low-passed before it is cut.
@@ -244,7 +244,7 @@ class Recording(eqx.Module):
         require(highest < self.rate / 2, "rate", self.rate, remedy)
         self._require_change()
         even = self.resampled(settings.rate)
-        first, stop = even._span(settings.rate)
+        first, stop = even.span(settings.rate)
         window = (first / settings.rate, stop / settings.rate)
         with jax.enable_x64(True):
             power = np.asarray(spectrum_of(even.whole, settings, window).power)
@@ -253,7 +253,7 @@ class Recording(eqx.Module):
     def fft_spectrum(self, settings: SpectrumSettings | str | None = None) -> Spectrum:
         """The same with the whole window as one segment (periodogram), in the frequency range of the settings."""
         settings = recorded_settings(settings)
-        first, stop = self._span(settings.rate)
+        first, stop = self.span(settings.rate)
         low, high = (float(settings.frequency[i]) * (stop - first) / settings.rate for i in (0, -1))
         require(stop - first >= 8 and high >= 1, "window", self.window, "is too short for a spectrum; give a longer one")
         bins = {"first_bin": math.ceil(low - 1e-9), "last_bin": math.floor(high + 1e-9)}

@@ -24,11 +24,11 @@ KINDS = (*TEXT, ".xlsx", *ARRAYS, *LABS)
 
 
 @overload
-def load_recording(path: str | os.PathLike[str], *, force: None = None, **options: Any) -> Recording: ...
+def load_recording(path: str | os.PathLike[str] | Table, *, force: None = None, **options: Any) -> Recording: ...
 @overload
-def load_recording(path: str | os.PathLike[str], *, force: str | int, **options: Any) -> PerturbedRecording: ...
+def load_recording(path: str | os.PathLike[str] | Table, *, force: str | int, **options: Any) -> PerturbedRecording: ...
 def load_recording(  # pyright: ignore[reportInconsistentOverload]
-    path: str | os.PathLike[str],
+    path: str | os.PathLike[str] | Table,
     *,
     column: str | int | None = None,
     force: str | int | None = None,
@@ -63,7 +63,7 @@ def load_recording(  # pyright: ignore[reportInconsistentOverload]
 
     **Arguments:**
 
-    - `path`: the file; its suffix says the format.
+    - `path`: the file; its suffix says the format. Or what `jaxmuscle.data.read_table` read of it.
     - `column`: name (case and unit may be left out) or number from 0; needed if there are several.
     - `force`, `displacement`: instead of `column`, the two channels of a perturbation experiment.
     - `rate` [Hz]: needed if the file does not state it.
@@ -93,7 +93,7 @@ def load_recording(  # pyright: ignore[reportInconsistentOverload]
 
 
 def load_columns(
-    path: str | os.PathLike[str],
+    path: str | os.PathLike[str] | Table,
     columns: Iterable[str | int] | None = None,
     *,
     time: str | int | None = None,
@@ -111,7 +111,20 @@ def load_columns(
     return [recording_of(Recording, table, Reading(name, time=time, **options), f"{stem} {name}") for name in names]
 
 
-def read_table(path: str | os.PathLike[str], skip_rows: int) -> Table:
+def read_table(path: str | os.PathLike[str] | Table, skip_rows: int = 0) -> Table:
+    """The columns of the file of a recording, for who must see them before they know what it holds.
+
+        table = jaxmuscle.data.read_table("trial.csv")
+        recording = jaxmuscle.load_recording(table, **jaxmuscle.data.two_channels(table))
+
+    `load_recording`, `load_recordings` and `two_channels` take a table in place of the path: the file is read once.
+
+    **Arguments:** `path`, `skip_rows` as in `load_recording`; a table is given back as it is.
+
+    **Raises:** `ValueError` naming file and line, and the remedy; `ImportError` that says what to install.
+    """
+    if isinstance(path, Table):
+        return path
     require(isinstance(path, str | os.PathLike), "path", path, "give the path of a recording")
     file = Path(path)
     with contextlib.suppress(RuntimeError):

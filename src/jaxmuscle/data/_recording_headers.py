@@ -130,6 +130,8 @@ def diadem(data: bytes, file: str, read: Callable[[bytes, str], Table]) -> Table
     if b"#BEGINCHANNELHEADER" not in data[: 1 << 16]:
         return None
     *heads, rest = re.split(rb"#ENDCHANNELHEADER[^\n]*\n?", data)
+    if not heads:
+        raise ValueError(f"{file}: its header has no #ENDCHANNELHEADER; save the file again")
     texts = [head.partition(b"#BEGINCHANNELHEADER")[2].decode("cp1252", errors="replace") for head in heads]
     channels = [dict(line.split(",", 1) for line in text.splitlines() if "," in line) for text in texts]
     channels = [{key.strip(): value.strip() for key, value in channel.items()} for channel in channels]
@@ -137,6 +139,8 @@ def diadem(data: bytes, file: str, read: Callable[[bytes, str], Table]) -> Table
     rate = next((1 / (number_in(c["241"], None) * (seconds(c.get("202")) or 1.0)) for c in steps), None)
     held = [channel for channel in channels if channel not in steps]
     sources = {Path(file).parent / channel["211"] for channel in held if channel.get("211")}
+    if Path(file) in sources:
+        raise ValueError(f"{file}: its header names the file itself for the values; give the file that holds them")
     if len(sources) == 1 and held[0].get("214", "ASCII") in _TYPES:
         found = [_binary(channel, len(held), next(iter(sources)), file) for channel in held]
         place, columns = "sample {}".format, [functools.partial(np.asarray, column) for column in found]

@@ -15,6 +15,7 @@ from jaxmuscle.spectra._welch import Spectrum
 from ._pooled import pooled_target
 from ._recording import Recording, recorded_settings
 from ._recording_files import load_columns, load_recording
+from ._recording_table import Table
 from ._target import Target
 
 
@@ -113,20 +114,22 @@ class Trials(Sequence[Recording]):
 
 
 def load_recordings(
-    paths: "Iterable[str | os.PathLike[str]] | str | os.PathLike[str]", *, columns: Iterable[str | int] | None = None,
+    paths: "Iterable[str | os.PathLike[str] | Table] | str | os.PathLike[str] | Table",
+    *,
+    columns: Iterable[str | int] | None = None,
     **options: Any,
-) -> Trials:  # fmt: skip
+) -> Trials:
     """Load the trials of one person in one condition.
 
         target = jm.load_recordings(["trial1.csv", "trial2.csv"]).steady().target("anna")
 
-    **Arguments:** `paths`, a list of files, or the path of one file that has a column for each trial; `columns`, which
-    columns of this one file are trials (by default all with numbers but the time); `options` as in `load_recording`, the
-    same for all files.
+    **Arguments:** `paths`, a list of files, or the path of one file that has a column for each trial (or what
+    `jaxmuscle.data.read_table` read of them); `columns`, which columns of this one file are trials (by default all with
+    numbers but the time); `options` as in `load_recording`, the same for all files.
 
     **Returns:** `Trials`, in the order given. **Raises:** `ValueError` as `load_recording` does, and for different units.
     """
-    if isinstance(paths, str | os.PathLike):
+    if isinstance(paths, str | os.PathLike | Table):
         return Trials(load_columns(paths, columns, **options))
     files = list(paths)
     if columns is not None:

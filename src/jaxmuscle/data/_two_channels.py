@@ -9,9 +9,9 @@ from jaxmuscle.spectra._settings import require
 
 from ._as_target import is_recording
 from ._perturbed import PerturbedRecording
-from ._recording_choice import signals
-from ._recording_files import load_recording, read_table
-from ._recording_table import bare, find, listed
+from ._recording_choice import Reading, perturbed_of, signals
+from ._recording_files import read_table
+from ._recording_table import Table, bare, find, listed
 from ._units import quantity_of
 
 CALLED = {
@@ -22,7 +22,7 @@ MEASURED = {"force": ("force", "torque"), "displacement": ("displacement", "angl
 
 
 def two_channels(
-    path: str | os.PathLike[str],
+    path: str | os.PathLike[str] | Table,
     force: str | int | None = None,
     displacement: str | int | None = None,
     *,
@@ -36,14 +36,16 @@ def two_channels(
     A column is found by its name (`force_N`, `Torque [Nm]`; `displacement_mm`, `length`, `position`, `angle_deg`), or by its
     unit.
 
-    **Arguments:** `path`, the file; `force`, `displacement`, a column that is known; `time`, `skip_rows` as in
-    `load_recording`.
+    **Arguments:** `path`, `time`, `skip_rows` as in `load_recording`; `force`, `displacement`, a column that is known.
 
     **Returns:** their names by role; nothing where the file does not hold both.
 
     **Raises:** `ValueError` that names the columns where several may be meant, and as `load_recording` does.
     """
-    table = read_table(path, skip_rows)
+    return _found_in(read_table(path, skip_rows), force, displacement, time)
+
+
+def _found_in(table: Table, force: str | int | None, displacement: str | int | None, time: str | int | None) -> Any:
     others, found = signals(table, time), dict[str, list[str]]()
     for role, given in (("force", force), ("displacement", displacement)):
         named = [name for name in others if CALLED[role].fullmatch(bare(name))]
@@ -64,7 +66,10 @@ def perturbed_recordings(given: Any, *, files: bool) -> tuple[PerturbedRecording
         return tuple(several)
     if not files or not all(isinstance(one, str | os.PathLike) and is_recording(one) for one in several):
         return ()
-    channels = [two_channels(one) for one in several]
+    tables = [read_table(one, 0) for one in several]
+    channels = [_found_in(table, None, None, None) for table in tables]
     if not channels or not all(channels):
         return ()
-    return tuple(load_recording(path, **names).steady() for path, names in zip(several, channels, strict=True))
+    found = (perturbed_of(PerturbedRecording.from_array, table, Reading(), names, None)
+             for table, names in zip(tables, channels, strict=True))  # fmt: skip
+    return tuple(recording.steady() for recording in found)

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from jaxmuscle._common.text import choices
+from jaxmuscle._common.units import NEWTONS
 from jaxmuscle.spectra._settings import require
 
 from ._target_fields import Quantity
@@ -18,7 +19,7 @@ UNITS: dict[str, Quantity | None] = {
 }  # fmt: skip
 _SPELLINGS = {"nm": "N m", "ncm": "N cm", "nmm": "N mm", "%mvc": "% MVC", "pctmvc": "% MVC", "%": "% MVC",
               "\u03bcm": "um", "au": "a.u.", "newton": "N", "newtons": "N", "volt": "V", "volts": "V"}  # fmt: skip
-_SI = {"force": {"N": 1.0, "mN": 1e-3, "kN": 1e3}, "torque": {"N m": 1.0, "N cm": 1e-2, "N mm": 1e-3},
+_SI = {"force": NEWTONS, "torque": {"N m": 1.0, "N cm": 1e-2, "N mm": 1e-3},
        "displacement": {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6},
        "angle": {"rad": 1.0, "deg": math.pi / 180}}  # fmt: skip
 _ANGLES = {"rad": "rad", "radian": "rad", "radians": "rad", "deg": "deg", "degree": "deg", "degrees": "deg", "°": "deg"}

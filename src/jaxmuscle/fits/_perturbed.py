@@ -46,7 +46,7 @@ def without_rhythm(task: AbstractTask, options: FitOptions) -> AbstractTask:
 
 
 def seen_with(muscle: AbstractTask, recordings: Sequence[PerturbedRecording]) -> Target:
-    """The target with the response of a task's nonlinear muscle taken off; of the linear one where that cannot be had."""
+    """The target with the response of a task's nonlinear muscle taken off, or of the linear one where that is not finite."""
     assert isinstance(muscle, PrescribedLength)
 
     def stiffness(f: np.ndarray) -> np.ndarray:
@@ -55,10 +55,7 @@ def seen_with(muscle: AbstractTask, recordings: Sequence[PerturbedRecording]) ->
     def predicted(motion: np.ndarray, interval: float) -> np.ndarray:
         return driven(muscle, -motion, interval)
 
-    try:
-        return perturbed_target(recordings, stiffness, predicted=predicted)
-    except ValueError:  # a muscle too stiff for its steps, which so is not finite; whatever else is wrong is said below
-        return perturbed_target(recordings, stiffness)
+    return perturbed_target(recordings, stiffness, predicted=predicted)
 
 
 def recordings_of(given: object, task: AbstractTask | None = None) -> tuple[PerturbedRecording, ...]:

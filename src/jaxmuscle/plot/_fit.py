@@ -18,7 +18,7 @@ from ._stiffness import gain, phase, stiffness_residuals
 from ._style import BLACK, BLUE, GREEN, GREY, ORANGE, PURPLE, SKY, VERMILLION, canvas, legend, output_label, styled
 
 WIDTH, LINE, FONT = 7.5, 0.165, 7.5  # inches, inches, points
-TABLE = (0.55, 0.565, 0.83)  # where values end, errors begin, units begin
+TABLE = (0.535, 0.548, 0.83)  # where values end, errors begin, units begin
 WRAP = 116  # characters of FONT on a line of WIDTH
 
 ALLOWED = 3.84  # 95 % quantile of χ² with one degree of freedom
@@ -39,7 +39,7 @@ def fit(result: Any, ax: Axes | None = None) -> Figure | SubFigure:
     """
     header, notes = _header(result), _notes(result)
     free = result.as_shown({name: estimate for name, estimate in result.parameters.items() if estimate.free})
-    derived = result.as_shown(result.derived)
+    derived = {name: p for name, p in result.as_shown(result.derived).items() if p.free}
     rows = 1 + max(len(free), len(derived), 1)
     panels = _panels(result)
     text = [LINE * (rows + 1), *[LINE * len(notes)] * bool(notes)]

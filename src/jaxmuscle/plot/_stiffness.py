@@ -38,10 +38,13 @@ def phase(ax: Axes, response: Any, curve: Curve | None = None) -> None:
     """The phase with two standard errors either way, and that of a curve."""
     f, known, shown = response.frequency, np.isfinite(response.stderr), _shown(response, curve)
     bars = np.where(known, np.minimum(2 * response.phase_stderr, 180.0), 0.0)
-    ax.errorbar(f[shown], response.phase[shown], bars[shown], **POINTS)
+    values = response.phase
     if curve is not None:
         fine, smooth = _smooth(f, curve[1])
-        ax.plot(fine, np.degrees(np.unwrap(np.angle(smooth))), color=BLUE, lw=1.2, zorder=2)
+        turned = np.degrees(np.unwrap(np.angle(smooth)))
+        ax.plot(fine, turned, color=BLUE, lw=1.2, zorder=2)
+        values = values + 360 * np.rint((np.interp(f, fine, turned) - values) / 360)  # the turn nearest to the curve
+    ax.errorbar(f[shown], values[shown], bars[shown], **POINTS)
     ax.axhline(0, color=GREY, lw=0.6)
     ax.set_ylabel("Phase (deg)")
     low, high = ax.get_ylim()
