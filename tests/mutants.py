@@ -103,13 +103,15 @@ SUBJECTS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
         (
             "ensembles/_ensemble",
             "ensembles/_layout",
+            "ensembles/_parts",
+            "ensembles/_places",
             "ensembles/_run",
             "ensembles/_store",
             "ensembles/_summary",
             "ensembles/_running_moments",
             "ensembles/_sweep",
         ),
-        ("ensemble",),
+        ("ensemble", "job_array"),
     ),
 }
 ARITHMETIC = {ast.Add: ast.Sub, ast.Sub: ast.Add, ast.Mult: ast.Div, ast.Div: ast.Mult, ast.Pow: ast.Mult,

@@ -207,6 +207,28 @@ def test_what_is_observed_of_a_motion(tmp_path):
     assert outcome.exit_code == 0 and "a_z: mean" in outcome.stdout and "m/s^2, standard deviation" in outcome.stdout
 
 
+@pytest.mark.slow
+def test_a_moved_insertion_is_simulated(tmp_path):
+    """The force of every instant long before and after a step is that of the muscle at rest at that length."""
+    import xarray
+    from scipy.optimize import brentq
+
+    quiet = {"harmonic_amplitude": 0.0, "noise_K_w": 1e-4, "noise_K_z": 0.0, "noise_C_w": 0.0, "noise_C_z": 0.0}
+    task = jm.PrescribedLength(x_z=jm.model.SmoothStep(-0.004, 6.0, 1.0)).replace(**quiet)
+    jm.save_preset(tmp_path / "moved.toml", task)
+    arguments = ["--task", "prescribed-length", "--seeds", 4, "--json", "--out", tmp_path]
+    found = strict(run("simulate", tmp_path / "moved.toml", *arguments).stdout)
+    assert found["task"] == "PrescribedLength" and found["quantity"] == "F_ext"
+    with xarray.open_dataset(tmp_path / "trajectories.nc", engine="h5netcdf") as data:
+        force, time = np.asarray(data["F_ext"]), np.asarray(data["time"])
+    k_w, k_z, P_w, x_ref = (float(task[name]) for name in ("k_w", "k_z", "P_w", "x_ref_w"))
+    for x_z, when in ((0.0, (time > 4.0) & (time < 5.9)), (-0.004, time > 12.0)):
+        tissue = k_z * (float(task["x_ref_z"]) ** 2 + x_z**2)
+        x_w = brentq(lambda x, x_z=x_z, tissue=tissue: k_w * (x_ref**2 + x**2) * x + tissue * (x - x_z) - P_w, -0.1, 0.1)
+        assert when.any()
+        np.testing.assert_allclose(force[:, when], tissue * (x_w - x_z), rtol=1e-3)  # the noise makes 1e-4
+
+
 # --- listings
 
 

@@ -130,8 +130,8 @@ def test_a_sum_is_its_parts(x64):
     again = (tremor + tremor).draw(KEY, 2000)
     assert abs(np.corrcoef(np.ravel(again[0]), np.ravel(again[1]))[0, 1]) < 3.3 / np.sqrt(4002)
     independent = jm.ResonantNoise((0.1, 0.1, 0.0, 0.0, 0.2))
-    assert independent.draw(KEY, 3).shape == (4, 2, 5)
-    assert jm.ResonantNoise((0.1, 0.1, 0.0, 0.0, 0.2), shared=True).draw(KEY, 3).shape == (4, 2, 1)
+    assert independent.draw(KEY, 3).shape == (4, 10)
+    assert jm.ResonantNoise((0.1, 0.1, 0.0, 0.0, 0.2), shared=True).draw(KEY, 3).shape == (4, 2)
 
 
 FAST = jm.ResonantNoise(0.1, 90.0, 20.0)

@@ -1,5 +1,6 @@
 """The tasks: which noise and inputs each allows, the inverse problem's output, static equilibria."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -8,7 +9,7 @@ import references
 
 import jaxmuscle as jm
 from jaxmuscle._common.errors import OperatingPointError
-from jaxmuscle.model import Constant, Decay, RampHold, SmoothStep
+from jaxmuscle.model import Constant, Decay, RampHold, Sampled, SmoothStep
 from jaxmuscle.response._equilibrium import operating_point
 
 KEY = jax.random.key(3)
@@ -88,6 +89,18 @@ def test_what_is_observed_is_saved(tmp_path):
     (tmp_path / "wrong.toml").write_text(text.replace('observe = "acceleration"', 'observe = "velocity"'))
     with pytest.raises(jm.errors.PresetError, match=r"wrong.toml: (.|\n)*'velocity'"):
         jm.load_preset(tmp_path / "wrong.toml")
+
+
+@pytest.mark.parametrize("moved", [
+    SmoothStep(-0.002, 1.0, 0.5), Sampled.through(np.linspace(0, 15, 31), 1e-3 * np.sin(np.arange(31.0))),
+], ids=["step", "sampled"])  # fmt: skip
+def test_a_moved_insertion_is_saved(tmp_path, moved):
+    task = jm.PrescribedLength(x_z=moved, P_w=8.0).replace(m_z=0.62)
+    jm.save_preset(tmp_path / "task.toml", task)
+    loaded = jm.load_preset(tmp_path / "task.toml")
+    assert eqx.tree_equal(loaded, task) and isinstance(loaded, jm.PrescribedLength)
+    times = np.linspace(0.0, 15.0, 7)
+    np.testing.assert_array_equal(jax.vmap(loaded.x_z)(times), jax.vmap(moved)(times))
 
 
 def test_motion_needs_damping_of_the_passive_tissue():

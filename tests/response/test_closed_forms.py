@@ -12,8 +12,8 @@ import scipy.integrate
 import jaxmuscle as jm
 from jaxmuscle.model import QuadraticDamping, QuadraticStiffness
 from jaxmuscle.model._noise import Realisation
+from jaxmuscle.simulation._batch import respond
 from jaxmuscle.simulation._grid import Grid
-from jaxmuscle.simulation._integrator import Forcing, observe, solve
 
 KEY = jax.random.key(23)
 MASS, K, C_W, C_Z, FORCE = 0.5, 200.0, 3.0, 1.0, 5.0
@@ -84,8 +84,7 @@ def test_spectrum_of_a_linear_oscillator(x64, noise):
     def spectra(key):
         fine = task.noise.realise(task.noise.draw(key, 30_000), 5e-4)
         pairs = (fine, Grid(5e-4, 30_000, 20)), (halved(fine), Grid(1e-3, 15_000, 10))
-        given = [(Forcing.of(task, path, grid), grid) for path, grid in pairs]
-        outputs = [observe(task, forcing, grid, solve(task, forcing, grid)) for forcing, grid in given]
+        outputs = [respond(task, path, grid, "instant")[1] for path, grid in pairs]
         return [jm.spectra.spectrum_of(output, task.settings, (5.0, 15.0)).power for output in outputs]
 
     fine, coarse = jax.vmap(spectra)(jax.random.split(KEY, 128))

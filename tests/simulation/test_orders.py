@@ -9,8 +9,8 @@ import references
 
 import jaxmuscle as jm
 from jaxmuscle.model._noise import Realisation
+from jaxmuscle.simulation._batch import respond
 from jaxmuscle.simulation._grid import Grid
-from jaxmuscle.simulation._integrator import Forcing, observe, solve
 
 KEY = jax.random.key(5)
 FINE, SECONDS, SEEDS = 2**14, 0.25, 400
@@ -34,15 +34,14 @@ def strong_errors(task, factors):
     @eqx.filter_jit
     def final(path, factor):
         grid = Grid(factor / FINE, steps // factor, steps // factor)
-        return jax.vmap(lambda p: solve(task, Forcing.of(task, coarsened(p, factor), grid), grid)[-1] * scale)(path)
+        return jax.vmap(lambda p: respond(task, coarsened(p, factor), grid, "instant")[0][-1] * scale)(path)
 
     reference = final(fine, 1)
     return [float(jnp.sqrt(jnp.mean(jnp.sum((final(fine, factor) - reference) ** 2, axis=-1)))) for factor in factors]
 
 
 def seen(task, path, grid):
-    given = Forcing.of(task, path, grid)
-    return observe(task, given, grid, solve(task, given, grid))
+    return respond(task, path, grid, "instant")[1]
 
 
 def moving(noise):

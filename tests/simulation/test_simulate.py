@@ -15,9 +15,8 @@ from jaxmuscle._common.arrays import is_concrete
 from jaxmuscle._common.types import Scalar
 from jaxmuscle.model import Decay, RampHold, Sampled, SmoothStep
 from jaxmuscle.model._noise import Realisation
-from jaxmuscle.simulation._batch import draw
+from jaxmuscle.simulation._batch import draw, respond
 from jaxmuscle.simulation._grid import Grid
-from jaxmuscle.simulation._integrator import Forcing, solve
 
 KEY = jax.random.key(11)
 HARMONIC = jm.Harmonic(0.1, 4.25, 0.3)
@@ -144,7 +143,7 @@ def test_every_step_gets_its_own_noise(steps, every, substeps, precision):
         task = Integral(noise=jm.WhiteNoise(1.0, relative=False), harmonic=jm.Harmonic(0.0))
         grid = Grid(1e-3, steps, every, substeps)
         paths = Realisation(values=jnp.asarray(noise)), Realisation(increments=jnp.asarray(noise[1:]))
-        smooth, rough = (solve(task, Forcing.of(task, path, grid), grid)[:, 0] for path in paths)
+        smooth, rough = (respond(task, path, grid, "instant")[0][:, 0] for path in paths)
         sums = np.cumsum(0.5e-3 * (noise[1:, 0] + noise[:-1, 0]).astype(float)), np.cumsum(noise[1:, 0].astype(float))
         for seen, expected, size in ((smooth, sums[0], 1e-3), (rough, sums[1], 1.0)):
             # One wrong value is an error of order `size`, at a thousand of the steps.

@@ -6,7 +6,6 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from enum import StrEnum
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -18,7 +17,7 @@ from .console import NOT_CONVERGED, err, out, record, reporting, task_of
 from .options import Force, Json, Observe, OtherTask, Preset, Seed
 
 if TYPE_CHECKING:
-    from jaxmuscle.ensembles import Pace
+    from jaxmuscle.ensembles import Pace, PartReport
     from jaxmuscle.model import AbstractTask
 
 
@@ -30,10 +29,20 @@ class Precision(StrEnum):
     double = "float64"
 
 
+class Increments(StrEnum):
+    gaussian = "gaussian"
+    weak = "weak"
+
+
+class Generator(StrEnum):
+    hash = "hash"
+    threefry = "threefry"
+
+
 def ensemble(
     preset: Preset,
     seeds: Annotated[int, typer.Option(help="Noise paths.")],
-    output: Annotated[Path, typer.Option("--out", metavar="FILE.zarr", help="The store.")],
+    output: Annotated[str, typer.Option("--out", metavar="FILE.zarr", help="The store: a folder, or a URL as s3://...")],
     task: OtherTask = None,
     observe: Observe = None,
     seed: Seed = 0,
@@ -45,7 +54,14 @@ def ensemble(
     reduce: Annotated[bool, typer.Option("--reduce", help="Keep moments, quantiles and the mean spectrum only.")] = False,
     states: Annotated[bool, typer.Option("--states", help="Keep the states too.")] = False,
     resume: Annotated[bool, typer.Option("--resume", help="Continue an interrupted store.")] = False,
+    part: Annotated[
+        str | None, typer.Option(metavar="I/N", help="Only the I-th of N parts, 1/N to N/N: a job array. See merge.")
+    ] = None,
     precision: Annotated[Precision, typer.Option(help="Of the simulation.")] = Precision.single,
+    increments: Annotated[
+        Increments, typer.Option(help="Of the noise; weak ones are faster and for --reduce only.")
+    ] = Increments.gaussian,
+    generator: Annotated[Generator, typer.Option(help="Of random numbers; threefry is JAX's, slower.")] = Generator.hash,
     chunk: Annotated[int | None, typer.Option(min=1, help="Seeds (times points) simulated at once.")] = None,
     devices: Devices = None,
     coordinator: Annotated[str | None, typer.Option(metavar="HOST:PORT", help="Process 0 of several.")] = None,
@@ -57,60 +73,127 @@ def ensemble(
     """Simulate any number of seeds into a zarr store, in chunks, on all cores, resumable.
 
     The store has the dimensions seed, time and frequency (and point with --vary); its attribute `complete` is set last.
-    Under SLURM or Open MPI, or with --coordinator, several processes share the work.
+    Under SLURM or Open MPI, or with --coordinator, several processes share the work. With --part they need not know of
+    each other: each adds its part to the store, in any order; the same command again goes on after a kill.
 
     Examples:
 
         jaxmuscle ensemble zagrodny-slifkin --seeds 10000 --out out/runs.zarr
 
         jaxmuscle ensemble out/fit/fit.json --seeds 1000000 --reduce --resume --out out/moments.zarr
+
+        jaxmuscle ensemble out/fit/fit.json --seeds 1000000 --reduce --out out/parts.zarr --part 3/64
     """
     with alone_or_together(coordinator, processes, as_json):
         from jaxmuscle._common.environment import keep_compiled_programs
 
         if states and reduce:
             raise ValueError("--states belongs to a store of trajectories: leave out --reduce")
+        together = any(given is not None for given in (coordinator, processes, process_id))
+        if part is not None and together:
+            raise ValueError(f"--part {part}: a part is a process of its own: leave out --coordinator and its companions")
         use(precision, devices, cores(coordinator, processes))
-        if jm.ensembles.launched() or any(given is not None for given in (coordinator, processes, process_id)):
+        if part is None and (together or jm.ensembles.launched()):
             jm.ensembles.join(coordinator, processes, process_id)
         keep_compiled_programs()
         model = task_of(preset, task, observe)
-        settings = {"duration": duration, "dt": dt, "chunk": chunk, "resume": resume, "overwrite": force,
-                    "states": states}  # fmt: skip
+        settings = {"duration": duration, "dt": dt, "chunk": chunk, "resume": resume, "overwrite": force, "states": states,
+                    "increments": increments.value, "generator": generator.value,
+                    **({} if part is None else {"part": numbers_of(part)})}  # fmt: skip
         if not run(model, swept(model, vary or []), seeds, seed, output, settings, reduce=reduce):
             raise typer.Exit(NOT_CONVERGED)
 
 
-def run(model: "AbstractTask", sweep: Any, seeds: int, seed: int, output: Path, settings: dict, *, reduce: bool) -> bool:
+def run(model: "AbstractTask", sweep: Any, seeds: int, seed: int, output: str, settings: dict, *, reduce: bool) -> bool:
     """Simulate and say how it went; whether every seed stayed finite."""
     import jax
 
-    from jaxmuscle._common.text import listed
-
-    first = jax.process_index() == 0
-    before = jm.ensembles.attributes_of(output).get("complete") if settings["resume"] and output.exists() else None
-    if settings["resume"] and first and not before:
-        err.print(f"{output}: {'there is no store yet, starting one' if before is None else 'resuming'}", highlight=False)
+    first, part = jax.process_index() == 0, settings.get("part")
+    there = jm.ensembles.attributes_of(output) if settings["resume"] else None
+    before = there is not None and there.get("complete")
+    if settings["resume"] and part is None and first and not before:
+        err.print(f"{output}: {'there is no store yet, starting one' if there is None else 'resuming'}", highlight=False)
     begun = time.monotonic()
     with watching(f"{seeds} seeds", first=first) as tell:
         kept: Any = {"reduce": True} if reduce else {}
         found: Any = jm.ensemble(model if sweep is None else sweep, jax.random.key(seed), seeds=seeds, store=output,
                                   progress=jm.ensembles.Watch(tell), **kept, **settings)  # fmt: skip
-    failed, elapsed = json.loads(jm.ensembles.attributes_of(output)["failed"]), time.monotonic() - begun
+    elapsed = time.monotonic() - begun
+    about = {"event": "done", "out": output, "seeds": seeds, "elapsed_s": round(elapsed, 3)}
+    if part is not None:
+        record(about | found._asdict() | {"failed": found.failed.tolist()})
+        return say_part(found, output, elapsed)
+    failed = json.loads((jm.ensembles.attributes_of(output) or {})["failed"])
     if not first:
         return not failed
-    record({"event": "done", "out": str(output), "seeds": seeds, "elapsed_s": round(elapsed, 3), "failed": failed})
+    record(about | {"failed": failed})
     if reduce:
         out.print(str(found), highlight=False)
     else:
-        sizes = ", ".join(f"{name} {size}" for name, size in found.sizes.items())
-        out.print(f"{type(model).__name__}: {', '.join(map(str, found.data_vars))} ({sizes})", highlight=False)
-    if failed and not reduce:
-        shown = listed([seed for _, seed in failed])
-        err.print(f"[bold red]failed:[/] {len(failed)} seed(s) did not stay finite ({shown}): lower the noise or dt")
+        say_store(f"{type(model).__name__}: ", found, failed)
     said = f"{output}: was complete, nothing to do" if before else f"Written: {output} in {elapsed:.1f} s"
     out.print(said, highlight=False, soft_wrap=True)
     return not failed
+
+
+def say_part(found: "PartReport", output: str, elapsed: float) -> bool:
+    """What one part did; whether every seed stayed finite."""
+    if found.complete:
+        said = f"{output}: was complete, nothing to do"
+    else:
+        said = (f"Part {found.number} of {found.parts}: {found.seeds} seeds in {elapsed:.1f} s. When all parts are done: "
+                f"jaxmuscle merge {output}")  # fmt: skip
+    say_failed(found.failed.tolist())
+    out.print(said, highlight=False, soft_wrap=True)
+    return found.success
+
+
+def say_store(title: str, found: Any, failed: list) -> None:
+    """What is in a store, and what failed."""
+    sizes = ", ".join(f"{name} {size}" for name, size in found.sizes.items())
+    out.print(f"{title}{', '.join(map(str, found.data_vars))} ({sizes})", highlight=False)
+    say_failed(failed)
+
+
+def say_failed(failed: list) -> None:
+    """Which seeds did not stay finite, if any."""
+    from jaxmuscle._common.text import listed
+
+    if failed:
+        shown = listed([seed for _, seed in failed])
+        err.print(f"[bold red]failed:[/] {len(failed)} seed(s) did not stay finite ({shown}): lower the noise or dt")
+
+
+def merge(
+    store: Annotated[str, typer.Argument(help="The store that the parts have made: a folder or a URL.")],
+    as_json: Json = False,
+) -> None:
+    """Make one ensemble of the parts that `jaxmuscle ensemble --part` has put into a store.
+
+    Checks that every chunk is there, reduces, and marks the store complete. What is missing is named, with the command to
+    run again. A repetition does no harm.
+
+    Example:
+
+        jaxmuscle merge out/parts.zarr
+    """
+    with reporting(as_json):
+        before = (jm.ensembles.attributes_of(store) or {}).get("complete")
+        found = jm.ensembles.merge(store)
+        failed = json.loads(found.attrs["failed"])
+        record({"event": "done", "out": store, "failed": failed})
+        say_store("", found, failed)
+        out.print(f"{store}: was complete, nothing to do" if before else f"Merged: {store}", highlight=False, soft_wrap=True)
+        if failed:
+            raise typer.Exit(NOT_CONVERGED)
+
+
+def numbers_of(part: str) -> tuple[int, int]:
+    """I and N of I/N."""
+    number, slash, count = part.partition("/")
+    if not (slash and number.strip().isdigit() and count.strip().isdigit()):
+        raise ValueError(f"--part {part}: write I/N with whole numbers, 1/4 to 4/4 say")
+    return int(number), int(count)
 
 
 @contextmanager

@@ -41,7 +41,7 @@ from .options import (
     fixed_values,
     names_in,
 )
-from .recordings import moved, read_perturbed, read_trials, reads_perturbed
+from .recordings import read_recordings, reads_perturbed
 
 
 @reads_perturbed
@@ -169,10 +169,11 @@ def fit(
         if any(recorded):
             if segments is not None or dataset is not None:
                 raise ValueError("--segments and --dataset belong to spectra; these are recordings")
-            if moved(target, reading, task):
-                aim = read_perturbed(target, reading, window), jm.model.TASKS[task or "prescribed-length"]()
+            found = read_recordings(target, reading, window, task)
+            if isinstance(found, list):
+                aim = found, jm.model.TASKS[task or "prescribed-length"]()
             else:
-                aim = aimed(read_trials(target, reading, window).target(quantity=quantity), task)
+                aim = aimed(found.target(quantity=quantity), task)
         elif jm.data.is_frequency_response(target[0]):
             aim = aim_of(target[0], task, {"segments": segments, "lever_arm": reading["lever_arm"]})
         else:

@@ -17,7 +17,7 @@ from .analyse import analyse
 from .compare import compare
 from .console import out, plain, record, reporting
 from .design import design
-from .ensemble import ensemble
+from .ensemble import ensemble, merge
 from .fit import fit
 from .options import Json
 from .posterior import posterior
@@ -33,6 +33,7 @@ app = typer.Typer(add_completion=False, no_args_is_help=True, rich_markup_mode="
 app.command()(fit)
 app.command()(simulate)
 app.command()(ensemble)
+app.command()(merge)
 app.command()(analyse)
 app.command()(steadiness)
 app.command()(posterior)

@@ -11,12 +11,16 @@ from jaxtyping import Int, PRNGKeyArray
 
 from jaxmuscle._common.arrays import all_concrete, as_arrays
 from jaxmuscle._common.progress import told
+from jaxmuscle._common.text import listed
+from jaxmuscle.model._stream import Draws
 from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.response._linearised import LinearTask
 from jaxmuscle.simulation._simulate import DT, DURATION, require_finite, trajectories
 from jaxmuscle.simulation._trajectory import Trajectory
 
 from ._layout import Layout, Pace, Watch, companions, covers_window, cut_of, laid_out, plan_of, run_chunks
+from ._parts import Part, PartReport
+from ._places import place_of
 from ._run import begun_with, reduced, stored
 from ._running_moments import LEVELS
 from ._summary import EnsembleSummary
@@ -25,6 +29,8 @@ from ._sweep import Population, Sweep
 if TYPE_CHECKING:
     import xarray
 
+
+FURTHEST = 0.01  # quantiles that weak increments are good for
 
 Seeds = int | Int[np.ndarray, " seeds"]
 Progress = bool | Callable[[str, float], None] | Watch
@@ -41,14 +47,19 @@ def ensemble(task: Sweep | Sequence[AbstractTask], key: PRNGKeyArray, *, seeds: 
 
 
 @overload
+def ensemble(task: AbstractTask | Sweep | Sequence[AbstractTask], key: PRNGKeyArray, *, seeds: Seeds, store: str | Path,
+             part: tuple[int, int], reduce: bool | tuple[float, ...] = ..., **given: Any) -> PartReport: ...  # fmt: skip
+
+
+@overload
 def ensemble(task: AbstractTask | Sweep | Sequence[AbstractTask], key: PRNGKeyArray, *, seeds: Seeds,
-             reduce: Literal[True] | tuple[float, ...], store: str | Path | None = ...,
+             reduce: Literal[True] | tuple[float, ...], store: str | Path | None = ..., part: None = ...,
              **given: Any) -> EnsembleSummary: ...  # fmt: skip
 
 
 @overload
 def ensemble(task: AbstractTask | Sweep | Sequence[AbstractTask], key: PRNGKeyArray, *, seeds: Seeds, store: str | Path,
-             reduce: Literal[False] = ..., **given: Any) -> "xarray.Dataset": ...  # fmt: skip
+             reduce: Literal[False] = ..., part: None = ..., **given: Any) -> "xarray.Dataset": ...  # fmt: skip
 
 
 def ensemble(  # pyright: ignore[reportInconsistentOverload]
@@ -69,6 +80,9 @@ def ensemble(  # pyright: ignore[reportInconsistentOverload]
     resume: bool = False,
     overwrite: bool = False,
     states: bool = False,
+    part: tuple[int, int] | None = None,
+    increments: str = "gaussian",
+    generator: str = "hash",
 ) -> Any:
     """Simulate many seeds (0 to seeds - 1, or those given) of one task, or of every point of a sweep.
 
@@ -84,12 +98,22 @@ def ensemble(  # pyright: ignore[reportInconsistentOverload]
     have decayed there.
 
     `reduce`, True or the levels of the quantiles, keeps moments, quantiles and the mean spectrum only: memory does not
-    depend on the number of seeds. `store`, the path of a zarr store, streams every chunk to disk (`states` with it), or
-    what is reduced from time to time; with `resume` an interrupted one is continued, with `overwrite` an older ensemble is
-    replaced. Under `jax.distributed` all processes make the same call and share its chunks; all must see the store's folder.
+    depend on the number of seeds. `store`, the folder or URL (fsspec's, as s3://...) of a zarr store, streams every chunk
+    there (`states` with it), or what is reduced from time to time; with `resume` an interrupted one is continued, with
+    `overwrite` an older ensemble is replaced. Under `jax.distributed` all processes make the same call and share its chunks;
+    all must see the store.
+
+    `part=(i, n)` computes the i-th (from 1) of n parts of a store. The parts are processes that do not know of each other.
+    They may run in any order or at once. One that was killed, or is repeated, goes on where it was, `resume` or not. In the
+    end `jaxmuscle.ensembles.merge(store)` makes one ensemble of all.
+
+    `increments="weak"` takes numbers of 256 values with the first seven moments of a normal instead of normals, which is
+    faster. Expectations keep their order in dt, paths mean nothing: with `reduce` only, and quantiles from 1 to 99 %.
+    `generator`, "hash" (counter-based, see `docs/engine.md`) or "threefry" (JAX's own, slower), makes other noise.
 
     **Returns:** a `Trajectory`, of a sweep a `Population`; with `reduce` an `EnsembleSummary`; with `store` alone the opened
-    `xarray.Dataset` (dimensions (point,) seed, time, frequency).
+    `xarray.Dataset` (dimensions (point,) seed, time, frequency); with `part` always a `PartReport`. A merged store is opened
+    by the same call without `part`, with `resume`.
 
     **Raises:** as `simulate`: what does not stay finite is an error that names every such seed; with `reduce` or `store` it
     is left out, or NaN, and listed in `failed`. `ValueError` for a store that exists already or was made with other
@@ -106,7 +130,11 @@ def ensemble(  # pyright: ignore[reportInconsistentOverload]
         raise ValueError("resume continues a store, overwrite replaces it: give one of the two")
     if (resume or states) and store is None:
         raise ValueError(f"{'resume' if resume else 'states'} = True belongs to a store: give store=")
-    levels = _levels(reduce)
+    levels, draws = _levels(reduce), Draws.of(generator, increments)
+    if draws.increments == "weak":
+        _check_weak(levels)
+    place = None if store is None else place_of(store)
+    mine = None if part is None else Part.checked(part, store=store is not None, overwrite=overwrite)
     plan = plan_of(task, duration, dt, rate, substeps, sampling)
     if not all_concrete((task, key)):
         if isinstance(task, Sweep) or levels or store is not None:
@@ -114,20 +142,22 @@ def ensemble(  # pyright: ignore[reportInconsistentOverload]
                 "under a JAX transformation an ensemble can be of one task, in memory: no sweep, reduce or store"
             )
         linear = LinearTask.of(as_arrays(task)) if control else None
-        return trajectories(task, linear, key, jnp.asarray(np.asarray(numbers)), plan)
+        return trajectories(task, linear, key, jnp.asarray(np.asarray(numbers)), plan, draws=draws)
     linear = companions(task, duration, control)
     kept = levels is not None or store is not None
     spectrum = kept and covers_window(plan, task)
     whole = not kept or (states and levels is None)
-    cut = begun_with(Path(store)) if store is not None and resume and chunk is None else None
-    cut = cut_of(task, len(numbers), plan, chunk, shared=store is not None) if cut is None else cut
-    layout = laid_out(task, key, numbers, plan, linear, cut=cut, states=whole, spectrum=spectrum)
-    begin = "resume" if resume else "overwrite" if overwrite else "new"
+    again = chunk is None and (resume or mine is not None)
+    cut = begun_with(place) if place is not None and again else None
+    if cut is None:
+        cut = cut_of(task, len(numbers), plan, chunk, shared=place is not None, parts=None if mine is None else mine.of)
+    layout = laid_out(task, key, numbers, plan, linear, cut=cut, states=whole, spectrum=spectrum, draws=draws)
+    begin = "part" if mine is not None else "resume" if resume else "overwrite" if overwrite else "new"
     with telling(progress, layout) as tell:
         if levels is not None:
-            return reduced(layout, levels, None if store is None else Path(store), tell, begin=begin)
-        if store is not None:
-            return stored(layout, Path(store), tell, begin=begin, states=states)
+            return reduced(layout, levels, place, tell, begin=begin, part=mine)
+        if place is not None:
+            return stored(layout, place, tell, begin=begin, states=states, part=mine)
         return _in_memory(layout, tell)
 
 
@@ -139,6 +169,15 @@ def _levels(reduce: bool | tuple[float, ...]) -> tuple[float, ...] | None:
     if not all(0 < level < 1 for level in levels):
         raise ValueError(f"reduce = {reduce}: levels of quantiles lie between 0 and 1")
     return tuple(sorted(levels))
+
+
+def _check_weak(levels: tuple[float, ...] | None) -> None:
+    if levels is None:
+        raise ValueError('increments = "weak" is for expectations, its paths mean nothing: give reduce=True (--reduce)')
+    outside = [level for level in levels if not FURTHEST <= level <= 1 - FURTHEST]
+    if outside:
+        raise ValueError(f'reduce = {levels} with increments = "weak": quantiles beyond {FURTHEST:g} and {1 - FURTHEST:g} '
+                         f"depend on the tails of single increments ({listed(outside)}): leave increments out")  # fmt: skip
 
 
 def _in_memory(layout: Layout, tell: Callable[[Pace], None]) -> Trajectory | Population:

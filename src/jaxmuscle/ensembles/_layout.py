@@ -14,6 +14,7 @@ from jax.sharding import PartitionSpec as P
 from jaxtyping import Int, PRNGKeyArray
 
 from jaxmuscle._common.arrays import as_arrays
+from jaxmuscle.model._stream import Draws
 from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.response._linearised import LinearTask
 from jaxmuscle.simulation._batch import LANES, Recipe, blocks, local_mesh, run_points, run_seeds
@@ -107,6 +108,16 @@ class Layout(NamedTuple):
     def duration(self) -> float:
         return self.plan.grid.dt * self.plan.grid.steps
 
+    @property
+    def time(self) -> np.ndarray:
+        """Of the saved samples [s]."""
+        return np.arange(self.plan.grid.steps // self.plan.grid.every + 1) / self.plan.rate
+
+    @property
+    def bins(self) -> int:
+        """Of the spectrum; 0 if none is computed."""
+        return 0 if self.recipe.edges is None else self.recipe.settings.frequency.size
+
     def task_of(self, point: int) -> AbstractTask:
         return self.task[point] if isinstance(self.task, Sweep) else self.task
 
@@ -121,10 +132,11 @@ def laid_out(
     cut: Cut,
     states: bool,
     spectrum: bool,
+    draws: Draws,
 ) -> Layout:
     """The layout; with `spectrum` the Welch power of every seed is computed, with `states` they are kept."""
     settings = _one_of(task).settings
-    recipe = Recipe(plan.grid, plan.sampling, states, settings, lanes_of(plan))
+    recipe = Recipe(plan.grid, plan.sampling, states, settings, lanes_of(plan), draws=draws)
     if spectrum:
         edges = (round(WINDOW[0] * settings.rate), round(WINDOW[1] * settings.rate))
         recipe = dataclasses.replace(recipe, every=round(plan.rate / settings.rate), edges=edges)
@@ -136,17 +148,27 @@ def _one_of(task: AbstractTask | Sweep) -> AbstractTask:
     return task.task if isinstance(task, Sweep) else task
 
 
-def cut_of(task: AbstractTask | Sweep, seeds: int, plan: Schedule, chunk: int | None, *, shared: bool) -> Cut:
+def cut_of(
+    task: AbstractTask | Sweep, seeds: int, plan: Schedule, chunk: int | None, *, shared: bool, parts: int | None = None
+) -> Cut:
     """As many seeds at once as the cache of every device likes, times `BLOCKS`; whole points where their seeds are few.
 
-    Where processes share the work, what process 0 says.
+    Where processes share the work, what process 0 says. Parts of a store cannot ask one another: each takes what one device
+    likes, so that machines need not be alike, or less, so that there is as much for every part.
     """
-    lanes = lanes_of(plan) * jax.local_device_count() if chunk is None else chunk
-    lanes = int(agreed(str(lanes))) if shared else lanes
+    if chunk is not None:
+        lanes, most, parts = chunk, chunk, None
+    else:
+        lanes = lanes_of(plan) * (jax.local_device_count() if parts is None else 1)
+        lanes = int(agreed(str(lanes))) if shared else lanes
+        most = lanes * BLOCKS
+    points = len(task) if isinstance(task, Sweep) else 1
     if isinstance(task, Sweep) and 2 * seeds <= lanes:
-        return Cut(min(len(task), lanes // seeds), seeds)
-    lanes *= BLOCKS if chunk is None else 1
-    return Cut(1, EIGHT * math.ceil(min(lanes, seeds) / EIGHT))
+        return Cut(min(math.ceil(points / (parts or 1)), lanes // seeds), seeds)
+    width, fair = min(most, seeds), math.ceil(points * seeds / (parts or 1))
+    if fair < seeds:  # a part has several equal chunks, or one
+        width = math.ceil(fair / math.ceil(fair / width))
+    return Cut(1, EIGHT * math.ceil(width / EIGHT))
 
 
 def lanes_of(plan: Schedule) -> int:

@@ -4,7 +4,6 @@ import hashlib
 import json
 import time
 from collections.abc import Callable
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import jax
@@ -14,30 +13,36 @@ from jaxtyping import Int
 from jaxmuscle._common.arrays import as_numbers
 from jaxmuscle._common.environment import versions
 from jaxmuscle._common.errors import SimulationError, StoreError
-from jaxmuscle._common.text import squared
-from jaxmuscle.model._parameters import PARAMETERS
+from jaxmuscle.model._stream import VERSION as STREAM
 from jaxmuscle.response._expected import linear_spectrum
 from jaxmuscle.simulation._trajectory import run_attributes
 
+from ._arrays import region_of, variables_of
 from ._layout import Chunk, Cut, Layout, Pace, run_chunks
+from ._parts import Part, PartReport, finish
+from ._places import AbstractPlace
 from ._processes import agreed, meet, rank_and_count
 from ._running_moments import CELLS, add, count_cells, empty, set_cells
 from ._store import (
+    CHUNKS,
+    PARTS,
     SETTINGS,
     Begin,
     Reduced,
     Variable,
-    attributes_of,
-    begin_log,
-    complete,
+    attributes_at,
     create,
+    ensemble_at,
+    generation_of,
     log_chunk,
     logged,
     read_tallies,
+    read_tally,
     state_of,
-    tally_files,
-    write_moments,
+    tally_key,
+    tally_keys,
     write_region,
+    write_tally,
 )
 from ._summary import EnsembleSummary, summarised
 from ._sweep import Sweep
@@ -52,48 +57,73 @@ KEEP_SHARE = 20  # and at least this many times what writing one took
 Tell = Callable[[Pace], None]
 
 
-def reduced(layout: Layout, levels: tuple[float, ...], path: Path | None, tell: Tell, *, begin: Begin) -> EnsembleSummary:
-    """Moments, quantiles and the mean spectrum of all chunks; kept in a store from time to time if there is one."""
-    settings = settings_of(layout) | {"kind": "reduced", "quantiles": list(levels)}
-    values = _time(layout).size + (2 * _bins(layout) + 1 if _bins(layout) else 0)
+def reduced(
+    layout: Layout,
+    levels: tuple[float, ...],
+    place: AbstractPlace | None,
+    tell: Tell,
+    *,
+    begin: Begin = "new",
+    part: Part | None = None,
+) -> EnsembleSummary | PartReport:
+    """Moments, quantiles and the mean spectrum of all chunks; kept in a store from time to time if there is one.
+
+    Of one part its chunks only, whose tally stays in the store until it is merged.
+    """
+    settings = _settings(layout, part, {"kind": "reduced", "quantiles": list(levels)})
+    values = layout.time.size + (2 * layout.bins + 1 if layout.bins else 0)
 
     def nothing() -> Reduced:
-        tally = empty(layout.points, values, _time(layout).size, len(levels), whole=layout.whole)
+        tally = empty(layout.points, values, layout.time.size, len(levels), whole=layout.whole)
         return Reduced(tally, frozenset(), [])
 
     blank = _summary(layout, levels, nothing())
-    if path is None:
+    if place is None:
         found = _reduce(layout, levels, nothing(), range(layout.chunks), tell, lambda found: None)
         return _summary(layout, levels, found)
-    variables = {name: Variable(dims, array.shape, array.shape, array.dtype, units,
-                                array if name in blank.coordinates() else None)
+    known = {*blank.coordinates(), "power_expected"}
+    variables = {name: Variable(dims, array.shape, array.shape, array.dtype, units, array if name in known else None)
                  for name, (dims, array, units) in blank.arrays().items()}  # fmt: skip
-    if _opened(path, variables, blank.coordinates(), blank.attributes(), settings, begin=begin):
-        _share_tallies(layout, levels, path, tell, nothing)
+    left = _opened(place, variables, blank.coordinates(), blank.attributes() | settings, begin=begin)
+    if part is not None:
+        failed = _reduce_part(layout, levels, place, part, tell, nothing) if left else _failed_in(place)
+        return _report(layout, part, failed, complete=not left)
+    if left:
+        _share_tallies(layout, levels, place, tell, nothing)
         if rank_and_count()[0] == 0:
-            whole = _summary(layout, levels, read_tallies(path, nothing()))
-            write_region(path, ..., {name: array for name, (_, array, _) in whole.arrays().items()})
-            complete(path, {"failed": json.dumps(whole.failed.tolist())})
+            finish(place, layout.chunks)
         meet()
-    return _loaded(path, blank)
+    return _loaded(place, blank)
 
 
 def _share_tallies(
-    layout: Layout, levels: tuple[float, ...], path: Path, tell: Tell, nothing: Callable[[], Reduced]
+    layout: Layout, levels: tuple[float, ...], place: AbstractPlace, tell: Tell, nothing: Callable[[], Reduced]
 ) -> None:
     """Every process reduces its share of what no tally in the store has yet; process 0 takes over those there are."""
     rank, count = rank_and_count()
-    base, old = read_tallies(path, nothing()), tally_files(path)
+    base, old = read_tallies(place) or nothing(), tally_keys(place)
     todo = [n for n in range(layout.chunks) if n not in base.chunks][rank::count]
-    name = f"{1 + max((int(file.stem.split('-')[1]) for file in old), default=0):06d}-{rank:06d}"
+    key = tally_key(1 + max(map(generation_of, old), default=0), rank)
     meet()  # all know what is left before anybody adds to it
     if rank == 0 and old:
-        write_moments(path, name, base)
-        for file in old:
-            file.unlink(missing_ok=True)
-    found = _reduce(layout, levels, base if rank == 0 else nothing(), todo, tell, _keeper(path, name))
-    write_moments(path, name, found)
+        write_tally(place, key, base)
+        place.remove(*old)
+    found = _reduce(layout, levels, base if rank == 0 else nothing(), todo, tell, _keeper(place, key))
+    write_tally(place, key, found)
     meet()
+
+
+def _reduce_part(
+    layout: Layout, levels: tuple[float, ...], place: AbstractPlace, part: Part, tell: Tell, nothing: Callable[[], Reduced]
+) -> list[list[int]]:
+    """One part goes on with its own tally, and no other process writes that; the (point, seed) that failed."""
+    key = tally_key(0, part.number)
+    base = read_tally(place, key) or nothing()
+    todo = [n for n in part.chunks(layout.chunks) if n not in base.chunks]
+    if todo:
+        base = _reduce(layout, levels, base, todo, tell, _keeper(place, key))
+        write_tally(place, key, base)
+    return base.failed
 
 
 def _reduce(
@@ -138,14 +168,14 @@ def _cell_sample(layout: Layout, chunk: Chunk, point: int, output: np.ndarray) -
 def _rows(layout: Layout, found: dict[str, np.ndarray], row: int) -> np.ndarray:
     """The values of every seed that are averaged: output, Welch power, what the linear response leaves of it, variation."""
     output = found["output"][row]
-    if not _bins(layout):
+    if not layout.bins:
         return output.astype(float)
     power = found["power"][row]
     left = power - found["linear_power"][row] if layout.linear is not None else np.zeros_like(power)
     return np.concatenate([output, power, left, found["variation"][row][:, None]], axis=1, dtype=float)
 
 
-def _keeper(path: Path, name: str) -> Callable[[Reduced], None]:
+def _keeper(place: AbstractPlace, key: str) -> Callable[[Reduced], None]:
     """Writes what it is given, not too often."""
     due = time.monotonic() + KEEP_EVERY
 
@@ -153,60 +183,77 @@ def _keeper(path: Path, name: str) -> Callable[[Reduced], None]:
         nonlocal due
         begun = time.monotonic()
         if begun >= due:
-            write_moments(path, name, found)
+            write_tally(place, key, found)
             now = time.monotonic()
             due = now + max(KEEP_EVERY, KEEP_SHARE * (now - begun))
 
     return keep
 
 
-def stored(layout: Layout, path: Path, tell: Tell, *, begin: Begin, states: bool) -> "xarray.Dataset":
-    """Every trajectory, and its Welch power, to a store; opened when it is complete."""
+def stored(
+    layout: Layout, place: AbstractPlace, tell: Tell, *, begin: Begin, states: bool, part: Part | None
+) -> "xarray.Dataset | PartReport":
+    """Every trajectory, and its Welch power, to a store; opened when it is complete. Of one part its chunks only."""
     import xarray
 
-    settings = settings_of(layout) | {"kind": "trajectories", "states": states}
-    variables, coordinates = _variables(layout, states=states)
-    if _opened(path, variables, coordinates, _about(layout), settings, begin=begin):
+    settings = _settings(layout, part, {"kind": "trajectories", "states": states})
+    variables, coordinates = variables_of(layout, states=states)
+    left = _opened(place, variables, coordinates, _about(layout) | settings, begin=begin)
+    own = range(layout.chunks) if part is None else part.chunks(layout.chunks)
+    if left:
         rank, count = rank_and_count()
-        done = logged(path)
+        done = logged(place, own)
+        meet()  # all know what is left before anybody adds to it
+        for chunk, found in run_chunks(layout, [n for n in own if n not in done][rank::count], tell):
+            region, parts = region_of(layout, chunk, found, states=states)
+            write_region(place, region, parts)
+            log_chunk(place, chunk.number, _failed(layout, chunk, found))
         meet()
-        begin_log(path, rank)
-        todo = [n for n in range(layout.chunks) if n not in done][rank::count]
-        for chunk, found in run_chunks(layout, todo, tell):
-            region, parts = _region(layout, chunk, found, states=states)
-            write_region(path, region, parts)
-            log_chunk(path, rank, chunk.number, _failed(layout, chunk, found))
+        if part is None and rank == 0:
+            finish(place, layout.chunks)
         meet()
-        if rank == 0:
-            there = logged(path)
-            missing = layout.chunks - len(there)
-            if missing:
-                raise StoreError(f"{path}: {missing} chunks are missing although all processes are done: is the folder the "
-                                 "same for all of them? Resume on a shared file system")  # fmt: skip
-            failed = [entry for number in sorted(there) for entry in there[number]]
-            complete(path, {"failed": json.dumps(failed)})
-        meet()
-    return xarray.open_zarr(path)
+    if part is None:
+        return xarray.open_zarr(place.opened())
+    there = logged(place, own)
+    failed = [entry for number in sorted(there) for entry in there[number]] if left else _failed_in(place)
+    return _report(layout, part, failed, complete=not left)
 
 
-def begun_with(path: Path) -> Cut | None:
+def _report(layout: Layout, part: Part, failed: list[list[int]], *, complete: bool) -> PartReport:
+    chunks = [layout.chunk(number) for number in part.chunks(layout.chunks)]
+    seeds = sum(len(chunk.points) * len(chunk.seeds) for chunk in chunks)
+    return PartReport(*part, seeds, np.array(sorted(failed), int).reshape(-1, 2), complete)
+
+
+def _failed_in(place: AbstractPlace) -> list[list[int]]:
+    """The (point, seed) that failed in a complete store."""
+    return json.loads(attributes_at(place)["failed"])
+
+
+def begun_with(place: AbstractPlace) -> Cut | None:
     """How an existing store was cut, so that it can be resumed with other devices; None if there is none."""
-    if not path.exists():
+    if not place.exists():
         return None
-    settings = json.loads(attributes_of(path).get(SETTINGS, "{}"))
+    settings = json.loads(ensemble_at(place)[SETTINGS])
     return Cut(settings["points at once"], settings["chunk"]) if "chunk" in settings else None
 
 
+def _settings(layout: Layout, part: Part | None, kind: dict[str, Any]) -> dict[str, Any]:
+    """Attributes by which a store is known again: all that its numbers depend on, and its parts."""
+    settings = {SETTINGS: json.dumps(settings_of(layout) | kind)}
+    return settings if part is None else settings | {PARTS: part.of, CHUNKS: layout.chunks}
+
+
 def _opened(
-    path: Path, variables: dict[str, Variable], coordinates: list[str], attributes: dict, settings: dict, *, begin: Begin
+    place: AbstractPlace, variables: dict[str, Variable], coordinates: list[str], attributes: dict, *, begin: Begin
 ) -> bool:
     """Make or find the store, as process 0 sees it; whether there is work left. All processes raise the same error."""
     said, failure = "", None
     if rank_and_count()[0] == 0:
         try:
-            said = state_of(path, settings, begin=begin)
-            if said == "absent":
-                create(path, variables, coordinates, attributes | {SETTINGS: json.dumps(settings)})
+            said = state_of(place, attributes, begin=begin)
+            if said == "absent" and not create(place, variables, coordinates, attributes):
+                said = state_of(place, attributes, begin="part" if PARTS in attributes else "new")
         except (ValueError, OSError) as error:
             said, failure = f"error: {error}", error
     said = agreed(said)
@@ -214,81 +261,29 @@ def _opened(
         raise failure
     if said.startswith("error: "):
         raise StoreError(said.removeprefix("error: "))
-    if not path.exists():
-        raise StoreError(f"{path}: process {rank_and_count()[0]} does not see what process 0 made: give a folder that all "
-                         "processes share")  # fmt: skip
+    if not place.exists():
+        raise StoreError(f"{place.name}: process {rank_and_count()[0]} does not see what process 0 made: give a folder that "
+                         "all processes share")  # fmt: skip
     return said != "complete"
-
-
-def _variables(layout: Layout, *, states: bool) -> tuple[dict[str, Variable], list[str]]:
-    task, time_, swept = layout.task_of(0), _time(layout), isinstance(layout.task, Sweep)
-    lead, shape = (("point",), (layout.points,)) if swept else ((), ())
-    cut = (layout.together,) if swept else ()
-    width, seeds = min(layout.width, len(layout.seeds)), len(layout.seeds)
-    dtype = np.dtype(jax.numpy.result_type(float))
-    found = {
-        "seed": Variable(("seed",), (seeds,), (seeds,), np.int64, "", np.asarray(layout.seeds)),
-        "time": Variable(("time",), (time_.size,), (time_.size,), float, "s", time_),
-        task.output_name: Variable((*lead, "seed", "time"), (*shape, seeds, time_.size), (*cut, width, time_.size), dtype,
-                                   task.output_unit),
-    }  # fmt: skip
-    units = zip(task.state_names, task.state_units, strict=True) if states else ()
-    for name, unit in units:
-        found.setdefault(name, found[task.output_name]._replace(units=unit))
-    coordinates = ["seed", "time"]
-    if _bins(layout):
-        bins, frequency = _bins(layout), task.settings.frequency
-        found["frequency"] = Variable(("frequency",), (bins,), (bins,), float, "Hz", frequency)
-        found["power"] = Variable((*lead, "seed", "frequency"), (*shape, seeds, bins), (*cut, width, bins), dtype,
-                                  squared(task.output_unit) + "/Hz")  # fmt: skip
-        coordinates.append("frequency")
-    if isinstance(layout.task, Sweep):
-        for name, values in layout.task.labels.items():
-            unit = PARAMETERS[name].unit if name in PARAMETERS else ""
-            found[name] = Variable(("point",), values.shape, values.shape, values.dtype, unit, values)
-            coordinates.append(name)
-    return found, coordinates
-
-
-def _region(
-    layout: Layout, chunk: Chunk, found: dict[str, np.ndarray], *, states: bool
-) -> tuple[tuple[slice, ...], dict[str, np.ndarray]]:
-    task = layout.task_of(0)
-    parts = {task.output_name: found["output"]} | ({"power": found["power"]} if _bins(layout) else {})
-    if states:
-        for i, name in enumerate(task.state_names):
-            parts.setdefault(name, found["states"][..., i])
-    region = slice(chunk.points.start, chunk.points.stop), slice(chunk.seeds.start, chunk.seeds.stop)
-    if not isinstance(layout.task, Sweep):
-        return region[1:], {name: values[0] for name, values in parts.items()}
-    return region, parts
-
-
-def _bins(layout: Layout) -> int:
-    return 0 if layout.recipe.edges is None else layout.recipe.settings.frequency.size
-
-
-def _time(layout: Layout) -> np.ndarray:
-    return np.arange(layout.plan.grid.steps // layout.plan.grid.every + 1) / layout.plan.rate
 
 
 def _summary(layout: Layout, levels: tuple[float, ...], found: Reduced) -> EnsembleSummary:
     expected = None
-    if _bins(layout) and layout.linear is not None:
+    if layout.bins and layout.linear is not None:
         spectra = [linear_spectrum(layout.task_of(i), layout.recipe.settings) for i in range(layout.points)]
         expected = np.stack([np.asarray(spectrum.power, float) for spectrum in spectra])
     failed: Int[np.ndarray, "failed 2"] = np.array(sorted(found.failed), int).reshape(-1, 2)
     about = _about(layout) | ({} if layout.whole else {"cells_per_quantile": CELLS})
-    return summarised(found.tally, layout.task, (len(layout.seeds), _bins(layout)), _time(layout), levels,
-                      layout.recipe.settings, expected, failed, about)  # fmt: skip
+    return summarised(found.tally, layout.task, len(layout.seeds), layout.time, levels, layout.recipe.settings, expected,
+                      failed, about)  # fmt: skip
 
 
-def _loaded(path: Path, blank: EnsembleSummary) -> EnsembleSummary:
+def _loaded(place: AbstractPlace, blank: EnsembleSummary) -> EnsembleSummary:
     """The summary in a complete store."""
     import zarr
 
-    group: Any = zarr.open_group(path, mode="r")
-    failed = np.array(json.loads(attributes_of(path)["failed"]), int).reshape(-1, 2)
+    group: Any = zarr.open_group(place.opened(), mode="r")
+    failed = np.array(_failed_in(place), int).reshape(-1, 2)
     return blank.with_arrays({name: np.asarray(group[name][...]) for name in blank.arrays()}, failed)
 
 
@@ -314,6 +309,7 @@ def settings_of(layout: Layout) -> dict[str, Any]:
         "dt": plan.grid.dt, "rate": plan.rate, "substeps": plan.grid.substeps, "sampling": plan.sampling,
         "spectrum": task.settings.to_dict(), "control": layout.linear is not None, "chunk": layout.width,
         "points at once": layout.together, "precision": str(jax.numpy.result_type(float)),
+        "random numbers": layout.recipe.draws._asdict() | {"stream": STREAM},
         "versions": {name: versions()[name] for name in ("jaxmuscle", "jax")},
     }  # fmt: skip
 

@@ -1,25 +1,24 @@
 """Ensembles as zarr stores: written chunk by chunk by one or many processes, resumed, never complete before they are."""
 
 import contextlib
+import io
 import json
-import os
-import shutil
-import tempfile
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
 from jaxmuscle._common.errors import StoreError
-from jaxmuscle._common.files import replacing, write_json
 
+from ._places import PROGRESS, ROOT, AbstractPlace, place_of
 from ._running_moments import RunningMoments, merged
 
-Begin = Literal["new", "resume", "overwrite"]
-SETTINGS = "settings"
-DONE, TALLY = "progress-", "tally-"
+Begin = Literal["new", "resume", "overwrite", "part"]
+SETTINGS, PARTS, CHUNKS = "settings", "parts", "chunks"
+DONE, TALLY = f"{PROGRESS}/chunk-", f"{PROGRESS}/tally-"
 
 
 class Variable(NamedTuple):
@@ -33,79 +32,113 @@ class Variable(NamedTuple):
     values: np.ndarray | None = None
 
 
-def create(path: Path, variables: Mapping[str, Variable], coordinates: list[str], attributes: dict[str, Any]) -> None:
-    """A new, incomplete store, which appears whole or not at all."""
+def create(
+    place: AbstractPlace, variables: Mapping[str, Variable], coordinates: list[str], attributes: dict[str, Any]
+) -> bool:
+    """A new, incomplete store, which appears whole or not at all; False if another process was faster.
+
+    **Raises:** `StoreError` if another has begun it with other settings.
+    """
+    with writing(place):
+        _refuse(place, json.loads(place.claim(attributes[SETTINGS])), json.loads(attributes[SETTINGS]))
+        with place.building() as folder:
+            _build(folder, variables, coordinates, attributes)
+            return place.put(folder)
+
+
+def _build(folder: Path, variables: Mapping[str, Variable], coordinates: list[str], attributes: dict[str, Any]) -> None:
     import zarr
 
-    with writing(path):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        temporary = Path(tempfile.mkdtemp(prefix=f".{path.name}-", dir=path.parent))
-        try:
-            labels = [name for name in coordinates if variables[name].dims != (name,)]
-            group = zarr.open_group(temporary, mode="w", zarr_format=3)
-            group.attrs.update(attributes | ({"coordinates": " ".join(labels)} if labels else {}) | {"complete": False})
-            for name, v in variables.items():
-                fill = np.nan if np.issubdtype(np.dtype(v.dtype), np.floating) else None
-                dtype = "string" if np.dtype(v.dtype).kind == "U" else v.dtype  # fixed width is not in the specification
-                array = group.create_array(name, shape=v.shape, chunks=v.chunks, dtype=dtype, dimension_names=v.dims,
-                                           fill_value=fill, attributes={"units": v.units} if v.units else {})  # fmt: skip
-                if v.values is not None:
-                    array[...] = v.values
-            _consolidate(temporary)
-            temporary.chmod(0o755)
-            os.rename(temporary, path)
-        finally:
-            shutil.rmtree(temporary, ignore_errors=True)
-
-
-def _consolidate(path: Path) -> None:
-    """Keep a copy of all arrays' metadata at the root, where xarray looks for it first."""
-    import zarr
-
+    labels = [name for name in coordinates if variables[name].dims != (name,)]
+    group = zarr.open_group(folder, mode="w", zarr_format=3)
+    group.attrs.update(attributes | ({"coordinates": " ".join(labels)} if labels else {}) | {"complete": False})
+    for name, v in variables.items():
+        fill = np.nan if np.issubdtype(np.dtype(v.dtype), np.floating) else None
+        dtype = "string" if np.dtype(v.dtype).kind == "U" else v.dtype  # fixed width is not in the specification
+        array = group.create_array(name, shape=v.shape, chunks=v.chunks, dtype=dtype, dimension_names=v.dims,
+                                   fill_value=fill, attributes={"units": v.units} if v.units else {})  # fmt: skip
+        if v.values is not None:
+            array[...] = v.values
     with warnings.catch_warnings():
+        # A copy of all arrays' metadata at the root, where xarray looks for it first.
         warnings.filterwarnings("ignore", "Consolidated metadata is currently not part", category=UserWarning)
-        zarr.consolidate_metadata(path)
+        zarr.consolidate_metadata(folder)
 
 
 @contextlib.contextmanager
-def writing(path: Path) -> Iterator[None]:
+def writing(place: AbstractPlace) -> Iterator[None]:
     """What the system refuses (a full disk, a folder without permission) becomes an error with the way on."""
     try:
         yield
     except OSError as error:
         remedy = "what is complete stays: make room, or permission, and resume (--resume, resume=True)"
-        raise OSError(error.errno, f"{error.strerror or error}; {remedy}", str(path)) from error
+        raise OSError(error.errno, f"{error.strerror or error}; {remedy}", place.name) from error
 
 
-def attributes_of(path: Path) -> dict[str, Any]:
-    """Attributes of the store at `path`. **Raises:** `StoreError` if there is none."""
-    try:
-        return json.loads((path / "zarr.json").read_text(encoding="utf-8"))["attributes"]
-    except (OSError, ValueError, KeyError) as error:
-        raise StoreError(f"{path}: is not a store that jaxmuscle wrote ({error}); give another name") from None
+def attributes_of(path: str | Path) -> dict[str, Any] | None:
+    """Attributes of the store at `path`, a folder or a URL; None if nothing is there.
 
-
-def state_of(path: Path, settings: dict[str, Any], *, begin: Begin) -> str:
-    """Whether a store is "absent", "begun" or "complete"; one that is to be overwritten is removed.
-
-    **Raises:** `StoreError` if it is there and not to be resumed, or was made with other settings (named).
+    **Raises:** `StoreError` if something else is there, or if the URL cannot be used.
     """
-    if not (path.exists() or path.is_symlink()):
+    place = place_of(path)
+    return attributes_at(place) if place.exists() else None
+
+
+def attributes_at(place: AbstractPlace) -> dict[str, Any]:
+    """Attributes of a store. **Raises:** `StoreError` if there is none."""
+    try:
+        root = place.read(ROOT)
+        if root is None:
+            raise ValueError(f"no {ROOT}")
+        return json.loads(root)["attributes"]
+    except (OSError, ValueError, KeyError) as error:
+        raise StoreError(f"{place.name}: is not a store that jaxmuscle wrote ({error}); give another name") from None
+
+
+def state_of(place: AbstractPlace, wanted: dict[str, Any], *, begin: Begin) -> str:
+    """Whether a store of these attributes is "absent", "begun" or "complete"; one that is to be overwritten is removed.
+
+    **Raises:** `StoreError` if it is there and not to be resumed, was made with other settings (named) or in other parts.
+    """
+    if not place.exists():
         return "absent"
     if begin == "new":
-        raise StoreError(f"{path}: exists already; resume it (--resume, resume=True), overwrite it (--force, "
+        raise StoreError(f"{place.name}: exists already; resume it (--resume, resume=True), overwrite it (--force, "
                          "overwrite=True), or give another name")  # fmt: skip
-    attributes = attributes_of(path)
-    if SETTINGS not in attributes or "complete" not in attributes:
-        raise StoreError(f"{path}: is not an ensemble that can be resumed (no settings in it); give another name")
+    found = ensemble_at(place)
     if begin == "overwrite":
-        with writing(path):
-            shutil.rmtree(path)
+        with writing(place):
+            place.clear()
         return "absent"
-    different = differences(json.loads(attributes[SETTINGS]), settings)
+    _refuse(place, json.loads(found[SETTINGS]), json.loads(wanted[SETTINGS]))
+    if found["complete"]:
+        return "complete"
+    there = found.get(PARTS)
+    if there != wanted.get(PARTS):
+        made, remedy = ("without parts", "resume it without --part, part=") if there is None else (
+            f"in {there} parts", f"run each with --part I/{there}, part=(i, {there}), then merge them (jaxmuscle merge)"
+        )  # fmt: skip
+        raise StoreError(f"{place.name}: is being made {made}: {remedy}, or give another name")
+    return "begun"
+
+
+def ensemble_at(place: AbstractPlace) -> dict[str, Any]:
+    """Attributes of an ensemble's store. **Raises:** `StoreError` if it is something else."""
+    attributes = attributes_at(place)
+    if SETTINGS not in attributes or "complete" not in attributes:
+        raise StoreError(f"{place.name}: is not an ensemble that can be resumed (no settings in it); give another name")
+    return attributes
+
+
+def _refuse(place: AbstractPlace, there: dict[str, Any], here: dict[str, Any]) -> None:
+    if "random numbers" not in there:
+        raise StoreError(f"{place.name}: was begun by an earlier version of jaxmuscle, whose seeds have other noise. So it "
+                         "cannot go on: begin it anew (--force, overwrite=True), or give another name")  # fmt: skip
+    different = differences(there, here)
     if different:
-        raise StoreError(f"{path}: was made with other settings: {'; '.join(different)}. Repeat them, or give another name")
-    return "complete" if attributes["complete"] else "begun"
+        raise StoreError(
+            f"{place.name}: was made with other settings: {'; '.join(different)}. Repeat them, or give another name"
+        )
 
 
 def differences(there: Any, here: Any, name: str = "") -> list[str]:
@@ -123,43 +156,30 @@ def _short(value: Any) -> str:
     return text if len(text) <= 60 else f"{text[:57]}..."
 
 
-def write_region(path: Path, region: Any, values: Mapping[str, np.ndarray]) -> None:
+def write_region(place: AbstractPlace, region: Any, values: Mapping[str, np.ndarray]) -> None:
     """Write part of some arrays; the region cuts their leading dimensions."""
     import zarr
 
-    with writing(path):
-        group = zarr.open_group(path, mode="r+")
+    with writing(place):
+        group = zarr.open_group(place.opened(), mode="r+")
         for name, part in values.items():
             array: Any = group[name]
             array[region] = part
 
 
-def begin_log(path: Path, rank: int) -> None:
-    """Start, or go on with, the log of the chunks that this process completes; ends a line that a full disk has cut."""
-    _append(path, rank, b"\n")
-
-
-def log_chunk(path: Path, rank: int, chunk: int, failed: list[list[int]]) -> None:
+def log_chunk(place: AbstractPlace, chunk: int, failed: list[list[int]]) -> None:
     """A chunk has been written, with these failed (point, seed)."""
-    _append(path, rank, json.dumps({"chunk": chunk, "failed": failed}).encode() + b" ok\n")
+    with writing(place):
+        place.write(f"{DONE}{chunk:08d}.json", json.dumps(failed).encode())
 
 
-def _append(path: Path, rank: int, line: bytes) -> None:
-    with writing(path), (path / f"{DONE}{rank}.txt").open("ab") as file:
-        file.write(line)
-        file.flush()
-        os.fsync(file.fileno())
-
-
-def logged(path: Path) -> dict[int, list[list[int]]]:
-    """Complete chunks of a store of trajectories, with the (point, seed) that failed in them."""
-    found = {}
-    for file in sorted(path.glob(f"{DONE}*.txt")):
-        for line in file.read_bytes().split(b"\n"):
-            if line.endswith(b" ok"):
-                entry = json.loads(line[:-3])
-                found[entry["chunk"]] = entry["failed"]
-    return found
+def logged(place: AbstractPlace, among: Iterable[int] | None = None) -> dict[int, list[list[int]]]:
+    """Complete chunks of a store of trajectories, all or `among` these, with the (point, seed) that failed in them."""
+    keys = {int(key.removeprefix(DONE)[:8]): key for key in place.progress() if key.startswith(DONE)}
+    numbers = sorted(keys.keys() if among is None else keys.keys() & set(among))
+    with ThreadPoolExecutor() as pool:  # an object store takes tens of milliseconds for each
+        found = pool.map(lambda number: place.read(keys[number]), numbers)
+        return {number: json.loads(data) for number, data in zip(numbers, found, strict=True) if data is not None}
 
 
 class Reduced(NamedTuple):
@@ -170,35 +190,56 @@ class Reduced(NamedTuple):
     failed: list[list[int]]
 
 
-def write_moments(path: Path, name: str, reduced: Reduced) -> None:
-    """Keep what was reduced so far; replaces the file in one step."""
-    with writing(path), replacing(path / f"{TALLY}{name}.npz") as temporary, temporary.open("wb") as file:
-        np.savez(file, chunks=np.array(sorted(reduced.chunks), int), failed=np.array(reduced.failed, int).reshape(-1, 2),
-                 **reduced.tally._asdict())  # fmt: skip
+def write_tally(place: AbstractPlace, key: str, reduced: Reduced) -> None:
+    """Keep what was reduced so far; replaces the key in one step."""
+    data = io.BytesIO()
+    np.savez(data, chunks=np.array(sorted(reduced.chunks), int), failed=np.array(reduced.failed, int).reshape(-1, 2),
+             **reduced.tally._asdict())  # fmt: skip
+    with writing(place):
+        place.write(key, data.getvalue())
 
 
-def read_tallies(path: Path, whole: Reduced) -> Reduced:
-    """All tallies of a store, added to `whole`; those that a later one contains are not counted twice."""
-    for file in sorted(path.glob(f"{TALLY}*.npz"), reverse=True):
-        with np.load(file) as data:
-            chunks = frozenset(data["chunks"].tolist())
-            if chunks & whole.chunks:
-                continue
-            part = RunningMoments(*(data[name] for name in RunningMoments._fields))
-            whole = Reduced(merged(whole.tally, part), whole.chunks | chunks, whole.failed + data["failed"].tolist())
+def read_tally(place: AbstractPlace, key: str) -> Reduced | None:
+    """What was kept under a key, None if there is nothing."""
+    kept = place.read(key)
+    if kept is None:
+        return None
+    with np.load(io.BytesIO(kept)) as data:
+        tally = RunningMoments(*(data[name] for name in RunningMoments._fields))
+        return Reduced(tally, frozenset(data["chunks"].tolist()), data["failed"].tolist())
+
+
+def read_tallies(place: AbstractPlace) -> Reduced | None:
+    """All tallies of a store together, None if there is none; those that a later one contains are not counted twice."""
+    whole = None
+    for key in reversed(tally_keys(place)):
+        part = read_tally(place, key)
+        if part is None or whole is None:
+            whole = part or whole
+        elif not part.chunks & whole.chunks:
+            whole = Reduced(merged(whole.tally, part.tally), whole.chunks | part.chunks, whole.failed + part.failed)
     return whole
 
 
-def tally_files(path: Path) -> list[Path]:
-    """Files that hold tallies."""
-    return sorted(path.glob(f"{TALLY}*.npz"))
+def tally_keys(place: AbstractPlace) -> list[str]:
+    """Keys that hold tallies."""
+    return [key for key in place.progress() if key.startswith(TALLY)]
 
 
-def complete(path: Path, attributes: dict[str, Any]) -> None:
+def tally_key(generation: int, rank: int) -> str:
+    """Key of a process's tally; one of a later generation contains those of the earlier ones that it shares a chunk with."""
+    return f"{TALLY}{generation:06d}-{rank:06d}.npz"
+
+
+def generation_of(key: str) -> int:
+    """Generation of a tally."""
+    return int(key.removeprefix(TALLY)[:6])
+
+
+def complete(place: AbstractPlace, attributes: dict[str, Any]) -> None:
     """Say that a store is complete, then drop what was needed to resume it."""
-    with writing(path):
-        document = json.loads((path / "zarr.json").read_text(encoding="utf-8"))
+    with writing(place):
+        document = json.loads(place.read(ROOT) or b"")
         document["attributes"] |= attributes | {"complete": True}
-        write_json(path / "zarr.json", document)
-        for file in (*path.glob(f"{DONE}*.txt"), *tally_files(path)):
-            file.unlink(missing_ok=True)
+        place.write(ROOT, (json.dumps(document, indent=1, ensure_ascii=False, allow_nan=False) + "\n").encode())
+        place.forget()

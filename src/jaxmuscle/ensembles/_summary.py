@@ -11,7 +11,7 @@ from jaxtyping import Float, Int
 from jaxmuscle import plot
 from jaxmuscle._common.text import folded, listed, squared
 from jaxmuscle.model._tasks import AbstractTask
-from jaxmuscle.spectra._mean import SpectrumEstimate, from_moments
+from jaxmuscle.spectra._mean import SpectrumEstimate
 from jaxmuscle.spectra._settings import SpectrumSettings
 
 from ._running_moments import RunningMoments, quantiles
@@ -155,10 +155,33 @@ class EnsembleSummary(eqx.Module):
         return folded(lines)
 
 
+def computed(
+    tally: RunningMoments, levels: tuple[float, ...], expected: Float[np.ndarray, "points bins"] | None
+) -> dict[str, Float[np.ndarray, "points ..."]]:
+    """All that a tally says, by the names of `EnsembleSummary.arrays`; `expected`, the exact linear spectra or None."""
+    samples = tally.low.shape[1]
+    bins = (tally.mean.shape[1] - samples) // 2  # then come power, what the linear response leaves of it, and variation
+    with np.errstate(invalid="ignore", divide="ignore"):
+        seen = np.where(tally.seeds > 0, tally.seeds, np.nan)[:, None]
+        averages = tally.mean + 0 * seen
+        variance = tally.squares / np.where(seen > 1, seen - 1, np.nan)
+        stderr = np.sqrt(variance / seen)
+    found = {"mean": averages[:, :samples], "variance": variance[:, :samples], "quantiles": quantiles(tally, levels)}
+    if bins:
+        plain, left = slice(samples, samples + bins), slice(samples + bins, samples + 2 * bins)
+        found |= {"coefficient_of_variation": averages[:, -1], "coefficient_of_variation_stderr": stderr[:, -1],
+                  "plain_power": averages[:, plain], "plain_stderr": stderr[:, plain]}  # fmt: skip
+        if expected is None:
+            found |= {"power": averages[:, plain], "power_stderr": stderr[:, plain]}
+        else:
+            found |= {"power": expected + averages[:, left], "power_stderr": stderr[:, left], "power_expected": expected}
+    return found
+
+
 def summarised(
     tally: RunningMoments,
     task: AbstractTask | Sweep,
-    shape: tuple[int, int],
+    seeds: int,
     time: Float[np.ndarray, " samples"],
     levels: tuple[float, ...],
     settings: SpectrumSettings,
@@ -166,21 +189,16 @@ def summarised(
     failed: Int[np.ndarray, "failed 2"],
     about: dict[str, Any],
 ) -> EnsembleSummary:
-    """A tally in words; `shape` is (seeds, bins of the spectrum or 0), `expected` the exact linear spectra or None."""
-    (seeds, bins), samples = shape, time.size
-    unit = (task[0] if isinstance(task, Sweep) else task).output_unit
-    with np.errstate(invalid="ignore", divide="ignore"):
-        seen = np.where(tally.seeds > 0, tally.seeds, np.nan)[:, None]
-        averages = tally.mean + 0 * seen
-        variance = tally.squares / np.where(seen > 1, seen - 1, np.nan)
-        stderr = np.sqrt(variance / seen)
-    parts = {"power": slice(samples, samples + bins), "left": slice(samples + bins, samples + 2 * bins)}
-    spectra = []
-    for point in range(len(tally.seeds) if bins else 0):
-        plain, left = ((averages[point, part], stderr[point, part]) for part in parts.values())
-        control = None if expected is None else (*left, expected[point])
-        spectra.append(from_moments(plain, control, int(tally.seeds[point]), settings, unit))
-    variation = np.stack([averages[:, -1], stderr[:, -1]], axis=-1) if bins else np.full((len(tally.seeds), 2), np.nan)
-    found = [averages[:, :samples], variance[:, :samples], quantiles(tally, levels), variation]
+    """A tally in words; `expected`, the exact linear spectra or None."""
+    arrays = computed(tally, levels, expected)
+    unit, points = (task[0] if isinstance(task, Sweep) else task).output_unit, len(tally.seeds)
+    variation, spectra = np.full((points, 2), np.nan), []
+    if "power" in arrays:
+        variation = np.stack([arrays["coefficient_of_variation"], arrays["coefficient_of_variation_stderr"]], axis=-1)
+        for i, seen in enumerate(tally.seeds):
+            row: dict[str, Any] = {name: arrays[label][i] for name, label in SPECTRUM.items() if label in arrays}
+            row = {"expected": None} | row
+            spectra.append(SpectrumEstimate(settings.frequency, **row, seeds=int(seen), settings=settings, unit=unit))
+    found = [arrays["mean"], arrays["variance"], arrays["quantiles"], variation]
     mean, variance, quantile, variation = found if isinstance(task, Sweep) else [values[0] for values in found]
     return EnsembleSummary(task, seeds, time, mean, variance, levels, quantile, variation, tuple(spectra), failed, about)

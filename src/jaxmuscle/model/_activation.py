@@ -1,5 +1,7 @@
 """Activation: what the active tissue makes of the nervous drive, a critically damped twitch."""
 
+from typing import Any, NamedTuple
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -12,6 +14,23 @@ from jaxmuscle._common.types import Scalar
 from ._parameters import default
 
 ACTIVE = (0, 2, 4)  # K_w, C_w and P_w among the inputs: those of the active tissue
+
+
+class Transition(NamedTuple):
+    """Coefficients of a step of an activation; x is the step over the contraction time."""
+
+    x: Array
+    fade: Array
+    early: Array
+    late: Array
+    early_slope: Array
+    late_slope: Array
+
+    def advance(self, state: tuple[Array, Array], n: Array, m: Array) -> tuple[Array, Array]:
+        """States (a, b) after a step in which the input runs from n to m."""
+        (a, b), x = state, self.x
+        return (self.fade * ((1 + x) * a + x * b) + self.early * n + self.late * m,
+                self.fade * ((1 - x) * b - x * a) + self.early_slope * n + self.late_slope * m)  # fmt: skip
 
 
 class Activation(eqx.Module):
@@ -37,26 +56,26 @@ class Activation(eqx.Module):
         self, before: Float[Array, "steps inputs"], after: Float[Array, "steps inputs"], dt: Scalar
     ) -> tuple[Float[Array, "points inputs"], Float[Array, "points inputs"]]:
         """Values and slopes of what comes out, from rest; what goes in runs straight from `before` to `after` in a step."""
-        x = jnp.asarray(dt / self.time, before.dtype)
-        fade = jnp.exp(-x)
-        share = jnp.asarray(NODES, x.dtype)
-        y = x * (1 - share)  # time left in the step
-        weight = x * jnp.asarray(WEIGHTS, x.dtype) * jnp.exp(-y)
-        late, late_slope = jnp.sum(weight * y * share), jnp.sum(weight * (1 - y) * share)
-        early, early_slope = jnp.sum(weight * y * (1 - share)), jnp.sum(weight * (1 - y) * (1 - share))
+        step = self.transition(dt, before.dtype)
 
         def advance(state, given):
-            (a, b), (n, m) = state, given
-            new = (
-                fade * ((1 + x) * a + x * b) + early * n + late * m,
-                fade * ((1 - x) * b - x * a) + early_slope * n + late_slope * m,
-            )
+            new = step.advance(state, *given)
             return new, new
 
         rest = jnp.zeros(before.shape[1:], before.dtype)
         _, (a, b) = jax.lax.scan(advance, (rest, rest), (before, after))
         a, b = (jnp.concatenate([rest[None], values]) for values in (a, b))
         return a, b / self.time
+
+    def transition(self, dt: Scalar, dtype: Any = None) -> "Transition":
+        """What a step of dt [s] does to the states (a, b = T a'), exactly, where the input runs straight in it."""
+        x = jnp.asarray(dt / self.time, jnp.result_type(float) if dtype is None else dtype)
+        share = jnp.asarray(NODES, x.dtype)
+        y = x * (1 - share)  # time left in the step
+        weight = x * jnp.asarray(WEIGHTS, x.dtype) * jnp.exp(-y)
+        late, late_slope = jnp.sum(weight * y * share), jnp.sum(weight * (1 - y) * share)
+        early, early_slope = jnp.sum(weight * y * (1 - share)), jnp.sum(weight * (1 - y) * (1 - share))
+        return Transition(x, jnp.exp(-x), early, late, early_slope, late_slope)
 
     def check_step(self, dt: float) -> None:
         """Raise a `ValueError` if a grid of step dt [s] is too coarse."""

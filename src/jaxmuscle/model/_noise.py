@@ -1,6 +1,8 @@
 """Random perturbations: what every noise has, and sums of noises."""
 
 import abc
+import functools
+import operator
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -13,6 +15,7 @@ from jaxmuscle._common.arrays import require
 from jaxmuscle._common.types import Scalar
 
 from ._parameters import CHANNELS, INPUTS, default
+from ._stream import APART, START, Draws, Stream
 
 Amplitude = Scalar | tuple | list | dict | None
 
@@ -28,6 +31,46 @@ class Realisation(eqx.Module):
     slopes: Float[Array, "*seeds points channels"] | None = None
     increments: Float[Array, "*seeds steps channels"] | None = None
     parts: "tuple[Realisation, ...] | None" = None
+
+
+class Recursion(eqx.Module):
+    """One channel of a unit noise from grid point to grid point, exact in distribution: `q ← A q + L z`, z standard normals.
+
+    `N = H q` at the grid points, `dN/dt = S q` if it is differentiable, and white noise has the increment `direct z`
+    between them. The states q are scaled to a stationary covariance of 1. What is structurally zero in the tables is None.
+    They apply to scalars and to arrays (of channels, of seeds) alike.
+    """
+
+    A: tuple[tuple[Scalar | None, ...], ...]
+    L: tuple[tuple[Scalar | None, ...], ...]
+    H: tuple[Scalar | None, ...]
+    S: tuple[Scalar | None, ...] | None = None
+    direct: Scalar | None = None
+
+    @property
+    def numbers(self) -> int:
+        """How many normals a step takes."""
+        return len(self.A) if self.direct is None else 1
+
+    def start(self, z: tuple[Array, ...]) -> tuple[Array, ...]:
+        """Where it begins, in its stationary distribution, whose covariance is the identity."""
+        return z[: len(self.A)]
+
+    def advance(self, q: tuple[Array, ...], z: tuple[Array, ...]) -> tuple[Array, ...]:
+        """One step on."""
+        return tuple(_dot((*a, *b), (*q, *z)) for a, b in zip(self.A, self.L, strict=True))
+
+    def value(self, q: tuple[Array, ...]) -> Array:
+        """N."""
+        return _dot(self.H, q)
+
+    def slope(self, q: tuple[Array, ...]) -> Array | None:
+        """dN/dt, or None."""
+        return None if self.S is None else _dot(self.S, q)
+
+
+def _dot(row: tuple[Scalar | None, ...], values: tuple[Array, ...]) -> Array:
+    return functools.reduce(operator.add, [a * x for a, x in zip(row, values, strict=True) if a is not None])
 
 
 class ShapingFilter(eqx.Module):
@@ -60,12 +103,8 @@ class AbstractNoise(eqx.Module):
         """Two-sided power density [1/Hz] of the unit-amplitude noise at frequency f [Hz]."""
 
     @abc.abstractmethod
-    def draw(self, key: PRNGKeyArray, steps: int) -> Any:
-        """All normals of one seed, in one block."""
-
-    @abc.abstractmethod
-    def realise(self, normals: Any, dt: Scalar) -> Realisation:
-        """The unit path that the normals stand for, exact in distribution on the grid of step dt [s]."""
+    def recursion(self, dt: Scalar) -> Recursion:
+        """How a channel goes on in a step of dt [s]."""
 
     @abc.abstractmethod
     def shaping_filter(self) -> ShapingFilter:
@@ -74,6 +113,34 @@ class AbstractNoise(eqx.Module):
     @abc.abstractmethod
     def check_step(self, dt: float) -> None:
         """Raise a `ValueError` if a grid of step dt [s] is too coarse for this noise."""
+
+    def draw(self, key: PRNGKeyArray, steps: int, draws: Draws = Draws()) -> Any:  # noqa: B008
+        """All normals of one seed: those that begin it and those of every step, in rows (of white noise the latter)."""
+        return self._drawn(Stream.of(key, draws), steps, 0)
+
+    def _drawn(self, stream: Stream, steps: int, part: int) -> Any:
+        count = self.channels * self.recursion(1e-3).numbers
+        given = stream.ahead(jnp.arange(steps), (*[0] * part, part * APART), (*[1] * part, count))
+        later = jnp.stack(stream.numbers(given, part, part * APART, count), axis=1)
+        if self.smoothness == 0:
+            return later
+        return jnp.concatenate([jnp.stack(stream.normals(START, part * APART, count))[None], later])
+
+    def realise(self, normals: Any, dt: Scalar) -> Realisation:
+        """The unit path that the normals stand for, exact in distribution on the grid of step dt [s]."""
+        made = jax.tree.map(lambda x: jnp.asarray(x, normals.dtype), self.recursion(dt))
+        rows = normals.reshape(len(normals), made.numbers, -1)  # of every channel
+        if made.direct is not None:
+            return Realisation(increments=made.direct * rows[:, 0])
+
+        def advance(q, z):
+            q = made.advance(q, tuple(z))
+            return q, q
+
+        begun = made.start(tuple(rows[0]))
+        _, later = jax.lax.scan(advance, begun, rows[1:])
+        whole = tuple(jnp.concatenate([first[None], rest]) for first, rest in zip(begun, later, strict=True))
+        return Realisation(values=made.value(whole), slopes=made.slope(whole))
 
     def psd(self, f: Float[Array | np.ndarray, " frequencies"] | Scalar) -> Float[Array, "..."]:
         """Two-sided power density `amplitude² density(f)` [amplitude²/Hz], one row per amplitude if there are four."""
@@ -130,11 +197,6 @@ def as_amplitude(value: Amplitude) -> Scalar:
     return value
 
 
-def standard_normals(key: PRNGKeyArray, shape: tuple[int, ...]) -> Float[Array, "..."]:
-    """Standard normals of single precision in either precision: seed i is the same path in both, and cheaper to draw."""
-    return jax.random.normal(key, shape, jnp.float32).astype(jnp.result_type(float))
-
-
 def _any_jax(values: tuple | list) -> bool:
     return any(isinstance(v, jax.Array) for v in values)
 
@@ -189,13 +251,15 @@ class NoiseSum(AbstractNoise):
             rows = rows.at[jnp.array(part.acts_on)].add(part.psd(f))
         return rows
 
-    def draw(self, key: PRNGKeyArray, steps: int) -> Any:
+    def _drawn(self, stream: Stream, steps: int, part: int) -> Any:
         # The first part draws what it would draw alone, so that a tremor can be added to a path.
-        keys = [key, *(jax.random.fold_in(key, i) for i in range(1, len(self.parts)))]
-        return tuple(part.draw(own, steps) for part, own in zip(self.parts, keys, strict=True))
+        return tuple(each._drawn(stream, steps, part + i) for i, each in enumerate(self.parts))
 
     def realise(self, normals: Any, dt: Scalar) -> Realisation:
         return Realisation(parts=tuple(p.realise(own, dt) for p, own in zip(self.parts, normals, strict=True)))
+
+    def recursion(self, dt: Scalar) -> Recursion:
+        raise ValueError("a sum of noises has a recursion for each of its components")
 
     def shaping_filter(self) -> ShapingFilter:
         raise ValueError("a sum of noises has a shaping filter for each of its components")

@@ -4,16 +4,15 @@ import functools
 from typing import ClassVar
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.special
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Float
 
 from jaxmuscle._common.arrays import require
 from jaxmuscle._common.types import Scalar
 
-from ._noise import AbstractNoise, Amplitude, Realisation, ShapingFilter, as_amplitude, check_amplitude, standard_normals
+from ._noise import AbstractNoise, Amplitude, Recursion, ShapingFilter, as_amplitude, check_amplitude
 
 TOLERANCE = 0.05
 POINTS = 2000
@@ -111,21 +110,12 @@ class PinkNoise(AbstractNoise):
     def density(self, f: Scalar) -> Scalar:
         return _density((self.corners, self.shares), f)
 
-    def draw(self, key: PRNGKeyArray, steps: int) -> Float[Array, "..."]:
-        return standard_normals(key, (steps + 1, self.corners.size * self.channels))
-
-    def realise(self, normals: Float[Array, "..."], dt: Scalar) -> Realisation:
-        x = jnp.asarray(2 * np.pi * self.corners, normals.dtype)[:, None] * dt
-        keep, kick = jnp.exp(-x), jnp.sqrt(-jnp.expm1(-2 * x))
-        weights = jnp.asarray(np.sqrt(self.shares), normals.dtype)[:, None]
-
-        def advance(q, normal):
-            q = keep * q + kick * normal.reshape(q.shape)
-            return q, jnp.sum(weights * q, axis=0)
-
-        start = normals[0].reshape(self.corners.size, -1)
-        _, later = jax.lax.scan(advance, start, normals[1:])
-        return Realisation(values=jnp.concatenate([jnp.sum(weights * start, axis=0)[None], later]))
+    def recursion(self, dt: Scalar) -> Recursion:
+        count, weights = self.corners.size, np.sqrt(self.shares)
+        x = [2 * np.pi * corner * dt for corner in self.corners]
+        A = tuple(tuple(jnp.exp(-x[i]) if i == j else None for j in range(count)) for i in range(count))
+        L = tuple(tuple(jnp.sqrt(-jnp.expm1(-2 * x[i])) if i == j else None for j in range(count)) for i in range(count))
+        return Recursion(A, L, tuple(float(weight) for weight in weights))
 
     def shaping_filter(self) -> ShapingFilter:
         dtype = jnp.result_type(float)

@@ -5,13 +5,13 @@ from typing import ClassVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Float
 
 from jaxmuscle._common.arrays import require
 from jaxmuscle._common.quadrature import NODES, WEIGHTS
 from jaxmuscle._common.types import Scalar
 
-from ._noise import AbstractNoise, Amplitude, Realisation, ShapingFilter, as_amplitude, check_amplitude, standard_normals
+from ._noise import AbstractNoise, Amplitude, Recursion, ShapingFilter, as_amplitude, check_amplitude
 from ._parameters import PARAMETERS
 
 
@@ -71,23 +71,10 @@ class ResonantNoise(AbstractNoise):
         b2 = self.width**2 * f**2
         return self.width / jnp.pi * f**2 / ((self.frequency**2 - f**2) ** 2 + b2)
 
-    def draw(self, key: PRNGKeyArray, steps: int) -> Float[Array, "..."]:
-        return standard_normals(key, (steps + 1, 2, self.channels))
-
-    def realise(self, normals: Float[Array, "..."], dt: Scalar) -> Realisation:
-        made = jax.tree.map(lambda x: x.astype(normals.dtype), self.shaping_filter())
-        step, kick = exact_step(made, dt)
-
-        def advance(state, normal):
-            (q, n), (first, second) = state, normal
-            new = (
-                step[0, 0] * q + step[0, 1] * n + kick[0, 0] * first,
-                (step[1, 0] * q + step[1, 1] * n + kick[1, 0] * first + kick[1, 1] * second),
-            )
-            return new, new[1]
-
-        _, later = jax.lax.scan(advance, (normals[0, 0], normals[0, 1]), normals[1:])
-        return Realisation(values=jnp.concatenate([normals[:1, 1], later]))
+    def recursion(self, dt: Scalar) -> Recursion:
+        step, kick = exact_step(self.shaping_filter(), dt)
+        A = tuple((row[0], row[1]) for row in step)
+        return Recursion(A, ((kick[0, 0], None), (kick[1, 0], kick[1, 1])), (None, 1.0))
 
     def shaping_filter(self) -> ShapingFilter:
         omega, rate = 2 * jnp.pi * jnp.asarray(self.frequency), 2 * jnp.pi * jnp.asarray(self.width)

@@ -3,15 +3,13 @@
 from typing import ClassVar
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, PRNGKeyArray
 
 from jaxmuscle._common.arrays import require
 from jaxmuscle._common.types import Scalar
 
-from ._noise import AbstractNoise, Amplitude, Realisation, ShapingFilter, as_amplitude, check_amplitude, standard_normals
+from ._noise import AbstractNoise, Amplitude, Recursion, ShapingFilter, as_amplitude, check_amplitude
 from ._parameters import PARAMETERS, default
 
 
@@ -37,11 +35,8 @@ class WhiteNoise(AbstractNoise):
     def density(self, f: Scalar) -> Scalar:
         return jnp.ones_like(f) / self.rate
 
-    def draw(self, key: PRNGKeyArray, steps: int) -> Float[Array, "..."]:
-        return standard_normals(key, (steps, self.channels))
-
-    def realise(self, normals: Float[Array, "..."], dt: Scalar) -> Realisation:
-        return Realisation(increments=normals * jnp.sqrt(dt / self.rate))
+    def recursion(self, dt: Scalar) -> Recursion:
+        return Recursion((), (), (), direct=jnp.sqrt(dt / self.rate))
 
     def shaping_filter(self) -> ShapingFilter:
         direct = 1 / jnp.sqrt(jnp.asarray(self.rate))
@@ -76,31 +71,17 @@ class BandLimitedNoise(AbstractNoise):
     def density(self, f: Scalar) -> Scalar:
         return 1 / self.rate / (1 + (f / self.cutoff) ** 4)
 
-    def draw(self, key: PRNGKeyArray, steps: int) -> Float[Array, "..."]:
-        return standard_normals(key, (steps + 1, 2 * self.channels))
-
-    def realise(self, normals: Float[Array, "..."], dt: Scalar) -> Realisation:
+    def recursion(self, dt: Scalar) -> Recursion:
         omega = 2 * jnp.pi * self.cutoff
         p = omega * dt / np.sqrt(2)
         fade, c, s = jnp.exp(-p), jnp.cos(p), jnp.sin(p)
-        # Transition of (N, N'/ω), both scaled to unit stationary variance; its process noise is I - F Fᵀ = L Lᵀ.
-        f11, f12, f21, f22 = fade * (c + s), fade * np.sqrt(2) * s, -fade * np.sqrt(2) * s, fade * (c - s)
-        l11 = jnp.sqrt(1 - f11**2 - f12**2)
-        l21 = -(f11 * f21 + f12 * f22) / l11
-        l22 = jnp.sqrt(1 - f21**2 - f22**2 - l21**2)
-
-        def advance(state, kick):
-            n, slope = state
-            first, second = jnp.split(kick, 2)
-            new = f11 * n + f12 * slope + l11 * first, f21 * n + f22 * slope + l21 * first + l22 * second
-            return new, new
-
-        # Two outputs, so that XLA leaves the slopes out where nobody asks for them.
-        start = jnp.split(normals[0], 2)
-        _, (n, slope) = jax.lax.scan(advance, (start[0], start[1]), normals[1:])
+        # Transition of (N, N'/ω), both scaled to unit stationary variance; its process noise is I - A Aᵀ = L Lᵀ.
+        a11, a12, a21, a22 = fade * (c + s), fade * np.sqrt(2) * s, -fade * np.sqrt(2) * s, fade * (c - s)
+        l11 = jnp.sqrt(1 - a11**2 - a12**2)
+        l21 = -(a11 * a21 + a12 * a22) / l11
+        l22 = jnp.sqrt(1 - a21**2 - a22**2 - l21**2)
         std = jnp.sqrt(omega / (2 * np.sqrt(2) * self.rate))
-        values, slopes = jnp.concatenate([start[0][None], n]), jnp.concatenate([start[1][None], slope])
-        return Realisation(values=std * values, slopes=std * omega * slopes)
+        return Recursion(((a11, a12), (a21, a22)), ((l11, None), (l21, l22)), (std, None), (None, std * omega))
 
     def shaping_filter(self) -> ShapingFilter:
         # States (N, N'/ω), so that both have the same scale.
@@ -147,19 +128,9 @@ class OrnsteinUhlenbeckNoise(AbstractNoise):
     def density(self, f: Scalar) -> Scalar:
         return 2 * self.correlation_time / (1 + (2 * jnp.pi * f * self.correlation_time) ** 2)
 
-    def draw(self, key: PRNGKeyArray, steps: int) -> Float[Array, "..."]:
-        return standard_normals(key, (steps + 1, self.channels))
-
-    def realise(self, normals: Float[Array, "..."], dt: Scalar) -> Realisation:
+    def recursion(self, dt: Scalar) -> Recursion:
         x = dt / self.correlation_time
-        keep, kick = jnp.exp(-x), jnp.sqrt(-jnp.expm1(-2 * x))
-
-        def advance(n, normal):
-            n = keep * n + kick * normal
-            return n, n
-
-        _, later = jax.lax.scan(advance, normals[0], normals[1:])
-        return Realisation(values=jnp.concatenate([normals[:1], later]))
+        return Recursion(((jnp.exp(-x),),), ((jnp.sqrt(-jnp.expm1(-2 * x)),),), (1.0,))
 
     def shaping_filter(self) -> ShapingFilter:
         rate = 1 / jnp.asarray(self.correlation_time)

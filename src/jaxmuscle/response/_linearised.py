@@ -1,6 +1,8 @@
 """A task linearised about its equilibrium."""
 
 import dataclasses
+import functools
+import operator
 from typing import Any, ClassVar, NamedTuple
 
 import jax
@@ -68,11 +70,17 @@ class LinearTask(AbstractTask):
         return self.system.point
 
     def vector_field(self, t: Scalar, y: State, u: Perturbation) -> State:
-        return self.system.A @ (y - self.system.point) + self.system.B @ u
+        s, away = self.system, [y[i] - self.system.point[i] for i in range(len(self.system.A))]
+        return jnp.stack([_sum(s.A[i], away) + _sum(s.B[i], u) for i in range(len(s.A))])
 
     def output(self, t: Scalar, y: State, u: Perturbation, du: Perturbation) -> Scalar:
         s = self.system
-        return s.rest + s.C @ (y - s.point) + s.D @ u + s.E @ du
+        return s.rest + _sum(s.C, [y[i] - s.point[i] for i in range(len(s.A))]) + _sum(s.D, u) + _sum(s.E, du)
+
+
+def _sum(row: Array, values: Any) -> Array:
+    """Their product, term by term: in a loop over many seeds XLA makes vectors of that, not of small matrices."""
+    return functools.reduce(operator.add, (row[i] * values[i] for i in range(len(row))))
 
 
 def settled(task: AbstractTask, time: float = HOLD) -> AbstractTask:

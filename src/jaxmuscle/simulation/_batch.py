@@ -1,6 +1,5 @@
 """One chunk of an ensemble: the compiled program for some points and seeds, shared by the devices of this process."""
 
-from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -13,8 +12,9 @@ from jaxtyping import Array, Int, PRNGKeyArray
 
 from jaxmuscle._common.programs import kept
 from jaxmuscle.model._noise import AbstractNoise, Realisation
+from jaxmuscle.model._stream import Draws, Stream
 from jaxmuscle.model._tasks import AbstractTask
-from jaxmuscle.spectra._decimation import at_every, decimated
+from jaxmuscle.spectra._decimation import at_every
 from jaxmuscle.spectra._measures import coefficient_of_variation
 from jaxmuscle.spectra._settings import SpectrumSettings
 from jaxmuscle.spectra._welch import lowpass, welch
@@ -29,7 +29,8 @@ class Recipe(eqx.Module):
     """What is computed of a seed: on which grid, sampled how, with states or not, Welch power and variation over `edges`.
 
     A device simulates at most `lanes` seeds side by side, what is more one block after the other. `every` is the ratio of
-    the run's rate to the spectrum's; `edges` [samples] are None where no spectrum is asked for.
+    the run's rate to the spectrum's; `edges` [samples] are None where no spectrum is asked for. `draws`: which random
+    numbers.
     """
 
     grid: Grid
@@ -39,6 +40,7 @@ class Recipe(eqx.Module):
     lanes: int = eqx.field(static=True, default=LANES)
     every: int = eqx.field(static=True, default=1)
     edges: tuple[int, int] | None = eqx.field(static=True, default=None)
+    draws: Draws = eqx.field(static=True, default=Draws())
 
 
 def local_mesh() -> Mesh | None:
@@ -49,41 +51,31 @@ def local_mesh() -> Mesh | None:
 
 def draw(noise: AbstractNoise, key: PRNGKeyArray, seeds: Int[Array, " seeds"], steps: int) -> Any:
     """Normals of every seed; seed i depends on nothing but the key and i. Few at a time, which stay in the cache."""
-    return _drawn(noise, key, seeds, steps, lambda normals: normals)
+    return jax.lax.map(lambda i: noise.draw(jax.random.fold_in(key, i), steps), seeds, batch_size=DRAWN)
 
 
-def _drawn(noise: AbstractNoise, key: PRNGKeyArray, seeds: Int[Array, " seeds"], steps: int, use: Callable) -> Any:
-    """What `use` makes of the normals of every seed."""
-    return jax.lax.map(lambda i: use(noise.draw(jax.random.fold_in(key, i), steps)), seeds, batch_size=DRAWN)
+def respond(task: AbstractTask, source: Stream | Realisation, grid: Grid, sampling: str) -> tuple[Array, Array]:
+    """States (samples, states), at instants, and sampled output (samples) of one noise path, drawn or given."""
+    from ._integrator import integrated  # and diffrax, which a program that is loaded does without
+
+    states, (output,) = integrated((task,), source, grid, sampling, states=True)
+    assert states is not None
+    return states, output
 
 
-def respond(task: AbstractTask, path: Realisation, grid: Grid, sampling: str) -> tuple[Array, Array]:
-    """States (samples, states), at instants, and sampled output (samples) of one noise path."""
-    from ._integrator import Forcing, observe, solve  # and diffrax, which a program that is loaded does without
+def _responses(task: AbstractTask, linear: Any, sources: Stream, recipe: Recipe) -> dict[str, Any]:
+    """Of all seeds' random numbers along a leading axis."""
+    from ._integrator import integrated
 
-    given = Forcing.of(task, path, grid)
-    if sampling == "instant":
-        states = solve(task, given, grid)
-        return states, observe(task, given, grid, states)
-    fine = Grid(grid.dt, grid.steps, 1, grid.substeps, grid.reverse)
-    states = solve(task, given, fine)
-    output = observe(task, given, fine, states)
-    if sampling == "filtered":
-        return states[:: grid.every], decimated(output, grid.every)
-    mean = jnp.mean(0.5 * (output[1:] + output[:-1]).reshape(-1, grid.every), axis=1)
-    return states[:: grid.every], jnp.concatenate([output[:1], mean])
+    def one(source):
+        tasks = (task,) if linear is None else (task, linear)
+        states, outputs = integrated(tasks, source, recipe.grid, recipe.sampling, states=recipe.states)
+        finite = jnp.all(jnp.isfinite(outputs[0]))
+        if states is not None:
+            finite &= jnp.all(jnp.isfinite(states))
+        return {"output": outputs[0], "finite": finite, "linear": None if linear is None else outputs[1], "states": states}
 
-
-def _responses(task: AbstractTask, linear: Any, path: Realisation, recipe: Recipe) -> dict[str, Any]:
-    """Of all paths along a leading axis of seeds."""
-
-    def one(path):
-        states, output = respond(task, path, recipe.grid, recipe.sampling)
-        finite = jnp.all(jnp.isfinite(output)) & jnp.all(jnp.isfinite(states))
-        beside = None if linear is None else respond(linear, path, recipe.grid, recipe.sampling)[1]
-        return {"output": output, "finite": finite, "linear": beside, "states": states if recipe.states else None}
-
-    found = jax.vmap(one)(path)
+    found = jax.vmap(one)(sources)
     if recipe.edges is not None:
         found["power"], found["variation"] = _seen(found["output"], recipe)
         found["linear_power"] = None if linear is None else _seen(found["linear"], recipe)[0]
@@ -111,9 +103,7 @@ def run_seeds(task: Any, linear: Any, key: Any, seeds: Any, recipe: Recipe, mesh
         task, linear, key = eqx.combine(arrays, rest)
 
         def block(seeds):
-            grid = recipe.grid
-            paths = _drawn(task.noise, key, seeds, grid.steps, lambda normals: task.noise.realise(normals, grid.dt))
-            return _responses(task, linear, paths, recipe)
+            return _responses(task, linear, _streams(key, seeds, recipe), recipe)
 
         count = blocks(len(seeds), recipe.lanes)
         if count == 1 or len(seeds) % count:
@@ -127,18 +117,21 @@ def run_seeds(task: Any, linear: Any, key: Any, seeds: Any, recipe: Recipe, mesh
 
 @kept
 def run_points(tasks: Any, linears: Any, key: Any, seeds: Any, recipe: Recipe, mesh: Mesh | None) -> dict[str, Any]:
-    """The same for every task along a leading axis of points; all of them get the same normals."""
+    """The same for every task along a leading axis of points; all of them get the same noise."""
 
     def local(moving, key, seeds):
         def one(moving):
             task, linear = eqx.combine(moving, rest)
-            return _responses(task, linear, jax.vmap(lambda z: task.noise.realise(z, recipe.grid.dt))(normals), recipe)
+            return _responses(task, linear, _streams(key, seeds, recipe), recipe)
 
-        normals = draw(eqx.combine(jax.tree.map(lambda x: x[0], moving), rest)[0].noise, key, seeds, recipe.grid.steps)
         return jax.vmap(one)(moving)
 
     moving, rest = eqx.partition((tasks, linears), eqx.is_array)
     return _shared(local, mesh, (P("lanes"), P(), P()))(moving, key, seeds)
+
+
+def _streams(key: PRNGKeyArray, seeds: Int[Array, " seeds"], recipe: Recipe) -> Stream:
+    return jax.vmap(lambda i: Stream.of(jax.random.fold_in(key, i), recipe.draws))(seeds)
 
 
 def _shared(local: Any, mesh: Mesh | None, specs: tuple) -> Any:

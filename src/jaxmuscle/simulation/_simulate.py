@@ -12,6 +12,7 @@ from jaxmuscle._common.arrays import all_concrete, as_arrays, as_numbers
 from jaxmuscle._common.errors import OperatingPointError, SimulationError
 from jaxmuscle._common.programs import kept
 from jaxmuscle._common.text import listed
+from jaxmuscle.model._stream import Draws
 from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.response._equilibrium import fastest_rate
 from jaxmuscle.response._linearised import LinearTask, check_equilibrium, check_inputs, linearised
@@ -153,10 +154,16 @@ def stable_substeps(task: AbstractTask, dt: float, duration: float = DURATION) -
 
 
 def trajectories(
-    task: AbstractTask, linear: LinearTask | None, key: PRNGKeyArray, seeds: Any, plan: Schedule, mesh: Any = None
+    task: AbstractTask,
+    linear: LinearTask | None,
+    key: PRNGKeyArray,
+    seeds: Any,
+    plan: Schedule,
+    mesh: Any = None,
+    draws: Draws = Draws(),  # noqa: B008
 ) -> Trajectory:
     """Every seed of one task in one program, finite or not; arrays stay where they were computed."""
-    recipe = Recipe(plan.grid, plan.sampling, True, task.settings)
+    recipe = Recipe(plan.grid, plan.sampling, True, task.settings, draws=draws)
     found = run_seeds(as_arrays(task), as_arrays(linear), key, seeds, recipe, mesh)
     grid = plan.grid
     return Trajectory(task, found["states"], found["output"], seeds, plan.rate, grid.dt, grid.substeps, plan.sampling,

@@ -13,6 +13,7 @@ from jaxmuscle import plot
 from jaxmuscle._common.arrays import as_numbers, is_concrete
 from jaxmuscle._common.environment import versions
 from jaxmuscle.model._parameters import PARAMETERS
+from jaxmuscle.model._stream import VERSION as STREAM
 from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.response._expected import linear_spectrum
 from jaxmuscle.spectra._decimation import at_every
@@ -177,6 +178,7 @@ def run_attributes(
         "dt": dt,
         "substeps": substeps,
         "sampling": sampling,
+        "stream": STREAM,
         "versions": json.dumps(versions()),
     }
 

@@ -1,0 +1,137 @@
+"""Stores that a job array makes in parts, and what makes any store complete."""
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Int
+
+from jaxmuscle._common.errors import StoreError
+
+from ._places import AbstractPlace, place_of
+from ._store import CHUNKS, PARTS, SETTINGS, complete, ensemble_at, logged, read_tallies, write_region
+from ._summary import computed
+
+if TYPE_CHECKING:
+    import xarray
+
+
+class Part(NamedTuple):
+    """Part `number` (from 1) of so many: a run of neighbouring chunks, so that few points of a sweep are cut."""
+
+    number: int
+    of: int
+
+    @staticmethod
+    def checked(part: tuple[int, int], *, store: bool, overwrite: bool) -> "Part":
+        """**Raises:** `ValueError` for numbers out of range, and for what does not go with a part."""
+        number, count = part
+        if not 1 <= number <= count:
+            raise ValueError(f"part = {number}/{count}: parts are numbered from 1 to their count, as 1/4 to 4/4")
+        if not store:
+            raise ValueError("a part of an ensemble belongs to a store: give store=")
+        if overwrite:
+            raise ValueError("a part adds to the store of all parts, it cannot overwrite it: remove the store first")
+        if jax.process_count() > 1:
+            raise ValueError("a part is a process of its own: leave out the part, or jax.distributed")
+        return Part(number, count)
+
+    def chunks(self, total: int) -> range:
+        """Those chunks of all that are this part's."""
+        return range(total * (self.number - 1) // self.of, total * self.number // self.of)
+
+
+class PartReport(NamedTuple):
+    """What one part of an ensemble did.
+
+    `number` of `parts`; `seeds` that are its own (points times seeds in a sweep); `failed`, rows (point, seed) of those that
+    did not stay finite. `complete`, whether the store had been merged before: then `failed` are those of the whole store.
+    """
+
+    number: int
+    parts: int
+    seeds: int
+    failed: Int[np.ndarray, "failed 2"]
+    complete: bool
+
+    @property
+    def success(self) -> bool:
+        """Whether every seed stayed finite."""
+        return len(self.failed) == 0
+
+
+def merge(path: str | Path) -> "xarray.Dataset":
+    """Make one ensemble of the parts in a store: checks that all chunks are there, reduces tallies, marks it complete.
+
+    A store that is complete is opened as it is, so a repetition does no harm.
+
+    **Arguments:** `path`, the store's folder or URL.
+
+    **Returns:** the opened `xarray.Dataset`. Its attribute `failed` lists (point, seed) of what did not stay finite.
+
+    **Raises:** `StoreError` that names the missing parts and how to run them; for a store without parts; for what is no
+    ensemble's store.
+    """
+    import xarray
+
+    place = place_of(path)
+    if not place.exists():
+        raise StoreError(f"{place.name}: there is no store; give the one that the parts have made")
+    attributes = ensemble_at(place)
+    if not attributes["complete"]:
+        if PARTS not in attributes:
+            raise StoreError(f"{place.name}: is not made in parts; resume it instead (--resume, resume=True)")
+        finish(place, attributes[CHUNKS])
+    return xarray.open_zarr(place.opened())
+
+
+def finish(place: AbstractPlace, chunks: int) -> None:
+    """Make a store complete: tallies become moments. **Raises:** `StoreError` if not all `chunks` are there."""
+    attributes = ensemble_at(place)
+    if json.loads(attributes[SETTINGS])["kind"] == "reduced":
+        found = read_tallies(place)
+        _require(place, set() if found is None else set(found.chunks), chunks, attributes.get(PARTS))
+        assert found is not None
+        write_region(place, ..., _moments(place, found.tally))
+        failed = sorted(found.failed)
+    else:
+        there = logged(place)
+        _require(place, set(there), chunks, attributes.get(PARTS))
+        failed = [entry for number in sorted(there) for entry in there[number]]
+    complete(place, {"failed": json.dumps(failed)})
+
+
+def _require(place: AbstractPlace, there: set[int], chunks: int, parts: int | None) -> None:
+    missing = set(range(chunks)) - there
+    if missing and parts is None:
+        raise StoreError(f"{place.name}: {len(missing)} chunks are missing although all processes are done: is the folder "
+                         "the same for all of them? Resume on a shared file system")  # fmt: skip
+    if missing and parts is not None:
+        numbers = [number for number in range(1, parts + 1) if missing & set(Part(number, parts).chunks(chunks))]
+        raise StoreError(f"{place.name}: {len(missing)} of {chunks} chunks are missing: parts {_ranges(numbers)} of {parts} "
+                         "are not done. Run each of them again, with the arguments that it had: "
+                         f"jaxmuscle ensemble ... --out {place.name} --part {numbers[0]}/{parts}")  # fmt: skip
+
+
+def _ranges(numbers: list[int]) -> str:
+    """Ascending numbers as `sbatch --array=` takes them: 3,17,20-31."""
+    runs: list[list[int]] = []
+    for number in numbers:
+        if runs and number == runs[-1][-1] + 1:
+            runs[-1][1:] = [number]
+        else:
+            runs.append([number])
+    return ",".join("-".join(map(str, run)) for run in runs)
+
+
+def _moments(place: AbstractPlace, tally: Any) -> dict[str, np.ndarray]:
+    """What a tally says, as the arrays of its store have it."""
+    import zarr
+
+    group: Any = zarr.open_group(place.opened(), mode="r")
+    levels = tuple(float(level) for level in group["quantile"][...])
+    expected = np.atleast_2d(group["power_expected"][...]) if "power_expected" in group else None
+    arrays = computed(tally, levels, expected)
+    return arrays if group["mean"].ndim == 2 else {name: values[0] for name, values in arrays.items()}
