@@ -13,9 +13,8 @@ from measure import DTYPES, Program, Row, Unequal, require_equal, seconds, speed
 
 import jaxmuscle as jm
 from jaxmuscle._common.arrays import as_arrays
-from jaxmuscle.simulation._batch import draw
+from jaxmuscle.simulation._batch import draw, respond
 from jaxmuscle.simulation._grid import Grid
-from jaxmuscle.simulation._integrator import Forcing, solve
 
 SEEDS, DT, EVERY, STEPS = 64, 1e-3, 10, 15_000
 GRID = Grid(DT, STEPS, EVERY, reverse=False)
@@ -45,7 +44,7 @@ def _against_scan(label: str, noise: Any, given: Any, scans: dict[str, Any], rep
 
     @eqx.filter_jit
     def engine(task, normals):
-        return jax.vmap(lambda z: solve(task, Forcing.of(task, task.noise.realise(z, DT), GRID), GRID))(normals)
+        return jax.vmap(lambda z: respond(task, task.noise.realise(z, DT), GRID, "instant")[0])(normals)
 
     integrate = {name: eqx.filter_jit(scan) for name, scan in scans.items()}
     programs = {OURS: lambda: engine(task, normals)} | {n: partial(s, task, normals) for n, s in integrate.items()}

@@ -1,119 +1,115 @@
 """Ensembles at scale: against the best hand-written scans, numba and C; threads, processes, memory, single precision."""
 
-import ctypes
+import contextlib
 import json
 import os
-import shutil
+import resource
 import socket
 import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numba
 import numpy as np
-from batched import DT, SEEDS, STEPS, band_by_hand, grid_inputs, numbers, white_by_hand
-from measure import Row, Unequal, require_equal, seconds, speed_ratio, speeds
+from anchors import ANCHOR, anchors
+from batched import DT, EVERY, SEEDS, STEPS, band_by_hand, white_by_hand
+from measure import Row, Unequal, seconds
 
 import jaxmuscle as jm
 from jaxmuscle._common.arrays import as_arrays
+from jaxmuscle.model._stream import Draws, Stream
+from jaxmuscle.simulation._grid import Grid
+from jaxmuscle.simulation._integrator import integrated
 
-OURS, BEST = "jaxmuscle.ensemble", "hand-written batched lax.scan"
-EPSILONS = 200
-
-
-@numba.njit(fastmath=True)
-def _numba_loop(rng, p, scale, P_w, F_ext, harmonic_w, harmonic_z, seeds, steps, dt, out):
-    m_w, m_z, k_w, k_z, c_w, c_z, xw2, xz2, vw2, vz2 = p
-    for seed in range(seeds):
-        y, moved, first = np.zeros(4, np.float32), np.zeros(4, np.float32), np.zeros(4, np.float32)
-        for k in range(steps):
-            n0, n1 = scale[0] * rng.standard_normal(), scale[1] * rng.standard_normal()
-            n2, n3 = scale[2] * rng.standard_normal(), scale[3] * rng.standard_normal()
-            moved[:] = y
-            for half in range(2):
-                x_w, v_w, x_z, v_z = moved
-                K_w = dt * (k_w * (xw2 + x_w * x_w) + harmonic_w[k + half]) + n0
-                K_z = dt * (k_z * (xz2 + x_z * x_z) + harmonic_z[k + half]) + n1
-                C_w, C_z = dt * c_w * (vw2 + v_w * v_w) + n2, dt * c_z * (vz2 + v_z * v_z) + n3
-                passive = C_z * (v_z - v_w) + K_z * (x_z - x_w)
-                a_w = (dt * P_w[k + half] - C_w * v_w - K_w * x_w + passive) / m_w
-                a_z = -(dt * F_ext[k + half] + passive) / m_z
-                if half == 0:
-                    first[0], first[1], first[2], first[3] = dt * v_w, a_w, dt * v_z, a_z
-                    moved[:] = y + first
-                else:
-                    y[0] += 0.5 * (first[0] + dt * v_w)
-                    y[1] += 0.5 * (first[1] + a_w)
-                    y[2] += 0.5 * (first[2] + dt * v_z)
-                    y[3] += 0.5 * (first[3] + a_z)
-        out[seed] = y[2]
+OURS, WEAK, THREEFRY = "jaxmuscle, Gaussian", "jaxmuscle, weak", "jaxmuscle, threefry"
+KEPT, BEST = "jaxmuscle, Gaussian, states kept", "hand-written batched lax.scan"
 
 
-def _anchors(task: Any) -> dict[str, Any]:
-    """numba with PCG64, and C if there is a compiler; both return the last x_z of every seed."""
-    inputs = [np.ascontiguousarray(row, np.float32) for row in grid_inputs(task)]
-    p = tuple(np.float32(v) for v in numbers(task))
-    scale = np.asarray(task.noise_scale() * np.sqrt(DT / float(task.noise.rate)), np.float32)
-
-    def by_numba():
-        out = np.empty(SEEDS, np.float32)
-        _numba_loop(np.random.Generator(np.random.PCG64(1)), p, scale, *inputs, SEEDS, STEPS, np.float32(DT), out)
-        return out
-
-    compiler, found = shutil.which("gcc"), {"numba, PCG64": by_numba}
-    if compiler is not None:
-        folder = Path(tempfile.mkdtemp())
-        source = Path(__file__).with_name("anchor.c")
-        flags = ["-O3", "-march=native", "-ffast-math", "-shared", "-fPIC"]
-        subprocess.run([compiler, *flags, str(source), "-o", str(folder / "anchor.so"), "-lm"], check=True)
-        library = ctypes.CDLL(str(folder / "anchor.so"))
-        library.simulate.argtypes = [ctypes.c_int, ctypes.c_int, ctypes.c_float, *[ctypes.c_void_p] * 7]
-        row = np.array(p, np.float32)
-
-        def by_c():
-            out = np.empty(SEEDS, np.float32)
-            arrays = [array.ctypes.data for array in (row, scale, *inputs, out)]
-            library.simulate(SEEDS, STEPS, DT, *arrays)
-            return out
-
-        found["C with SIMD"] = by_c
-    return found
+def _same_law(label: str, programs: dict[str, Any], ours: Any) -> None:
+    """Other noise of the same law: the sd of 1024 seeds has a standard error of 2.2 %, the mean one of 3.1 % of it."""
+    spread = float(np.std(ours))
+    for name, program in programs.items():
+        last = np.asarray(program())
+        far = abs(float(np.mean(last)) - float(np.mean(ours))) / spread
+        if not (abs(np.log(float(np.std(last)) / spread)) < 0.14 and far < 0.2):
+            raise Unequal(f"{label}, {name}: mean {np.mean(last):.6g}, sd {np.std(last):.3g} of x_z, not sd {spread:.3g}")
 
 
-def _rows(label: str, noise: Any, by_hand: Any, target: float, repetitions: int, *, anchors: bool) -> list[Row]:
+def against(label: str, noise: Any, by_hand: Any, repetitions: int) -> list[Row]:
+    """One block of seeds by diffrax with each kind of random numbers, by hand and by C, on one core.
+
+    Every tenth output is kept, as for `reduce`; against the scan by hand, which does so, all states.
+    """
     task, key = as_arrays(jm.PrescribedForce(noise=noise)), jax.random.key(0)
-    hand = eqx.filter_jit(by_hand)
-    programs: dict[str, Any] = {
-        OURS: lambda: jm.ensemble(task, key, seeds=SEEDS, duration=STEPS * DT, control=False).states,
-        BEST: partial(hand, task, key),
-    }
-    tolerance = EPSILONS * float(jnp.finfo(jnp.float32).eps)
-    ours, theirs = np.asarray(programs[OURS]())[:, 1:], np.asarray(programs[BEST]())
-    require_equal(f"{label}: {OURS} against {BEST}", ours, theirs, tolerance)
-    if anchors:
-        programs |= _anchors(task)
-        spread = float(np.std(ours[:, -1, 2]))
-        for name in list(programs)[2:]:
-            # Other noise of the same law: the sd of 1024 seeds has a standard error of 2.2 %, the mean one of 3.1 % of it.
-            last = programs[name]()
-            far = abs(float(np.mean(last)) - float(np.mean(ours[:, -1, 2]))) / spread
-            if not (abs(np.log(float(np.std(last)) / spread)) < 0.14 and far < 0.2):
-                raise Unequal(
-                    f"{label}, {name}: mean {np.mean(last):.6g}, sd {np.std(last):.3g} of x_z, not sd {spread:.3g}"
-                )
+    hand, grid = eqx.filter_jit(by_hand), Grid(DT, STEPS, EVERY, reverse=False)
+
+    @eqx.filter_jit
+    def ours(task, key, draws, states):
+        def one(i):
+            stream = Stream.of(jax.random.fold_in(key, i), draws)
+            found = integrated((task,), stream, grid, "instant", states=states)
+            return found.states if states else found.outputs[0]
+
+        return jax.vmap(one)(jnp.arange(SEEDS))
+
+    kinds = {OURS: Draws(), WEAK: Draws(increments="weak"), THREEFRY: Draws(generator="threefry")}
+    programs: dict[str, Any] = {name: partial(ours, task, key, draws, False) for name, draws in kinds.items()}
+    programs |= {KEPT: partial(ours, task, key, Draws(), True), BEST: partial(hand, task, key)}
+    compared = anchors(task)
+    last: dict[str, Any] = {name: (lambda name=name: programs[name]()[:, -1]) for name in (WEAK, THREEFRY)}
+    last |= {name: (lambda name=name: programs[name]()[:, -1, 2]) for name in (KEPT, BEST)}
+    _same_law(label, last | compared, np.asarray(programs[OURS]())[:, -1])
+    programs |= compared
+    with one_core():
+        taken = seconds(programs, repetitions)
     steps = dict.fromkeys(programs, SEEDS * STEPS)
-    taken = seconds(programs, repetitions)
-    found = speeds(label, taken, steps) + speed_ratio(label, taken, steps, (OURS, BEST), target)
-    for name in list(programs)[2:]:
-        found += speed_ratio(label, taken, steps, (OURS, name))
+    found = [Row(f"{label}: {name}", float(np.median(each.processor) / steps[name] * 1e9), "ns per seed and step")
+             for name, each in taken.items()]  # fmt: skip
+    asked = [(KEPT, BEST, 2.0), (OURS, ANCHOR, 0.25), (WEAK, ANCHOR, 0.6), (THREEFRY, ANCHOR, None)]
+    for name, other, target in asked:
+        if other in taken:
+            ratio = float(np.median(taken[other].processor / taken[name].processor))
+            found.append(Row(f"{label}: speed of {name} by processor time", ratio, "times", other, target))
     return found
+
+
+@contextlib.contextmanager
+def one_core() -> Iterator[None]:
+    """All threads of this process on one core, where the system can do that."""
+    everywhere = os.sched_getaffinity(0) if hasattr(os, "sched_setaffinity") else set()
+    try:
+        _pin({min(everywhere)} if everywhere else set())
+        yield
+    finally:
+        _pin(everywhere)
+
+
+def _pin(cores: set[int]) -> None:
+    threads = Path("/proc/self/task")
+    for thread in threads.iterdir() if cores and threads.exists() else ():
+        os.sched_setaffinity(int(thread.name), cores)
+
+
+def reduced(repetitions: int) -> list[Row]:
+    """`ensemble(reduce=True)` of the default `Isometric` with its spectra and control variate; on one core."""
+    task, key, seeds, found = jm.Isometric(), jax.random.key(0), 4096, []
+    programs = {
+        name: partial(jm.ensemble, task, key, seeds=seeds, reduce=True, increments=name) for name in ("gaussian", "weak")
+    }
+    with one_core():
+        taken = seconds({name: (lambda run=run: run().mean) for name, run in programs.items()}, repetitions)
+    for name, each in taken.items():
+        pace = float(np.median(each.processor)) / (seeds * 15_000) * 1e9
+        found.append(Row(f"reduced Isometric, {name}", pace, "ns per seed and step"))
+    ratio = float(np.median(taken["gaussian"].processor / taken["weak"].processor))
+    return [*found, Row("reduced Isometric: speed of weak by processor time", ratio, "times", "gaussian")]
 
 
 WORKER = """
@@ -170,49 +166,86 @@ def threads(repetitions: int) -> list[Row]:
     found = [
         Row(f"threads: {name}", seeds * 1e3 / np.median(times) / 1e6, "million steps/s") for name, times in taken.items()
     ]
-    for name, target in (("two threads", 1.6), ("two processes", None)):
+    for name, target in (("two threads", 1.8), ("two processes", None)):
         ratio = float(np.median(np.array(taken["one core"]) / np.array(taken[name])))
         found.append(Row(f"threads: speed of {name}", ratio, "times", "one core", target))
     return found
 
 
+class Pace(NamedTuple):
+    """Of `jaxmuscle ensemble`: seconds of the whole command for few seeds; seeds per second of wall and of processor time.
+
+    These are reckoned by how much longer it takes for many more.
+    """
+
+    short: float
+    wall: float
+    processor: float
+
+
 def processes(repetitions: int) -> list[Row]:
-    """`jaxmuscle ensemble` as 1, 2 and 4 processes on the loopback: the whole command, and its speed once compiled."""
-    found, base = [], 0.0
-    for count in (1, 2, 4):
-        whole, speed = zip(*(_pace(count) for _ in range(max(1, repetitions // 3))), strict=True)
-        found.append(Row(f"processes: {count}, speed", float(np.median(speed)), "seeds/s"))
-        found.append(Row(f"processes: {count}, whole command with start and compilation", float(np.median(whole)), "s"))
-        base = base or float(np.median(speed))
-        if count > 1:
-            found.append(Row(f"processes: efficiency of {count}", float(np.median(speed)) / base / count, "", "one process"))
+    """`jaxmuscle ensemble` as one process, as several of `jax.distributed` on the loopback, and as parts that do not know of
+    each other, with their merging. On a core each, or left to find one."""
+    cores = sorted(os.sched_getaffinity(0))
+    ways = {"1": (1, _parts, None)}
+    ways |= {
+        f"{count} {name}": (count, way, None) for name, way in (("joined", _joined), ("parts", _parts)) for count in (2, 4)
+    }
+    if len(cores) > 1:
+        ways |= {"1 on a core": (1, _parts, cores), "2 parts on a core each": (2, _parts, cores)}
+    turns = [{name: _pace(*way) for name, way in ways.items()} for _ in range(repetitions)]
+    found = []
+    for name in ways:
+        short, wall, processor = np.median([turn[name] for turn in turns], axis=0).tolist()
+        found += [Row(f"processes: {name}, speed", wall, "seeds/s"),
+                  Row(f"processes: {name}, speed by processor time", processor, "seeds/s"),
+                  Row(f"processes: {name}, whole command with start", short, "s")]  # fmt: skip
+        if name not in ("1", "1 on a core"):
+            base = "1 on a core" if "core" in name else "1"
+            ratio = float(np.median([turn[name].wall / turn[base].wall for turn in turns]))
+            found.append(Row(f"processes: speed of {name}", ratio, "times", base, 1.7 if "core" in name else None))
     return found
 
 
-def _pace(count: int) -> tuple[float, float]:
-    """Seconds of the command for few seeds, and seeds per second: by how much longer it takes for many more."""
-    few, many = 32_768, 425_984
-    short, long = _command(count, few), _command(count, many)
-    return short, (many - few) / (long - short)
-
-
-def _command(count: int, seeds: int) -> float:
-    """Seconds of the command."""
-    folder = tempfile.mkdtemp()
+def _joined(count: int) -> list[list[str]]:
+    """Arguments of each process of one program."""
     with socket.socket() as listener:
         listener.bind(("127.0.0.1", 0))
         port = listener.getsockname()[1]
-    command = [sys.executable, "-m", "jaxmuscle", "ensemble", "zagrodny-slifkin", "--seeds", str(seeds), "--reduce",
-               "--duration", "1", "--devices", "1", "--out", f"{folder}/a.zarr"]  # fmt: skip
-    each = [["--coordinator", f"127.0.0.1:{port}", "--processes", str(count), "--process-id", str(i)]
-            for i in range(count)] if count > 1 else [[]]  # fmt: skip
-    begun = time.perf_counter()
-    workers = [subprocess.Popen([*command, *more], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) for more in each]
-    if any([worker.wait() for worker in workers]):
-        raise Unequal(f"processes: {count} processes failed")
-    taken = time.perf_counter() - begun
-    shutil.rmtree(folder)
-    return taken
+    return [["--coordinator", f"127.0.0.1:{port}", "--processes", str(count), "--process-id", str(i)] for i in range(count)]
+
+
+def _parts(count: int) -> list[list[str]]:
+    """Arguments of each part; none if there is only one."""
+    return [["--part", f"{i}/{count}"] for i in range(1, count + 1)] if count > 1 else [[]]
+
+
+def _pace(count: int, arguments: Callable[[int], list[list[str]]], cores: list[int] | None) -> Pace:
+    few, many = 32_768, 425_984
+    (short, busy), (long, busier) = (_command(arguments(count), cores, seeds) for seeds in (few, many))
+    return Pace(short, (many - few) / (long - short), (many - few) / (busier - busy))
+
+
+def _command(each: list[list[str]], cores: list[int] | None, seeds: int) -> tuple[float, float]:
+    """Wall and processor time [s] of the command, as so many processes at once."""
+    with tempfile.TemporaryDirectory() as folder:
+        store = f"{folder}/a.zarr"
+        command = [sys.executable, "-m", "jaxmuscle", "ensemble", "zagrodny-slifkin", "--seeds", str(seeds), "--reduce",
+                   "--duration", "1", "--devices", "1", "--out", store]  # fmt: skip
+        quiet: Any = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+        begun, before = time.perf_counter(), resource.getrusage(resource.RUSAGE_CHILDREN)
+        workers = []
+        for number, more in enumerate(each):
+            bound = [] if cores is None else ["taskset", "--cpu-list", str(cores[number])]
+            workers.append(subprocess.Popen([*bound, *command, *more], **quiet))
+        codes = [worker.wait() for worker in workers]
+        if each[0][:1] == ["--part"]:
+            codes.append(subprocess.run([sys.executable, "-m", "jaxmuscle", "merge", store], **quiet).returncode)
+        if any(codes):
+            raise Unequal(f"processes: {' '.join(each[0])} failed")
+        after = resource.getrusage(resource.RUSAGE_CHILDREN)
+        busy = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+        return time.perf_counter() - begun, busy
 
 
 MEMORY = """
@@ -236,7 +269,7 @@ def memory() -> list[Row]:
         done = subprocess.run([sys.executable, "-c", MEMORY, str(seeds)], capture_output=True, text=True, check=True)
         values.append(float(done.stdout))
         name = f"memory: {seeds} seeds of 1 s, reduced"
-        found += [Row(name, values[-1], "MiB", target=1536, at_most=True), Row(name, time.perf_counter() - begun, "s")]
+        found += [Row(name, values[-1], "MiB", target=307, at_most=True), Row(name, time.perf_counter() - begun, "s")]
     return [*found, Row("memory: 1 000 000 seeds over 100 000", values[1] / values[0], "times", target=1.1, at_most=True)]
 
 
@@ -260,6 +293,6 @@ def precision() -> list[Row]:
 def rows(repetitions: int) -> list[Row]:
     """Everything, in single precision."""
     with jax.enable_x64(False):
-        found = _rows("scale, white", jm.WhiteNoise(), white_by_hand, 0.9, repetitions, anchors=True)
-        found += _rows("scale, band-limited", jm.BandLimitedNoise(), band_by_hand, 0.7, repetitions, anchors=False)
-        return found + threads(repetitions) + processes(repetitions) + memory() + precision()
+        found = against("scale, white", jm.WhiteNoise(), white_by_hand, repetitions)
+        found += against("scale, band-limited", jm.BandLimitedNoise(), band_by_hand, repetitions)
+        return found + reduced(repetitions) + threads(repetitions) + processes(repetitions) + memory() + precision()
