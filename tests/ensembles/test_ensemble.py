@@ -25,6 +25,7 @@ from typer.testing import CliRunner
 import jaxmuscle as jm
 from jaxmuscle.commands.main import app
 from jaxmuscle.ensembles import _run as _ensemble_run
+from jaxmuscle.ensembles import _settings
 from jaxmuscle.ensembles._processes import join
 from jaxmuscle.ensembles._running_moments import CELLS, add, count_cells, empty, merged, quantiles, set_cells
 from jaxmuscle.ensembles._store import differences
@@ -374,7 +375,7 @@ def test_a_store_of_another_version_is_not_resumed(tmp_path, monkeypatch):
     given = {"seeds": 20, "store": tmp_path / "a.zarr"} | SHORT
     with pytest.raises(Stop):
         jm.ensemble(TASK, KEY, **given, progress=stopped_after(1))
-    monkeypatch.setattr(_ensemble_run, "versions", lambda: {"jaxmuscle": "9.9", "jax": jax.__version__})
+    monkeypatch.setattr(_settings, "versions", lambda: {"jaxmuscle": "9.9", "jax": jax.__version__})
     with pytest.raises(ValueError, match=r'versions.jaxmuscle = ".*" there, "9.9" here'):
         jm.ensemble(TASK, KEY, **given, resume=True)
 

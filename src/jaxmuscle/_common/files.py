@@ -4,10 +4,14 @@ import contextlib
 import json
 import math
 import os
+import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
+
+SYNCED_AT_ONCE = 32
 
 
 @contextlib.contextmanager
@@ -26,6 +30,22 @@ def replacing(path: str | Path) -> Iterator[Path]:
         os.replace(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def to_disk(paths: Iterable[Path]) -> None:
+    """Wait until files and the entries of folders are on disk, where a power cut leaves them; together, which is faster."""
+    with ThreadPoolExecutor(SYNCED_AT_ONCE) as pool:
+        list(pool.map(_to_disk, set(paths)))
+
+
+def _to_disk(path: Path) -> None:
+    if sys.platform == "win32" and path.is_dir():  # its entries need no waiting for, and cannot be waited for
+        return
+    handle = os.open(path, os.O_RDONLY if sys.platform != "win32" else os.O_RDWR)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
 
 
 def text_of(data: bytes, file: str, error: type[ValueError] = ValueError) -> str:

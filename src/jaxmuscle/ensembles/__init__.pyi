@@ -5,6 +5,7 @@ from ._layout import Pace as Pace
 from ._layout import Watch as Watch
 from ._parts import PartReport as PartReport
 from ._parts import merge as merge
+from ._parts import open_store as open_store
 from ._processes import join as join
 from ._processes import launched as launched
 from ._processes import leave as leave

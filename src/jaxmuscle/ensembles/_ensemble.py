@@ -21,8 +21,9 @@ from jaxmuscle.simulation._trajectory import Trajectory
 from ._layout import Layout, Pace, Watch, companions, covers_window, cut_of, laid_out, plan_of, run_chunks
 from ._parts import Part, PartReport
 from ._places import place_of
-from ._run import begun_with, reduced, stored
+from ._run import reduced, stored
 from ._running_moments import LEVELS
+from ._settings import begun_with
 from ._summary import EnsembleSummary
 from ._sweep import Population, Sweep
 

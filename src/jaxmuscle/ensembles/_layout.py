@@ -100,9 +100,9 @@ class Layout(NamedTuple):
         points = range(row * self.together, min((row + 1) * self.together, self.points))
         return Chunk(number, points, range(column * self.width, min((column + 1) * self.width, len(self.seeds))))
 
-    def first_of(self, point: int) -> int:
-        """Number of the first chunk of a point."""
-        return (point // self.together) * math.ceil(len(self.seeds) / self.width)
+    def chunk_of(self, point: int, column: int) -> int:
+        """Number of the chunk that has a point and a seed, counted from 0."""
+        return (point // self.together) * math.ceil(len(self.seeds) / self.width) + column // self.width
 
     @property
     def duration(self) -> float:

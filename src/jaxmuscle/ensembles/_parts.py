@@ -1,5 +1,6 @@
 """Stores that a job array makes in parts, and what makes any store complete."""
 
+import contextlib
 import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -10,9 +11,24 @@ from jaxtyping import Int
 
 from jaxmuscle._common.errors import StoreError
 
+from ._integrity import in_words, others, wrong
+from ._locks import WHOLE
+from ._mending import drop_damaged
 from ._places import AbstractPlace, place_of
-from ._store import CHUNKS, PARTS, SETTINGS, complete, ensemble_at, logged, read_tallies, write_region
+from ._store import (
+    CHUNKS,
+    PARTS,
+    SETTINGS,
+    attributes_at,
+    complete,
+    description_of,
+    ensemble_at,
+    logged,
+    write_arrays,
+    writing,
+)
 from ._summary import computed
+from ._tallies import read_tallies
 
 if TYPE_CHECKING:
     import xarray
@@ -65,7 +81,7 @@ class PartReport(NamedTuple):
 def merge(path: str | Path) -> "xarray.Dataset":
     """Make one ensemble of the parts in a store: checks that all chunks are there, reduces tallies, marks it complete.
 
-    A store that is complete is opened as it is, so a repetition does no harm.
+    A store that is complete is checked and opened, as by `open_store`, so a repetition does no harm.
 
     **Arguments:** `path`, the store's folder or URL.
 
@@ -80,34 +96,81 @@ def merge(path: str | Path) -> "xarray.Dataset":
     if not place.exists():
         raise StoreError(f"{place.name}: there is no store; give the one that the parts have made")
     attributes = ensemble_at(place)
-    if not attributes["complete"]:
-        if PARTS not in attributes:
-            raise StoreError(f"{place.name}: is not made in parts; resume it instead (--resume, resume=True)")
-        finish(place, attributes[CHUNKS])
+    if attributes["complete"]:
+        return open_store(path)
+    if PARTS not in attributes:
+        raise StoreError(f"{place.name}: is not made in parts; resume it instead (--resume, resume=True)")
+    with contextlib.ExitStack() as locks:
+        with writing(place):
+            locks.enter_context(place.locked(WHOLE))
+        if not ensemble_at(place)["complete"]:
+            finish(place, attributes[CHUNKS])
+    return xarray.open_zarr(place.opened())
+
+
+def open_store(path: str | Path) -> "xarray.Dataset":
+    """Open a complete store after every chunk of it has been compared with its checksum.
+
+    `xarray.open_zarr` compares chunks when they are read, and takes one that is missing for NaN.
+
+    **Arguments:** `path`, the store's folder or URL.
+
+    **Returns:** the opened `xarray.Dataset`.
+
+    **Raises:** `StoreError` that says what to do for a store that is not complete, or of which a chunk or a description is
+    damaged or missing; for what is no ensemble's store.
+    """
+    import xarray
+
+    place = place_of(path)
+    if not place.exists():
+        raise StoreError(f"{place.name}: there is no store; give the folder or the URL of one")
+    document = description_of(place)
+    if not document["attributes"]["complete"]:
+        raise StoreError(f"{place.name}: is not complete: resume it (--resume, resume=True), or merge its parts (jaxmuscle "
+                         "merge). xarray.open_zarr opens it as it is")  # fmt: skip
+    bad = wrong(place, document)
+    if bad:
+        raise StoreError(f"{place.name}: {in_words(bad)}. Resume the ensemble with the arguments that it had (--resume, "
+                         "resume=True): what is damaged is computed again")  # fmt: skip
     return xarray.open_zarr(place.opened())
 
 
 def finish(place: AbstractPlace, chunks: int) -> None:
-    """Make a store complete: tallies become moments. **Raises:** `StoreError` if not all `chunks` are there."""
-    attributes = ensemble_at(place)
+    """Make a store complete: tallies become moments.
+
+    **Raises:** `StoreError` if not all `chunks` are there, or if anything is not as it was written.
+    """
+    document = description_of(place)
+    attributes = document["attributes"]
     if json.loads(attributes[SETTINGS])["kind"] == "reduced":
         found = read_tallies(place)
         _require(place, set() if found is None else set(found.chunks), chunks, attributes.get(PARTS))
         assert found is not None
-        write_region(place, ..., _moments(place, found.tally))
+        write_arrays(place, _moments(place, found.tally))
         failed = sorted(found.failed)
     else:
+        drop_damaged(place, logged(place))
         there = logged(place)
         _require(place, set(there), chunks, attributes.get(PARTS))
         failed = [entry for number in sorted(there) for entry in there[number]]
+    bad = wrong(place, document, others(document))
+    if bad:
+        way = "resume it" if PARTS not in attributes else "run any part again, then merge"
+        raise StoreError(f"{place.name}: {in_words(bad)}: {way}, and they are written again")
     complete(place, {"failed": json.dumps(failed)})
+
+
+def failed_in(place: AbstractPlace) -> list[list[int]]:
+    """The (point, seed) that failed in a complete store."""
+    return json.loads(attributes_at(place)["failed"])
 
 
 def _require(place: AbstractPlace, there: set[int], chunks: int, parts: int | None) -> None:
     missing = set(range(chunks)) - there
     if missing and parts is None:
-        raise StoreError(f"{place.name}: {len(missing)} chunks are missing although all processes are done: is the folder "
-                         "the same for all of them? Resume on a shared file system")  # fmt: skip
+        raise StoreError(f"{place.name}: {len(missing)} of {chunks} chunks are missing although all processes are done: is "
+                         "the folder the same for all of them? Resume on a shared file system")  # fmt: skip
     if missing and parts is not None:
         numbers = [number for number in range(1, parts + 1) if missing & set(Part(number, parts).chunks(chunks))]
         raise StoreError(f"{place.name}: {len(missing)} of {chunks} chunks are missing: parts {_ranges(numbers)} of {parts} "

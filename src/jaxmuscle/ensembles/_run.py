@@ -1,51 +1,27 @@
 """Ensembles that outlive their process: reduced while they run, or streamed to a store, by one process or many."""
 
-import hashlib
-import json
 import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
-import jax
 import numpy as np
 from jaxtyping import Int
 
-from jaxmuscle._common.arrays import as_numbers
-from jaxmuscle._common.environment import versions
-from jaxmuscle._common.errors import SimulationError, StoreError
-from jaxmuscle.model._stream import VERSION as STREAM
+from jaxmuscle._common.errors import SimulationError
 from jaxmuscle.response._expected import linear_spectrum
-from jaxmuscle.simulation._trajectory import run_attributes
 
 from ._arrays import region_of, variables_of
-from ._layout import Chunk, Cut, Layout, Pace, run_chunks
-from ._parts import Part, PartReport, finish
+from ._layout import Chunk, Layout, Pace, run_chunks
+from ._mending import drop_damaged
+from ._opening import opened
+from ._parts import Part, PartReport, failed_in, finish
 from ._places import AbstractPlace
-from ._processes import agreed, meet, rank_and_count
+from ._processes import meet, rank_and_count
 from ._running_moments import CELLS, add, count_cells, empty, set_cells
-from ._store import (
-    CHUNKS,
-    PARTS,
-    SETTINGS,
-    Begin,
-    Reduced,
-    Variable,
-    attributes_at,
-    create,
-    ensemble_at,
-    generation_of,
-    log_chunk,
-    logged,
-    read_tallies,
-    read_tally,
-    state_of,
-    tally_key,
-    tally_keys,
-    write_region,
-    write_tally,
-)
+from ._settings import about, identity
+from ._store import PARTS, Begin, Variable, chunk_log, ensemble_at, logged, write_region
 from ._summary import EnsembleSummary, summarised
-from ._sweep import Sweep
+from ._tallies import Reduced, generation_of, read_tallies, read_tally, tally_key, tally_keys, write_tally
 
 if TYPE_CHECKING:
     import xarray
@@ -70,7 +46,7 @@ def reduced(
 
     Of one part its chunks only, whose tally stays in the store until it is merged.
     """
-    settings = _settings(layout, part, {"kind": "reduced", "quantiles": list(levels)})
+    identified = identity(layout, part, {"kind": "reduced", "quantiles": list(levels)})
     values = layout.time.size + (2 * layout.bins + 1 if layout.bins else 0)
 
     def nothing() -> Reduced:
@@ -84,16 +60,35 @@ def reduced(
     known = {*blank.coordinates(), "power_expected"}
     variables = {name: Variable(dims, array.shape, array.shape, array.dtype, units, array if name in known else None)
                  for name, (dims, array, units) in blank.arrays().items()}  # fmt: skip
-    left = _opened(place, variables, blank.coordinates(), blank.attributes() | settings, begin=begin)
-    if part is not None:
-        failed = _reduce_part(layout, levels, place, part, tell, nothing) if left else _failed_in(place)
-        return _report(layout, part, failed, complete=not left)
-    if left:
-        _share_tallies(layout, levels, place, tell, nothing)
-        if rank_and_count()[0] == 0:
-            finish(place, layout.chunks)
-        meet()
+    attributes = blank.attributes() | identified
+    with opened(layout, place, variables, blank.coordinates(), attributes, begin=begin, part=part) as left:
+        if part is not None:
+            failed = _reduce_part(layout, levels, place, part, tell, nothing) if left else failed_in(place)
+            return _report(layout, part, failed, complete=not left)
+        if left:
+            _reduce_all(layout, levels, place, tell, nothing)
+            _finished(layout, place)
     return _loaded(place, blank)
+
+
+def _finished(layout: Layout, place: AbstractPlace) -> None:
+    """Process 0 makes the store complete, once all are done."""
+    if rank_and_count()[0] == 0:
+        finish(place, layout.chunks)
+    meet()
+
+
+def _reduce_all(
+    layout: Layout, levels: tuple[float, ...], place: AbstractPlace, tell: Tell, nothing: Callable[[], Reduced]
+) -> None:
+    """All that is left; of a store made in parts, which was damaged, part by part, so that the numbers are the same."""
+    parts = ensemble_at(place).get(PARTS)
+    if parts is None:
+        return _share_tallies(layout, levels, place, tell, nothing)
+    rank, count = rank_and_count()
+    for number in range(1, parts + 1)[rank::count]:
+        _reduce_part(layout, levels, place, Part(number, parts), tell, nothing)
+    meet()
 
 
 def _share_tallies(
@@ -156,7 +151,7 @@ def _failed(layout: Layout, chunk: Chunk, found: dict[str, np.ndarray]) -> list[
 
 def _cell_sample(layout: Layout, chunk: Chunk, point: int, output: np.ndarray) -> np.ndarray:
     """Output of the first chunk of a point, by which every process places its cells."""
-    first = layout.first_of(point)
+    first = layout.chunk_of(point, 0)
     if chunk.number != first:
         (_, found), = run_chunks(layout, [first], lambda pace: None)  # fmt: skip
         output = found["output"][0][found["finite"][0]]
@@ -196,27 +191,34 @@ def stored(
     """Every trajectory, and its Welch power, to a store; opened when it is complete. Of one part its chunks only."""
     import xarray
 
-    settings = _settings(layout, part, {"kind": "trajectories", "states": states})
+    attributes = about(layout) | identity(layout, part, {"kind": "trajectories", "states": states})
     variables, coordinates = variables_of(layout, states=states)
-    left = _opened(place, variables, coordinates, _about(layout) | settings, begin=begin)
     own = range(layout.chunks) if part is None else part.chunks(layout.chunks)
-    if left:
-        rank, count = rank_and_count()
-        done = logged(place, own)
-        meet()  # all know what is left before anybody adds to it
+    with opened(layout, place, variables, coordinates, attributes, begin=begin, part=part) as left:
+        if left:
+            _write_chunks(layout, place, own, tell, states=states)
+        if part is not None:
+            there = logged(place, own)
+            failed = [entry for number in sorted(there) for entry in there[number]] if left else failed_in(place)
+            return _report(layout, part, failed, complete=not left)
+        if left:
+            _finished(layout, place)
+    return xarray.open_zarr(place.opened())
+
+
+def _write_chunks(layout: Layout, place: AbstractPlace, own: range, tell: Tell, *, states: bool) -> None:
+    """Every process writes its share of those of these chunks that are not there, or are damaged."""
+    rank, count = rank_and_count()
+    drop_damaged(place, logged(place, own[rank::count]))
+    meet()
+    done = logged(place, own)
+    meet()  # all know what is left before anybody adds to it
+    with chunk_log(place) as log:
         for chunk, found in run_chunks(layout, [n for n in own if n not in done][rank::count], tell):
             region, parts = region_of(layout, chunk, found, states=states)
             write_region(place, region, parts)
-            log_chunk(place, chunk.number, _failed(layout, chunk, found))
-        meet()
-        if part is None and rank == 0:
-            finish(place, layout.chunks)
-        meet()
-    if part is None:
-        return xarray.open_zarr(place.opened())
-    there = logged(place, own)
-    failed = [entry for number in sorted(there) for entry in there[number]] if left else _failed_in(place)
-    return _report(layout, part, failed, complete=not left)
+            log(chunk.number, _failed(layout, chunk, found))
+    meet()
 
 
 def _report(layout: Layout, part: Part, failed: list[list[int]], *, complete: bool) -> PartReport:
@@ -225,57 +227,15 @@ def _report(layout: Layout, part: Part, failed: list[list[int]], *, complete: bo
     return PartReport(*part, seeds, np.array(sorted(failed), int).reshape(-1, 2), complete)
 
 
-def _failed_in(place: AbstractPlace) -> list[list[int]]:
-    """The (point, seed) that failed in a complete store."""
-    return json.loads(attributes_at(place)["failed"])
-
-
-def begun_with(place: AbstractPlace) -> Cut | None:
-    """How an existing store was cut, so that it can be resumed with other devices; None if there is none."""
-    if not place.exists():
-        return None
-    settings = json.loads(ensemble_at(place)[SETTINGS])
-    return Cut(settings["points at once"], settings["chunk"]) if "chunk" in settings else None
-
-
-def _settings(layout: Layout, part: Part | None, kind: dict[str, Any]) -> dict[str, Any]:
-    """Attributes by which a store is known again: all that its numbers depend on, and its parts."""
-    settings = {SETTINGS: json.dumps(settings_of(layout) | kind)}
-    return settings if part is None else settings | {PARTS: part.of, CHUNKS: layout.chunks}
-
-
-def _opened(
-    place: AbstractPlace, variables: dict[str, Variable], coordinates: list[str], attributes: dict, *, begin: Begin
-) -> bool:
-    """Make or find the store, as process 0 sees it; whether there is work left. All processes raise the same error."""
-    said, failure = "", None
-    if rank_and_count()[0] == 0:
-        try:
-            said = state_of(place, attributes, begin=begin)
-            if said == "absent" and not create(place, variables, coordinates, attributes):
-                said = state_of(place, attributes, begin="part" if PARTS in attributes else "new")
-        except (ValueError, OSError) as error:
-            said, failure = f"error: {error}", error
-    said = agreed(said)
-    if failure is not None:
-        raise failure
-    if said.startswith("error: "):
-        raise StoreError(said.removeprefix("error: "))
-    if not place.exists():
-        raise StoreError(f"{place.name}: process {rank_and_count()[0]} does not see what process 0 made: give a folder that "
-                         "all processes share")  # fmt: skip
-    return said != "complete"
-
-
 def _summary(layout: Layout, levels: tuple[float, ...], found: Reduced) -> EnsembleSummary:
     expected = None
     if layout.bins and layout.linear is not None:
         spectra = [linear_spectrum(layout.task_of(i), layout.recipe.settings) for i in range(layout.points)]
         expected = np.stack([np.asarray(spectrum.power, float) for spectrum in spectra])
     failed: Int[np.ndarray, "failed 2"] = np.array(sorted(found.failed), int).reshape(-1, 2)
-    about = _about(layout) | ({} if layout.whole else {"cells_per_quantile": CELLS})
+    described = about(layout) | ({} if layout.whole else {"cells_per_quantile": CELLS})
     return summarised(found.tally, layout.task, len(layout.seeds), layout.time, levels, layout.recipe.settings, expected,
-                      failed, about)  # fmt: skip
+                      failed, described)  # fmt: skip
 
 
 def _loaded(place: AbstractPlace, blank: EnsembleSummary) -> EnsembleSummary:
@@ -283,39 +243,5 @@ def _loaded(place: AbstractPlace, blank: EnsembleSummary) -> EnsembleSummary:
     import zarr
 
     group: Any = zarr.open_group(place.opened(), mode="r")
-    failed = np.array(_failed_in(place), int).reshape(-1, 2)
+    failed = np.array(failed_in(place), int).reshape(-1, 2)
     return blank.with_arrays({name: np.asarray(group[name][...]) for name in blank.arrays()}, failed)
-
-
-def _about(layout: Layout) -> dict[str, Any]:
-    """What was run, as attributes."""
-    plan, labels = layout.plan, layout.task.labels if isinstance(layout.task, Sweep) else ()
-    made = run_attributes(layout.task_of(0), plan.rate, plan.grid.dt, plan.grid.substeps, plan.sampling, labels)
-    return made | {"precision": str(jax.numpy.result_type(float))}
-
-
-def settings_of(layout: Layout) -> dict[str, Any]:
-    """All that the numbers depend on, for a store that is resumed to be compared with."""
-    task, plan = layout.task_of(0), layout.plan
-    numbers = layout.task.task if isinstance(layout.task, Sweep) else as_numbers(layout.task)
-    everything = _digest(str(jax.tree.structure(numbers)), *jax.tree.leaves(numbers))
-    seeds = layout.seeds
-    given = f"0 to {len(seeds) - 1}" if isinstance(seeds, range) else f"{len(seeds)}, digest {_digest(seeds)}"
-    parameters = {name: float(value) for name, value in as_numbers(task.parameters).items()}
-    return {
-        "task": type(task).__name__, "muscle": type(task.muscle).__name__, "noise": type(task.noise).__name__,
-        "points": layout.points, "parameters": parameters, "inputs and everything else": everything,
-        "key": np.asarray(jax.random.key_data(layout.key)).ravel().tolist(), "seeds": given, "duration": layout.duration,
-        "dt": plan.grid.dt, "rate": plan.rate, "substeps": plan.grid.substeps, "sampling": plan.sampling,
-        "spectrum": task.settings.to_dict(), "control": layout.linear is not None, "chunk": layout.width,
-        "points at once": layout.together, "precision": str(jax.numpy.result_type(float)),
-        "random numbers": layout.recipe.draws._asdict() | {"stream": STREAM},
-        "versions": {name: versions()[name] for name in ("jaxmuscle", "jax")},
-    }  # fmt: skip
-
-
-def _digest(*values: Any) -> str:
-    found = hashlib.sha256()
-    for value in values:
-        found.update(value.encode() if isinstance(value, str) else np.asarray(value).tobytes())
-    return found.hexdigest()[:16]

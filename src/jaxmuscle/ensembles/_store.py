@@ -1,10 +1,11 @@
 """Ensembles as zarr stores: written chunk by chunk by one or many processes, resumed, never complete before they are."""
 
 import contextlib
-import io
 import json
+import threading
+import time
 import warnings
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -13,12 +14,14 @@ import numpy as np
 
 from jaxmuscle._common.errors import StoreError
 
+from ._integrity import CHECKSUM, Document, keys_of_array, keys_of_chunk, require_intact, sealed, stamped, unsealed
 from ._places import PROGRESS, ROOT, AbstractPlace, place_of
-from ._running_moments import RunningMoments, merged
 
 Begin = Literal["new", "resume", "overwrite", "part"]
 SETTINGS, PARTS, CHUNKS = "settings", "parts", "chunks"
-DONE, TALLY = f"{PROGRESS}/chunk-", f"{PROGRESS}/tally-"
+DONE = f"{PROGRESS}/chunk-"
+LOG_EVERY = 1.0  # seconds between two moments at which chunks are on disk, and said to be
+OPENING = threading.Lock()
 
 
 class Variable(NamedTuple):
@@ -48,6 +51,7 @@ def create(
 
 def _build(folder: Path, variables: Mapping[str, Variable], coordinates: list[str], attributes: dict[str, Any]) -> None:
     import zarr
+    from zarr.codecs import Crc32cCodec, ZstdCodec
 
     labels = [name for name in coordinates if variables[name].dims != (name,)]
     group = zarr.open_group(folder, mode="w", zarr_format=3)
@@ -55,14 +59,31 @@ def _build(folder: Path, variables: Mapping[str, Variable], coordinates: list[st
     for name, v in variables.items():
         fill = np.nan if np.issubdtype(np.dtype(v.dtype), np.floating) else None
         dtype = "string" if np.dtype(v.dtype).kind == "U" else v.dtype  # fixed width is not in the specification
-        array = group.create_array(name, shape=v.shape, chunks=v.chunks, dtype=dtype, dimension_names=v.dims,
-                                   fill_value=fill, attributes={"units": v.units} if v.units else {})  # fmt: skip
-        if v.values is not None:
-            array[...] = v.values
+        group.create_array(name, shape=v.shape, chunks=v.chunks, dtype=dtype, dimension_names=v.dims, fill_value=fill,
+                           compressors=(ZstdCodec(), Crc32cCodec()),
+                           attributes={"units": v.units} if v.units else {})  # fmt: skip
     with warnings.catch_warnings():
         # A copy of all arrays' metadata at the root, where xarray looks for it first.
         warnings.filterwarnings("ignore", "Consolidated metadata is currently not part", category=UserWarning)
         zarr.consolidate_metadata(folder)
+    for name, array in _arrays(folder, [name for name, v in variables.items() if v.values is not None]).items():
+        array[...] = variables[name].values
+    document = json.loads((folder / ROOT).read_text(encoding="utf-8"))
+    (folder / ROOT).write_bytes(text_of(stamped(document)))
+
+
+def _arrays(opened: Any, names: Iterable[str]) -> dict[str, Any]:
+    """Arrays of a store, which write every chunk: that one is not there must mean that it was lost."""
+    import zarr
+
+    with OPENING, zarr.config.set({"array.write_empty_chunks": True}):
+        group: Any = zarr.open_group(opened, mode="r+")
+        return {name: group[name] for name in names}
+
+
+def text_of(document: Document) -> bytes:
+    """A description as it is kept."""
+    return (json.dumps(document, indent=1, ensure_ascii=False, allow_nan=False) + "\n").encode()
 
 
 @contextlib.contextmanager
@@ -85,18 +106,29 @@ def attributes_of(path: str | Path) -> dict[str, Any] | None:
 
 
 def attributes_at(place: AbstractPlace) -> dict[str, Any]:
-    """Attributes of a store. **Raises:** `StoreError` if there is none."""
+    """Attributes of a store. **Raises:** `StoreError` if there is none, or if they are damaged."""
+    document = _document(place)
+    if CHECKSUM in document["attributes"]:
+        require_intact(place, document)
+    return document["attributes"]
+
+
+def _document(place: AbstractPlace) -> Document:
     try:
         root = place.read(ROOT)
         if root is None:
             raise ValueError(f"no {ROOT}")
-        return json.loads(root)["attributes"]
-    except (OSError, ValueError, KeyError) as error:
-        raise StoreError(f"{place.name}: is not a store that jaxmuscle wrote ({error}); give another name") from None
+        document = json.loads(root)
+        if not isinstance(document["attributes"], dict):
+            raise ValueError("no attributes")
+        return document
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise StoreError(f"{place.name}: is not a store that jaxmuscle wrote, or its {ROOT} is damaged ({error}); give "
+                         "another name") from None  # fmt: skip
 
 
 def state_of(place: AbstractPlace, wanted: dict[str, Any], *, begin: Begin) -> str:
-    """Whether a store of these attributes is "absent", "begun" or "complete"; one that is to be overwritten is removed.
+    """Whether a store of these attributes is "absent", to be "overwritten", "begun" or "complete".
 
     **Raises:** `StoreError` if it is there and not to be resumed, was made with other settings (named) or in other parts.
     """
@@ -105,11 +137,10 @@ def state_of(place: AbstractPlace, wanted: dict[str, Any], *, begin: Begin) -> s
     if begin == "new":
         raise StoreError(f"{place.name}: exists already; resume it (--resume, resume=True), overwrite it (--force, "
                          "overwrite=True), or give another name")  # fmt: skip
-    found = ensemble_at(place)
     if begin == "overwrite":
-        with writing(place):
-            place.clear()
-        return "absent"
+        _require_ensemble(place, _document(place)["attributes"])
+        return "overwritten"
+    found = ensemble_at(place)
     _refuse(place, json.loads(found[SETTINGS]), json.loads(wanted[SETTINGS]))
     if found["complete"]:
         return "complete"
@@ -123,11 +154,22 @@ def state_of(place: AbstractPlace, wanted: dict[str, Any], *, begin: Begin) -> s
 
 
 def ensemble_at(place: AbstractPlace) -> dict[str, Any]:
-    """Attributes of an ensemble's store. **Raises:** `StoreError` if it is something else."""
-    attributes = attributes_at(place)
+    """Attributes of an ensemble's store. **Raises:** `StoreError` if it is something else, or damaged."""
+    return description_of(place)["attributes"]
+
+
+def description_of(place: AbstractPlace) -> Document:
+    """The whole description of an ensemble's store. **Raises:** `StoreError` if it is something else, or damaged."""
+    document = _document(place)
+    _require_ensemble(place, document["attributes"])
+    if "random numbers" in document["attributes"][SETTINGS]:
+        require_intact(place, document)
+    return document
+
+
+def _require_ensemble(place: AbstractPlace, attributes: dict[str, Any]) -> None:
     if SETTINGS not in attributes or "complete" not in attributes:
         raise StoreError(f"{place.name}: is not an ensemble that can be resumed (no settings in it); give another name")
-    return attributes
 
 
 def _refuse(place: AbstractPlace, there: dict[str, Any], here: dict[str, Any]) -> None:
@@ -158,19 +200,58 @@ def _short(value: Any) -> str:
 
 def write_region(place: AbstractPlace, region: Any, values: Mapping[str, np.ndarray]) -> None:
     """Write part of some arrays; the region cuts their leading dimensions."""
-    import zarr
-
     with writing(place):
-        group = zarr.open_group(place.opened(), mode="r+")
-        for name, part in values.items():
-            array: Any = group[name]
-            array[region] = part
+        for name, array in _arrays(place.opened(), values).items():
+            array[region] = values[name]
 
 
-def log_chunk(place: AbstractPlace, chunk: int, failed: list[list[int]]) -> None:
-    """A chunk has been written, with these failed (point, seed)."""
+def write_arrays(place: AbstractPlace, values: Mapping[str, np.ndarray]) -> None:
+    """Write whole arrays, which are on disk afterwards."""
+    document = _document(place)
+    write_region(place, ..., values)
     with writing(place):
-        place.write(f"{DONE}{chunk:08d}.json", json.dumps(failed).encode())
+        place.settle(key for name in values for key in keys_of_array(document, name))
+
+
+Log = Callable[[int, list[list[int]]], None]
+
+
+@contextlib.contextmanager
+def chunk_log(place: AbstractPlace) -> Iterator[Log]:
+    """What is called with every chunk that has been written, and the (point, seed) that failed in it.
+
+    The chunks are put on disk, then said to be there, together every second and at the end: one by one it takes far longer.
+    """
+    document, waiting, due = _document(place), {}, 0.0
+
+    def commit() -> None:
+        with writing(place):
+            place.settle(key for chunk in waiting for key in keys_of_chunk(document, chunk))
+        say_done(place, waiting)
+        waiting.clear()
+
+    def log(chunk: int, failed: list[list[int]]) -> None:
+        nonlocal due
+        waiting[chunk] = failed
+        if time.monotonic() >= due:
+            commit()
+            due = time.monotonic() + LOG_EVERY
+
+    try:
+        yield log
+    finally:
+        commit()
+
+
+def done_key(chunk: int) -> str:
+    """The key that says that a chunk is on disk."""
+    return f"{DONE}{chunk:08d}.json"
+
+
+def say_done(place: AbstractPlace, chunks: Mapping[int, list[list[int]]]) -> None:
+    """These chunks are on disk, and these (point, seed) failed in them."""
+    with writing(place):
+        place.write({done_key(chunk): sealed(json.dumps(failed).encode()) for chunk, failed in chunks.items()})
 
 
 def logged(place: AbstractPlace, among: Iterable[int] | None = None) -> dict[int, list[list[int]]]:
@@ -178,68 +259,19 @@ def logged(place: AbstractPlace, among: Iterable[int] | None = None) -> dict[int
     keys = {int(key.removeprefix(DONE)[:8]): key for key in place.progress() if key.startswith(DONE)}
     numbers = sorted(keys.keys() if among is None else keys.keys() & set(among))
     with ThreadPoolExecutor() as pool:  # an object store takes tens of milliseconds for each
-        found = pool.map(lambda number: place.read(keys[number]), numbers)
+        found = pool.map(lambda number: unsealed(place.read(keys[number]) or b""), numbers)
         return {number: json.loads(data) for number, data in zip(numbers, found, strict=True) if data is not None}
-
-
-class Reduced(NamedTuple):
-    """A tally, the chunks in it, and the (point, seed) that failed in them."""
-
-    tally: RunningMoments
-    chunks: frozenset[int]
-    failed: list[list[int]]
-
-
-def write_tally(place: AbstractPlace, key: str, reduced: Reduced) -> None:
-    """Keep what was reduced so far; replaces the key in one step."""
-    data = io.BytesIO()
-    np.savez(data, chunks=np.array(sorted(reduced.chunks), int), failed=np.array(reduced.failed, int).reshape(-1, 2),
-             **reduced.tally._asdict())  # fmt: skip
-    with writing(place):
-        place.write(key, data.getvalue())
-
-
-def read_tally(place: AbstractPlace, key: str) -> Reduced | None:
-    """What was kept under a key, None if there is nothing."""
-    kept = place.read(key)
-    if kept is None:
-        return None
-    with np.load(io.BytesIO(kept)) as data:
-        tally = RunningMoments(*(data[name] for name in RunningMoments._fields))
-        return Reduced(tally, frozenset(data["chunks"].tolist()), data["failed"].tolist())
-
-
-def read_tallies(place: AbstractPlace) -> Reduced | None:
-    """All tallies of a store together, None if there is none; those that a later one contains are not counted twice."""
-    whole = None
-    for key in reversed(tally_keys(place)):
-        part = read_tally(place, key)
-        if part is None or whole is None:
-            whole = part or whole
-        elif not part.chunks & whole.chunks:
-            whole = Reduced(merged(whole.tally, part.tally), whole.chunks | part.chunks, whole.failed + part.failed)
-    return whole
-
-
-def tally_keys(place: AbstractPlace) -> list[str]:
-    """Keys that hold tallies."""
-    return [key for key in place.progress() if key.startswith(TALLY)]
-
-
-def tally_key(generation: int, rank: int) -> str:
-    """Key of a process's tally; one of a later generation contains those of the earlier ones that it shares a chunk with."""
-    return f"{TALLY}{generation:06d}-{rank:06d}.npz"
-
-
-def generation_of(key: str) -> int:
-    """Generation of a tally."""
-    return int(key.removeprefix(TALLY)[:6])
 
 
 def complete(place: AbstractPlace, attributes: dict[str, Any]) -> None:
     """Say that a store is complete, then drop what was needed to resume it."""
+    describe(place, attributes | {"complete": True})
     with writing(place):
-        document = json.loads(place.read(ROOT) or b"")
-        document["attributes"] |= attributes | {"complete": True}
-        place.write(ROOT, (json.dumps(document, indent=1, ensure_ascii=False, allow_nan=False) + "\n").encode())
         place.forget()
+
+
+def describe(place: AbstractPlace, attributes: dict[str, Any]) -> None:
+    """Set attributes of a store."""
+    document = description_of(place)
+    with writing(place):
+        place.write({ROOT: text_of(stamped(document | {"attributes": document["attributes"] | attributes}))})
