@@ -54,7 +54,7 @@ def require_intact(place: AbstractPlace, document: Document) -> None:
         intact = False
     if not intact:
         raise StoreError(f"{place.name}: its description ({ROOT}) is damaged, or of an earlier version of jaxmuscle: its "
-                         "checksum is missing or wrong. Take it from a copy, or begin anew (--force, overwrite=True)")  # fmt: skip
+                         "checksum is missing or wrong. Take a copy, or begin anew (--force, overwrite=True)")  # fmt: skip
 
 
 def described(document: Document) -> dict[str, Document]:

@@ -21,7 +21,7 @@ Begin = Literal["new", "resume", "overwrite", "part"]
 SETTINGS, PARTS, CHUNKS = "settings", "parts", "chunks"
 DONE = f"{PROGRESS}/chunk-"
 LOG_EVERY = 1.0  # seconds between two moments at which chunks are on disk, and said to be
-OPENING = threading.Lock()
+OPENING = threading.Lock()  # of what changes settings of the whole process for a moment
 
 
 class Variable(NamedTuple):
@@ -62,7 +62,7 @@ def _build(folder: Path, variables: Mapping[str, Variable], coordinates: list[st
         group.create_array(name, shape=v.shape, chunks=v.chunks, dtype=dtype, dimension_names=v.dims, fill_value=fill,
                            compressors=(ZstdCodec(), Crc32cCodec()),
                            attributes={"units": v.units} if v.units else {})  # fmt: skip
-    with warnings.catch_warnings():
+    with OPENING, warnings.catch_warnings():
         # A copy of all arrays' metadata at the root, where xarray looks for it first.
         warnings.filterwarnings("ignore", "Consolidated metadata is currently not part", category=UserWarning)
         zarr.consolidate_metadata(folder)
