@@ -3,8 +3,8 @@
     python benchmarks/kills.py [--trials 20] [--only parts runs writers]
 
 `parts`: four parts start at once, one of them ends by SIGKILL at a random moment (also while it starts) and is run again,
-all are merged. `runs`: one process ends by SIGKILL at a random moment, twice, and is resumed. `writers`: two processes start on
-one reduced store, the second a random moment later, with the same settings, or to overwrite it with others; whoever is
+all are merged. `runs`: one process ends by SIGKILL at a random moment, twice, and is resumed. `writers`: two processes start
+on one reduced store, the second a random moment later, with the same settings, or to overwrite it with others; whoever is
 refused must say so. Paths must be those of one run bit by bit, moments of parts to 1e-6 of the largest value, all others
 bit by bit. A quarter of an hour.
 """

@@ -149,16 +149,20 @@ def _held(file: Path, name: str, *, shared: bool = False, beside: bool = False, 
         yield
     finally:
         # The last of those who share removes the file; whoever opened it meanwhile sees that, and begins again.
-        if not shared or _lock(handle, shared=False):
+        last = not shared or _lock(handle, shared=False)
+        if sys.platform == "win32":  # which removes no open file
+            os.close(handle)
+        if last:
             file.unlink(missing_ok=True)
-        os.close(handle)
+        if sys.platform != "win32":
+            os.close(handle)
 
 
 def _taken(file: Path, name: str, *, shared: bool, patient: bool) -> int:
     for _ in range(TRIES):
         handle = os.open(file, os.O_RDWR | os.O_CREAT, 0o666)
         try:
-            got, who = _lock(handle, shared=shared), Holder.of(os.pread(handle, 4096, 0))
+            got, who = _lock(handle, shared=shared), Holder.of(os.read(handle, 4096))
             who_else = who or next(filter(None, (Holder.of(_bytes(other)) for other in _beside(file))), None)
             if got is False and who_else is not None:
                 raise busy(name, who_else)
@@ -183,7 +187,8 @@ def _succeed(handle: int, file: Path, name: str, who: Holder | None, *, known: b
         taken_over(name, who)
     os.ftruncate(handle, 0)
     if not shared:
-        os.pwrite(handle, Holder.here().to_bytes(), 0)
+        os.lseek(handle, 0, os.SEEK_SET)
+        os.write(handle, Holder.here().to_bytes())
 
 
 def _lock(handle: int, *, shared: bool) -> bool | None:

@@ -83,7 +83,7 @@ def _arrays(opened: Any, names: Iterable[str]) -> dict[str, Any]:
 
 def text_of(document: Document) -> bytes:
     """A description as it is kept."""
-    return (json.dumps(document, indent=1, ensure_ascii=False, allow_nan=False) + "\n").encode()
+    return json.dumps(document, indent=2, allow_nan=False).encode()
 
 
 @contextlib.contextmanager
