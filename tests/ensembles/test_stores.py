@@ -266,7 +266,7 @@ def test_leftovers_are_removed(tmp_path, kept):
     given: Any = {"seeds": 24, "store": path, **SHORT, **kept}
     with pytest.raises(Stop):
         jm.ensemble(TASK, KEY, progress=stopped_after(1), **given)
-    (tmp_path / ".a.zarr.new-abc").mkdir()
+    (tmp_path / ".a.zarr.new-abc").mkdir()  # killed while it began, or removed an older store
     (path / "time" / "c" / "0.123.partial").write_bytes(b"killed while writing")
     (tmp_path / ".a.zarr-backup").mkdir()  # somebody else's
     jm.ensemble(TASK, KEY, resume=True, **given)

@@ -175,7 +175,9 @@ class Folder(AbstractPlace):
         return True
 
     def clear(self) -> None:
-        shutil.rmtree(self.path)
+        aside = Path(tempfile.mkdtemp(prefix=self._built.name, dir=self.path.parent))
+        os.rename(self.path, aside / "old")  # in one step: what is half removed has another name
+        shutil.rmtree(aside)
 
 
 class Bucket(AbstractPlace):
