@@ -406,20 +406,16 @@ def test_a_file_system_without_locks(tmp_path, monkeypatch, caplog):
 
 
 @pytest.mark.slow
-def test_two_writers_and_kills_never_give_wrong_numbers(tmp_path, monkeypatch):
-    """A few of the trials of benchmarks/kills.py, which has fifty and twenty."""
+def test_two_writers_never_give_wrong_numbers(tmp_path, monkeypatch):
+    """A few of the trials of benchmarks/kills.py, which has fifty; the second process comes within a second."""
     monkeypatch.syspath_prepend(str(Path(__file__).parents[2] / "benchmarks"))
     monkeypatch.setenv("PYTHONPATH", environment()["PYTHONPATH"])
     import kills
 
-    longest, rng = kills.undisturbed(tmp_path / "a.zarr", True), random.Random(4)
-    ones = {key: kills.whole(True, key) for key in (5, 6)}
+    ones, rng = {key: kills.whole(True, key) for key in (5, 6)}, random.Random(4)
     for number in range(4):
-        found, key, _ = kills.writers(tmp_path / f"writers-{number}.zarr", rng, longest)
+        found, key, _ = kills.writers(tmp_path / f"{number}.zarr", rng, 1.0)
         assert kills.equal(found, ones[key], True, 0.0)
-    trials = [kills.runs(tmp_path / f"runs-{number}.zarr", True, rng, longest) for number in range(2)]
-    assert [kills.equal(found, ones[5], True, 0.0) for found, _ in trials] == [True] * 2
-    assert any(early for _, early in trials), "nothing was interrupted: the test shows nothing"
 
 
 def test_a_store_may_be_copied(tmp_path):
