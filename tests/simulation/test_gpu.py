@@ -19,7 +19,7 @@ from jaxmuscle.model._stream import Stream
 stream = Stream.of(jax.random.key(3))
 normals = np.stack(stream.normals(np.arange(10_000, dtype=np.uint32), 0, 4))
 path = jm.simulate(jm.Isometric(), jax.random.key(3), duration=2.0).output
-reduced = jm.ensemble(jm.Isometric(), seeds=64, duration=3.4, key=jax.random.key(3), reduce=True)
+reduced = jm.ensemble(jm.Isometric(), seeds=64, duration=15.0, key=jax.random.key(3), reduce=True)
 np.savez(sys.argv[1], normals=normals, path=path, mean=reduced.mean, power=reduced.spectrum.power)
 """
 
