@@ -103,7 +103,9 @@ def _as_options(message: str) -> str:
 
 
 def plain(text: object) -> str:
-    return str(text).replace("[", r"\[")
+    """Text as it is: no markup in it, and no letters that do something to the terminal (they may come out of a file)."""
+    shown = "".join(letter if letter.isprintable() or letter in "\n\t" else ascii(letter)[1:-1] for letter in str(text))
+    return shown.replace("[", r"\[")
 
 
 def show(result: object, *, success: bool) -> None:
