@@ -148,6 +148,7 @@ def mutant(data: bytes, rng: random.Random) -> bytes:
             changed[at:at] = changed[at : at + rng.randrange(1, 64)]
         else:
             changed = changed[: at + 1]
+        changed = changed or bytearray(1)
     return bytes(changed)
 
 

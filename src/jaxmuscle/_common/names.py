@@ -6,7 +6,7 @@ from collections.abc import Iterable
 
 LONGEST = 100  # bytes in UTF-8
 _FORBIDDEN = '/\\:*?"<>|'
-_RESERVED = re.compile(r"(con|prn|aux|nul|conin\$|conout\$|(com|lpt)[0-9¹²³])(\..*)?", re.IGNORECASE)  # of Windows
+_RESERVED = re.compile(r"(con|prn|aux|nul|conin\$|conout\$|(com|lpt)[0-9¹²³]) *(\..*)?", re.IGNORECASE)  # of Windows
 
 
 def file_name(name: str) -> str:
@@ -20,8 +20,8 @@ def file_name(name: str) -> str:
     text = unicodedata.normalize("NFC", name)
     text = "".join("_" if letter in _FORBIDDEN or not letter.isprintable() else letter for letter in text)
     text = re.sub(r"^[-.~ ]+", lambda front: "_" * len(front[0]), text.rstrip(". "))
-    text = text.encode()[:LONGEST].decode(errors="ignore").rstrip(". ")
-    return f"_{text}" if not text or _RESERVED.fullmatch(text) else text
+    text = f"_{text}" if not text or _RESERVED.fullmatch(text) else text
+    return text.encode()[:LONGEST].decode(errors="ignore").rstrip(". ")
 
 
 def file_names(names: Iterable[str], taken: Iterable[str] = ()) -> dict[str, str]:

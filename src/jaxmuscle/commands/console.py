@@ -91,7 +91,8 @@ def record(found: Any) -> None:
 def _words(error: Exception) -> str:
     if isinstance(error, OSError) and error.filename is not None:
         return f"{error.filename}: {error.strerror}"
-    return _as_options(str(error))
+    # A cell of a damaged file may be as long as the file.
+    return _as_options(re.sub(r"(?s)(\S{200})\S{200,}", r"\1...", str(error)))
 
 
 def _as_options(message: str) -> str:

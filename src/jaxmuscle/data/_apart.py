@@ -5,6 +5,7 @@ process gets limits of memory and time, and hands back lines of JSON and plain n
 """
 
 import contextlib
+import io
 import json
 import math
 import multiprocessing.spawn
@@ -15,7 +16,7 @@ import sys
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 
@@ -54,7 +55,7 @@ def read_apart(path: Path, kind: str, error: type[ValueError] = ValueError, **wo
 
 
 def understood(
-    path: Path, kind: str, stream: BinaryIO, ended: Callable[[], str], error: type[ValueError] = ValueError
+    path: Path, kind: str, stream: io.BufferedIOBase, ended: Callable[[], str], error: type[ValueError] = ValueError
 ) -> Any:
     """What the process that reads the file at `path` hands over by `stream`; `ended` says why it ended before.
 
@@ -106,7 +107,7 @@ def _reading(request: dict[str, Any], error: type[ValueError]) -> Iterator[tuple
         process.stdout.close()
 
 
-def received(stream: BinaryIO, allowed: int) -> list[Channel] | bytes:
+def received(stream: io.BufferedIOBase, allowed: int) -> list[Channel] | bytes:
     """What the process hands over; not trusted, since the file may have taken it over.
 
     **Raises:** `EOFError` where it ends before it has said all; `ValueError` with the words for what is wrong with the file;
@@ -145,11 +146,11 @@ def _described(name: Any, kind: Any, count: Any, rate: Any, unit: Any) -> tuple[
     return printable(str(name)), kind, count, float(rate) if stated else None, printable(str(unit))
 
 
-def _filled(stream: BinaryIO, array: np.ndarray) -> np.ndarray:
+def _filled(stream: io.BufferedIOBase, array: np.ndarray) -> np.ndarray:
     view = memoryview(array).cast("B") if array.size else memoryview(b"")
     done = 0
     while done < len(view):
-        count = stream.readinto(view[done:])  # pyright: ignore[reportAttributeAccessIssue]
+        count = stream.readinto(view[done:])
         if not count:
             raise EOFError
         done += count

@@ -3,12 +3,13 @@
 It imports NumPy and the library for the format. Whatever that library does (crash, wait, take all memory), it does here.
 """
 
+import io
 import json
 import os
 import signal
 import tarfile
 from collections.abc import Callable, Iterator
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 
@@ -68,7 +69,7 @@ def limit(most: int, seconds: int) -> None:
             continue
 
 
-def answer(request: dict[str, Any], out: BinaryIO) -> None:
+def answer(request: dict[str, Any], out: io.BufferedIOBase) -> None:
     """One line of JSON that says what follows, or what is wrong; then the bytes of the text, or of all samples."""
     head: dict[str, Any]
     parts: Iterator[Any] = iter(())

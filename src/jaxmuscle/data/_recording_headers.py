@@ -83,10 +83,10 @@ def _labchart(above: Rows, width: int, file: str) -> Head | None:
 def _acqknowledge(lines: list[Line], first: list[str], above: Rows, width: int, length: int, file: str) -> Head | None:
     """AcqKnowledge: `0.5 msec/sample`, `2 channels`, name and unit of each on lines of their own, `CH1 CH2`, counts."""
     found = next(((i, match) for i, line in enumerate(lines[:20]) if (match := _PER_SAMPLE.match(line.body))), None)
-    if found is None:
+    if found is None or not above or found[0] + 1 == len(lines):
         return None
     at, match = found
-    count = int((re.match(r"\s*(\d+)", lines[at + 1].body) or [0, width])[1])
+    count = int((re.match(r"\s*(\d{1,6})", lines[at + 1].body) or [0, width])[1])
     texts = [line.body.strip().strip('"') for line in lines[at + 2 : at + 2 + 2 * count]]
     names, units = texts[::2], texts[1::2]
     if width == count + 1:
