@@ -20,12 +20,15 @@ POWER = 1 / (1 + (GRID / 1.2) ** 2) + 0.01
 
 
 @pytest.fixture(autouse=True)
-def keep_cache(monkeypatch):
-    """Commands switch the compilation cache; the tests keep theirs. Messages are not to be broken into lines."""
+def keep_settings(monkeypatch):
+    """Commands switch cache, precision and devices; the tests keep theirs. Messages are not to be broken into lines."""
     monkeypatch.setenv("COLUMNS", "1000")
-    before = jax.config.jax_compilation_cache_dir
+    monkeypatch.setenv("JAXMUSCLE_CACHE", os.environ.get("JAXMUSCLE_CACHE", ""))
+    jax.devices()  # from now on there can be no more of them
+    before = jax.config.jax_compilation_cache_dir, jax.config.jax_enable_x64
     yield
-    jax.config.update("jax_compilation_cache_dir", before)
+    jax.config.update("jax_compilation_cache_dir", before[0])
+    jax.config.update("jax_enable_x64", before[1])
 
 
 def run(*arguments):
@@ -51,7 +54,7 @@ COMMANDS = {
     "design": ("fit.json", []),
     "design a preset": ("preset.toml", []),
     "simulate": ("preset.toml", []),
-    "ensemble": ("fit.json", []),
+    "ensemble": ("fit.json", ["--seeds", 2]),
     "speed": ("preset.toml", []),
     "study": ("study.csv", []),
     "reproduce": ("trial.csv", ["--recording"]),

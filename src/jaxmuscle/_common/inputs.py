@@ -38,7 +38,9 @@ def looked_at(path: Path, error: type[ValueError] = ValueError, *, instead: str 
         raise error(_unreadable(path, reason)) from None
     if not stat.S_ISREG(found.st_mode):
         raise error(f"{path}: is a {OTHERS.get(stat.S_IFMT(found.st_mode), 'special file')}; give {instead}")
-    _allowed(path, found.st_size, error)
+    if found.st_size > most():
+        size, allowed = found.st_size / 2**30, most() / 2**30
+        raise error(f"{path}: has {size:.3g} GiB, more than the {allowed:.3g} GiB that may be read{BEYOND}")
     return found.st_size
 
 
@@ -47,11 +49,9 @@ def read_bytes(path: Path, error: type[ValueError] = ValueError, *, instead: str
     looked_at(path, error, instead=instead, hint=hint)
     try:
         with path.open("rb") as stream:
-            data = stream.read(most() + 1)
+            return stream.read()
     except OSError as reason:
         raise error(_unreadable(path, reason)) from None
-    _allowed(path, len(data), error)
-    return data
 
 
 def read_text(path: Path, error: type[ValueError] = ValueError, *, instead: str = "a file", hint: str = "") -> str:
@@ -61,8 +61,3 @@ def read_text(path: Path, error: type[ValueError] = ValueError, *, instead: str 
 
 def _unreadable(path: Path, reason: Exception) -> str:
     return f"{path}: cannot be read: {getattr(reason, 'strerror', None) or reason}"
-
-
-def _allowed(path: Path, size: int, error: type[ValueError]) -> None:
-    if size > most():
-        raise error(f"{path}: has {size / 2**30:.3g} GiB, more than the {most() / 2**30:.3g} GiB that may be read{BEYOND}")
