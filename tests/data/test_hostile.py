@@ -211,6 +211,18 @@ def test_bombs(name, tmp_path, monkeypatch):
     assert message in one_sentence(path, caught.value) and ALLOWED in str(caught.value)
 
 
+# --- names of files
+
+
+@POSIX
+def test_names_of_files_that_cannot_be_printed_can_be_written(tmp_path):
+    path = tmp_path / os.fsdecode(b"tri\xff\x1bal.csv")
+    path.write_bytes(hostile_files.TEXTS["csv"])
+    recording = load_recording(path)
+    assert recording.name == "tri\N{REPLACEMENT CHARACTER}\N{REPLACEMENT CHARACTER}al"
+    assert recording.name.encode() and recording.source.encode()
+
+
 # --- HDF5 that points elsewhere; objects
 
 

@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 
 from jaxmuscle._common.inputs import BEYOND, looked_at, most
+from jaxmuscle._common.text import printable
 
 from ._recording_channels import TYPES, Channel
 
@@ -155,11 +156,6 @@ def _filled(stream: io.BufferedIOBase, array: np.ndarray) -> np.ndarray:
             raise EOFError
         done += count
     return array
-
-
-def printable(text: str) -> str:
-    """Text out of a file without letters that would do something to a terminal or cannot be written."""
-    return "".join(letter if letter.isprintable() else "\N{REPLACEMENT CHARACTER}" for letter in text)
 
 
 def _ended(code: int, seconds: int, *, late: bool) -> str:

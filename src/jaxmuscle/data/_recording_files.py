@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, overload
 
 from jaxmuscle._common.inputs import looked_at, read_bytes
+from jaxmuscle._common.text import printable
 from jaxmuscle.spectra._settings import require
 
 from ._apart import read_apart
@@ -106,7 +107,7 @@ def load_columns(
     require(columns is None or len(names) > 0, "columns", columns, "give the names of the columns that are recordings")
     if not names:
         raise ValueError(f"{table.file}: holds no column with numbers besides the time")
-    stem = Path(table.file).stem
+    stem = printable(Path(table.file).stem)
     return [recording_of(Recording, table, Reading(name, time=time, **options), f"{stem} {name}") for name in names]
 
 

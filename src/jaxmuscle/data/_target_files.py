@@ -13,7 +13,7 @@ from jaxmuscle._common.bundled import bundled_text, list_targets
 from jaxmuscle._common.errors import TargetError
 from jaxmuscle._common.files import text_of
 from jaxmuscle._common.inputs import read_bytes
-from jaxmuscle._common.text import choices
+from jaxmuscle._common.text import choices, printable
 from jaxmuscle.spectra._settings import SpectrumSettings
 
 from ._apart import read_apart
@@ -99,7 +99,7 @@ def _parse_csv(text: str, file: str, axis: str) -> Raw:
         return _digitised(points, file, axis, comment or path.name)
     _linear(axis, file)
     check_columns(columns, file, ordered=True)
-    fields = {"name": path.stem, "source": comment or path.name, "settings": SpectrumSettings()}
+    fields = {"name": printable(path.stem), "source": comment or printable(path.name), "settings": SpectrumSettings()}
     return Raw(file, fields, columns, [])
 
 
@@ -119,7 +119,12 @@ def _digitised(points: Points, file: str, axis: str, source: str) -> Raw:
     notice = f"{origin}: taken as points of a figure, {what}, sorted by frequency"
     notice += f", {averaged} near-duplicates averaged" if averaged else ""
     source = source if points.dataset is None else f"{source}, dataset {points.dataset!r}"
-    fields = {"name": Path(file).stem, "provenance": "digitised", "source": source, "settings": settings}
+    fields = {
+        "name": printable(Path(file).stem),
+        "provenance": "digitised",
+        "source": printable(source),
+        "settings": settings,
+    }
     return Raw(file, fields, merged, [notice], True, log_frequency)
 
 
