@@ -192,6 +192,7 @@ def declared_tar(path):
 
 BOMBS = {
     "bomb.npz": (zip_bomb, "it holds more than 0.01 GiB"),
+    "bomb.xlsx": (zip_bomb, "it holds more than 0.01 GiB"),
     "bomb.npy": (declared_npy, "it holds more than 0.01 GiB"),
     "bomb.mat": (packed_mat, "it holds more than 0.01 GiB"),
     "bomb73.mat": (declared_hdf5, "it holds more than 0.01 GiB"),
@@ -203,6 +204,8 @@ BOMBS = {
 @pytest.mark.parametrize("name", BOMBS)
 def test_bombs(name, tmp_path, monkeypatch):
     make, message = BOMBS[name]
+    if name.endswith("xlsx"):
+        pytest.importorskip("openpyxl")
     path = tmp_path / name
     make(path)
     monkeypatch.setenv(ALLOWED, "0.01")
