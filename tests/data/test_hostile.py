@@ -156,6 +156,15 @@ def test_rates_and_names_of_an_answer_are_cleaned():
     assert (second.name, second.rate, second.samples.dtype) == ("b", None, np.int16)
 
 
+def test_a_channel_may_be_empty(tmp_path):
+    path, nptdms = tmp_path / "trial.tdms", pytest.importorskip("nptdms")
+    with nptdms.TdmsWriter(str(path)) as writer:
+        empty = nptdms.ChannelObject("arm", "Empty", np.zeros(0))
+        writer.write_segment([nptdms.ChannelObject("arm", "Force", np.arange(3.0), {"wf_increment": 0.01}), empty])
+    table = read_table(path)
+    assert table.columns["Empty"]().size == 0 and table.columns["Force"]().tolist() == [0, 1, 2]
+
+
 # --- bombs
 
 

@@ -143,12 +143,12 @@ def received(stream: io.BufferedIOBase, allowed: int) -> list[Channel] | bytes:
 def _described(name: Any, kind: Any, count: Any, rate: Any, unit: Any) -> tuple[str, str, int, float | None, str]:
     if kind not in TYPES or not isinstance(count, int) or count < 0:
         raise TypeError
-    stated = rate is not None and 0 < float(rate) < math.inf
-    return printable(str(name)), kind, count, float(rate) if stated else None, printable(str(unit))
+    stated = math.nan if rate is None else float(rate)
+    return printable(str(name)), kind, count, stated if 0 < stated < math.inf else None, printable(str(unit))
 
 
 def _filled(stream: io.BufferedIOBase, array: np.ndarray) -> np.ndarray:
-    view = memoryview(array).cast("B") if array.size else memoryview(b"")
+    view = array.data.cast("B") if array.size else memoryview(b"")
     done = 0
     while done < len(view):
         count = stream.readinto(view[done:])

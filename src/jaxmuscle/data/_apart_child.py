@@ -109,4 +109,4 @@ def _described(channel: Channel) -> list[Any]:
 
 
 def _bytes(channel: Channel) -> memoryview:
-    return memoryview(np.ascontiguousarray(channel.samples)).cast("B")
+    return np.ascontiguousarray(channel.samples).data.cast("B") if channel.samples.size else memoryview(b"")
