@@ -8,7 +8,6 @@ import subprocess
 import sys
 import tarfile
 import threading
-import time
 import zipfile
 
 import hostile_files
@@ -72,7 +71,7 @@ DOES = {
     "gives up": ("import os; os.abort()", "its reader crashed (SIGABRT)"),
     "never ends": ("import time; time.sleep(600)", "its reader did not come to an end within 2 s; the file is"),
     "takes all time": ("while True: pass", "its reader did not come to an end within"),
-    "takes all memory": ("a = [bytearray(1 << 28) for _ in range(100)]", "it holds more than 0.25 GiB, or says so because"),
+    "takes all memory": ("import numpy; numpy.empty(3 << 30, 'u1')", "it holds more than 0.25 GiB, or says so because"),
     "leaves": ("import os; os._exit(7)", "its reader ended without an answer (exit code 7)"),
     "recurses": ("f = lambda: f()\n    f()", "maximum recursion depth exceeded"),
     "says many lines": ("raise RuntimeError('one\\ntwo ' + 'x' * 9999)", "one two x"),
@@ -89,17 +88,16 @@ def test_what_a_library_does_is_one_sentence(case, tmp_path, monkeypatch):
     (tmp_path / "ezc3d.py").write_text(f"def c3d(path):\n    {done}\n")
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(_apart, "SECONDS", 1)
-    monkeypatch.setattr(_apart, "EACH", 1)
+    if "did not come to an end" in message:
+        monkeypatch.setattr(_apart, "SECONDS", 1)
+        monkeypatch.setattr(_apart, "EACH", 1)
     monkeypatch.setenv(ALLOWED, "0.25")
     path = tmp_path / "trial.c3d"
     path.write_bytes(b"c3d")
-    begun = time.monotonic()
     with pytest.raises(ValueError) as caught:
         load_recording(path)
     words = one_sentence(path, caught.value)
     assert words.startswith(f"{path}: cannot be read as .c3d: ") and message in words and len(words) < 1000
-    assert time.monotonic() - begun < 60
 
 
 def test_a_script_without_a_guard_reads_once(tmp_path):
