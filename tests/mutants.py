@@ -84,7 +84,10 @@ SUBJECTS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     ),
     "recordings": (
         (
+            "data/_apart",
+            "data/_apart_child",
             "data/_recording",
+            "data/_recording_channels",
             "data/_recording_quality",
             "data/_recording_body",
             "data/_recording_choice",
@@ -97,7 +100,7 @@ SUBJECTS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
             "data/_recording_time",
             "data/_units",
         ),
-        ("recording", "recording_file", "recording_formats", "reproduce"),
+        ("recording", "recording_file", "recording_formats", "hostile", "reproduce"),
     ),
     "ensemble store": (
         (

@@ -154,9 +154,9 @@ def test_out_is_a_file(tmp_path):
 
 PRESETS = {
     "unknown": ("zagrodny-slifki", "unknown preset 'zagrodny-slifki'"),
-    "missing file": ("{folder}/missing.toml", "missing.toml: cannot be read: No such file"),
-    "folder": ("{folder}", "cannot be read: Is a directory"),
-    "empty file": ("{folder}/empty.toml", "empty.toml: has no [task_table]"),
+    "missing file": ("{folder}/missing.toml", "missing.toml: no such file"),
+    "folder": ("{folder}", "is a folder; give a preset (.toml) or a fit.json"),
+    "empty file": ("{folder}/empty.toml", "empty.toml: is empty"),
     "broken file": ("{folder}/broken.toml", "broken.toml: is not valid TOML"),
     "broken fit.json": ("{folder}/fit.json", "fit.json: is not valid JSON"),
 }

@@ -17,6 +17,8 @@ from typer.testing import CliRunner
 from jaxmuscle.commands.analyse import analyse
 from jaxmuscle.data._recording import Recording
 from jaxmuscle.data._recording_files import load_recording
+from jaxmuscle.data._recording_formats import read_c3d
+from jaxmuscle.data._recording_table import channels_table
 from jaxmuscle.data._target import load_target
 
 X = np.round(10 + np.random.default_rng(0).normal(size=40), 3)
@@ -215,9 +217,9 @@ class FakeC3d(dict):
         super().__init__(data=data, parameters=parameters)
 
 
-def test_c3d(tmp_path, monkeypatch):
+def test_c3d(monkeypatch):
     monkeypatch.setitem(sys.modules, "ezc3d", types.SimpleNamespace(c3d=FakeC3d))
-    path = write(tmp_path, b"c3d", "trial.c3d")
+    path = channels_table("trial.c3d", read_c3d("trial.c3d", 0))
     recording = load_recording(path, column="finger", axis="y", reference="stand")
     expected = XYZ[:, 1] - STAND[:, 1]
     expected[7] = (expected[6] + expected[8]) / 2
@@ -229,8 +231,14 @@ def test_c3d(tmp_path, monkeypatch):
     np.testing.assert_array_equal(load_recording(path, column="channel 1", units="N").whole, X + 1)
 
 
+def without_ezc3d(tmp_path, monkeypatch):
+    """Files are read in a process of its own, which finds modules where this one does."""
+    write(tmp_path, b"raise ImportError", "ezc3d.py")
+    monkeypatch.syspath_prepend(tmp_path)
+
+
 def test_c3d_without_library(tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "ezc3d", None)
+    without_ezc3d(tmp_path, monkeypatch)
     with pytest.raises(ImportError, match=r"reading C3D needs ezc3d: pip install jaxmuscle\[c3d\]"):
         load_recording(write(tmp_path, b"c3d", "trial.c3d"))
 
@@ -444,6 +452,6 @@ def test_command_exits_with_2_and_one_line(arguments, message, tmp_path):
 
 
 def test_command_without_ezc3d(tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "ezc3d", None)
+    without_ezc3d(tmp_path, monkeypatch)
     done = run(write(tmp_path, b"c3d", "trial.c3d"), "--out", tmp_path / "out")
     assert done.exit_code == 2 and "pip install jaxmuscle[c3d]" in " ".join(done.output.split())

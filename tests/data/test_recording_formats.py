@@ -10,6 +10,8 @@ import pytest
 
 from jaxmuscle.data._recording import Recording
 from jaxmuscle.data._recording_files import load_columns, load_recording
+from jaxmuscle.data._recording_labs import read_acq, read_smr
+from jaxmuscle.data._recording_table import channels_table
 
 X = np.round(10 + np.random.default_rng(0).normal(size=60), 4)
 EMG = np.round(np.random.default_rng(1).normal(size=60), 4)
@@ -340,17 +342,17 @@ def test_tdms(tmp_path):
     assert [r.name for r in load_columns(path)] == ["trial arm/Force", "trial leg/Force"]
 
 
-def test_acq(tmp_path, monkeypatch):
+def test_acq(monkeypatch):
     """No library writes .acq: this is the documented part of what bioread returns."""
     channel = types.SimpleNamespace(name="Force", data=X, samples_per_second=500.0, units="Volts")
     fake = types.SimpleNamespace(read_file=lambda path: types.SimpleNamespace(channels=[channel]))
     monkeypatch.setitem(sys.modules, "bioread", fake)
-    recording = load_recording(write(tmp_path, b"acq", "trial.acq"))
+    recording = load_recording(channels_table("trial.acq", read_acq("trial.acq", 0)))
     np.testing.assert_array_equal(recording.whole, X)
     assert (recording.rate, recording.unit) == (500, "V")
 
 
-def test_smr(tmp_path, monkeypatch):
+def test_smr(monkeypatch):
     """No library writes .smr: neo's own signals, in place of what it reads."""
     neo, quantities = pytest.importorskip("neo"), pytest.importorskip("quantities")
     signal = neo.AnalogSignal(np.stack([X, EMG], axis=1), units="N", sampling_rate=0.5 * quantities.kHz,
@@ -359,12 +361,12 @@ def test_smr(tmp_path, monkeypatch):
     segment.analogsignals.append(signal)
     blocks = types.SimpleNamespace(segments=[segment])
     monkeypatch.setattr("neo.io.Spike2IO", lambda filename: types.SimpleNamespace(read_block=lambda lazy: blocks))
-    recording = load_recording(write(tmp_path, b"smr", "trial.smr"), column="Force")
+    recording = load_recording(channels_table("trial.smr", read_smr("trial.smr", 0)), column="Force")
     np.testing.assert_array_equal(recording.whole, X)
     assert (recording.rate, recording.unit) == (500, "N")
     blocks.segments.append(segment)
     with pytest.raises(ValueError, match="holds 2 stretches with gaps between"):
-        load_recording(tmp_path / "trial.smr")
+        read_smr("trial.smr", 0)
 
 
 LIBRARIES = {"xlsx": "openpyxl", "edf": "pyedflib", "tdms": "nptdms", "acq": "bioread", "smr": "neo.io"}
@@ -372,7 +374,8 @@ LIBRARIES = {"xlsx": "openpyxl", "edf": "pyedflib", "tdms": "nptdms", "acq": "bi
 
 @pytest.mark.parametrize("kind", LIBRARIES)
 def test_without_library(kind, tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, LIBRARIES[kind], None)
+    write(tmp_path, b"raise ImportError", LIBRARIES[kind].partition(".")[0] + ".py")
+    monkeypatch.syspath_prepend(tmp_path)
     with pytest.raises(ImportError, match=rf"needs {LIBRARIES[kind].partition('.')[0]}: pip install jaxmuscle\[labs\]"):
         load_recording(write(tmp_path, b"any", f"trial.{kind}"))
 

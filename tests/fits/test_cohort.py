@@ -183,7 +183,7 @@ def test_the_printed_table_fits_80_columns_and_shortens_no_number(monkeypatch):
     cohort = jm.fits.CohortResult(dict.fromkeys(names, result), names, {})
     console = Console(width=80, file=io.StringIO(), color_system=None)
     monkeypatch.setattr(_cli_cohort, "out", console)
-    _cli_cohort._show(cohort, Path("out"))
+    _cli_cohort._show(cohort, Path("out"), {name: Path("out") / name for name in names})
     printed = console.file.getvalue()
     assert printed.count("0.000199±6e-05") == 2 * len(_cli_cohort.SHOWN) and "…" not in printed
     assert max(map(len, printed.splitlines())) <= 80

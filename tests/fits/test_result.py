@@ -293,10 +293,10 @@ def test_json_refuses_what_it_has_no_word_for(tmp_path):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        (None, "fit.json: cannot be read: No such file"),
+        (None, "fit.json: no such file"),
         ("{", "fit.json: is not JSON"),
-        ("", "fit.json: is not JSON"),
-        (b"\xff\xfe\x00", "fit.json: is not JSON"),
+        ("", "fit.json: is empty"),
+        (b"\xff\xfe\x00", "fit.json: is not UTF-8 text"),
         ("[1, 2]", f"is not a fit result of format {FORMAT}; write it with FitResult.save"),
         ("{}", f"is not a fit result of format {FORMAT}"),
         ('{"format": 99}', "is not a fit result of format"),
@@ -438,12 +438,12 @@ def preset_text(**changes):
 
 
 WRONG = {
-    "unknown.toml": (None, "unknown.toml: cannot be read: No such file"),
+    "unknown.toml": (None, "unknown.toml: no such file"),
     "broken.toml": ("[task_table", "broken.toml: is not valid TOML"),
     "broken.json": ("{", "broken.json: is not valid JSON"),
-    "binary.toml": (b"\xff\xfe\x00", "binary.toml: is not valid TOML"),
+    "binary.toml": (b"\xff\xfe\x00", "binary.toml: is not UTF-8 text"),
     "list.json": ("[]", "list.json: is not a preset"),
-    "empty.toml": ("", r"empty.toml: has no \[task_table\]"),
+    "empty.toml": ("", "empty.toml: is empty"),
     "target.toml": ('name = "t"', r"has no \[task_table\]: is it a preset"),
     "task.toml": (preset_text(task="isometrics"), "task.toml: task = 'isometrics': did you mean 'isometric'"),
     "key.toml": (preset_text(muscles=1), "key.toml: unknown key task.muscles: did you mean 'muscle'"),

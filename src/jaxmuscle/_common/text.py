@@ -55,3 +55,8 @@ def choices(word: str, options: Iterable[str]) -> str:
 def listed(items: Sequence | np.ndarray) -> str:
     """The first ten of some numbers or names."""
     return ", ".join(str(item) for item in items[:10]) + (f" and {len(items) - 10} more" if len(items) > 10 else "")
+
+
+def printable(text: str) -> str:
+    """Text out of a file without letters that would do something to a terminal or cannot be written."""
+    return "".join(letter if letter.isprintable() else "\N{REPLACEMENT CHARACTER}" for letter in text)

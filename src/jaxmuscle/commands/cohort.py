@@ -1,6 +1,7 @@
 """`jaxmuscle fit` with several targets."""
 
 import csv
+import io
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -8,6 +9,8 @@ from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
 import jaxmuscle as jm
+from jaxmuscle._common.inputs import read_text
+from jaxmuscle._common.names import file_names
 from jaxmuscle._common.progress import told
 
 from .console import BAD_INPUT, CONVERGED, NOT_CONVERGED, csv_text, err, out, plain, record, save_figure, writable, write_fit
@@ -17,6 +20,7 @@ if TYPE_CHECKING:
     from jaxmuscle.fits import CohortResult
 
 
+FILES = ("cohort.csv", "differences.csv", "cohort.png")
 SHOWN = {
     "harmonic_frequency": "harmonic (Hz)",
     "corner_frequency": "corner (Hz)",
@@ -47,7 +51,8 @@ def fit_together(
     options = {name: value for name, value in options.items() if name != "starts"} | starts
     if not targets:
         raise ValueError(f"none of the targets can be read: {_reasons(failed)}")
-    writable(folder, "cohort.csv", *(f"{target.name}/fit.json" for target in targets), force=force)
+    places = {name: folder / place for name, place in file_names((t.name for t in targets), taken=FILES).items()}
+    writable(folder, "cohort.csv", *(f"{place.name}/fit.json" for place in places.values()), force=force)
     with told(True, f"fitting {len(targets)} targets") as tell:
         found = jm.fit_cohort(
             targets, groups=grouped, task=None if task is None else jm.model.TASKS[task], progress=tell, **options
@@ -56,8 +61,8 @@ def fit_together(
     if not found.results:
         raise ValueError(f"none of the targets can be fitted: {_reasons(failed)}")
     cohort = jm.fits.CohortResult(found.results, found.groups, failed)
-    _write(cohort, folder)
-    _show(cohort, folder)
+    _write(cohort, folder, places)
+    _show(cohort, folder, places)
     return BAD_INPUT if failed else CONVERGED if cohort.success else NOT_CONVERGED
 
 
@@ -67,8 +72,11 @@ def _reasons(failed: dict[str, str]) -> str:
 
 def _groups(path: Path) -> dict[str, str]:
     """The groups that a CSV with the columns target and group names."""
-    with open(path, encoding="utf-8-sig", newline="") as file:
-        rows = list(csv.DictReader(file))
+    text = read_text(path, instead="a CSV with the columns target and group")
+    try:
+        rows = list(csv.DictReader(io.StringIO(text, newline="")))
+    except csv.Error as error:
+        raise ValueError(f"{path}: is not CSV: {error}") from None
     if not rows or not {"target", "group"} <= set(rows[0]):
         raise ValueError(f"{path}: needs a header with the columns target and group, and a line per target")
     found: dict[str, str] = {}
@@ -82,19 +90,19 @@ def _groups(path: Path) -> dict[str, str]:
     return found
 
 
-def _write(cohort: "CohortResult", folder: Path) -> None:
+def _write(cohort: "CohortResult", folder: Path, places: dict[str, Path]) -> None:
     from jaxmuscle._common.files import remove, write_text
 
-    remove(folder, "differences.csv", "cohort.png")  # an earlier cohort may have had them
+    remove(folder, *FILES[1:])  # an earlier cohort may have had them
     for name, result in cohort.results.items():
-        write_fit(result, folder / name)
+        write_fit(result, places[name])
     write_text(folder / "cohort.csv", csv_text(_columns(cohort.table())))
     differences = [_row(d) for d in cohort.differences()]
     if differences:
         write_text(folder / "differences.csv", csv_text(_columns(differences)))
     if any(row["stderr"] is not None for row in cohort.table()):
         save_figure(cohort.plot("group" if len(set(cohort.groups.values())) > 1 else "person"), folder / "cohort.png")
-    fits = {name: str(folder / name / "fit.json") for name in cohort.results}
+    fits = {name: str(places[name] / "fit.json") for name in cohort.results}
     record({"success": cohort.success, "verdict": cohort.verdict, "table": cohort.table(), "differences": differences,
             "failed": cohort.failed, "fits": fits})  # fmt: skip
 
@@ -108,7 +116,7 @@ def _columns(rows: list[dict[str, Any]]) -> dict[str, list[Any]]:
     return {name: [row[name] for row in rows] for name in rows[0]}
 
 
-def _show(cohort: "CohortResult", folder: Path) -> None:
+def _show(cohort: "CohortResult", folder: Path, places: dict[str, Path]) -> None:
     title = f"{len(cohort.results)} targets, in linear response; in brackets: not determined"
     table = Table(title=title, title_justify="left", box=SIMPLE_HEAD, padding=0)
     table.add_column("target", overflow="fold")
@@ -128,6 +136,10 @@ def _show(cohort: "CohortResult", folder: Path) -> None:
                   f"(95 %: {d.low:.3g} to {d.high:.3g})", highlight=False)  # fmt: skip
     for name, why in cohort.failed.items():
         err.print(f"[bold red]not fitted:[/] {plain(name)}: {plain(why)}", highlight=False)
+    for name in cohort.results:
+        if places[name].name != name:
+            words = f"{plain(name)}: cannot be the name of a folder here; its fit is in {plain(places[name])}"
+            err.print(f"[yellow]notice:[/] {words}", highlight=False)
     out.print(f"Written: {folder}/cohort.csv and a folder for each target", highlight=False)
 
 

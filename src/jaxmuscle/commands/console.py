@@ -91,7 +91,8 @@ def record(found: Any) -> None:
 def _words(error: Exception) -> str:
     if isinstance(error, OSError) and error.filename is not None:
         return f"{error.filename}: {error.strerror}"
-    return _as_options(str(error))
+    # A cell of a damaged file may be as long as the file.
+    return _as_options(re.sub(r"(?s)(\S{200})\S{200,}", r"\1...", str(error)))
 
 
 def _as_options(message: str) -> str:
@@ -103,7 +104,9 @@ def _as_options(message: str) -> str:
 
 
 def plain(text: object) -> str:
-    return str(text).replace("[", r"\[")
+    """Text as it is: no markup in it, and no letters that do something to the terminal (they may come out of a file)."""
+    shown = "".join(letter if letter.isprintable() or letter in "\n\t" else ascii(letter)[1:-1] for letter in str(text))
+    return shown.replace("[", r"\[")
 
 
 def show(result: object, *, success: bool) -> None:

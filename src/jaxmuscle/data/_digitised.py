@@ -5,9 +5,7 @@ ignores the stored values too: (x, y) = A (px, py) + c with A mapping the pixel 
 of the axis values, in log10 on a logarithmic axis.
 """
 
-import io
 import json
-import tarfile
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -36,22 +34,6 @@ class Points(NamedTuple):
     log_x: bool = False
     log_y: bool = False
     dataset: str | None = None
-
-
-def read_tar(data: bytes, file: str) -> bytes:
-    """The bytes of wpd.json in a project saved as .tar.
-
-    **Raises:** `TargetError` if there is none.
-    """
-    try:
-        with tarfile.open(fileobj=io.BytesIO(data)) as archive:
-            for member in archive:
-                content = archive.extractfile(member) if member.name.split("/")[-1] == "wpd.json" else None
-                if content is not None:
-                    return content.read()
-    except (tarfile.TarError, EOFError, OSError):
-        raise TargetError(f"{file}: is not a tar archive; save the project again, or {EXPORT}") from None
-    raise TargetError(f"{file}: holds no wpd.json, so it is not a WebPlotDigitizer project")
 
 
 def read_project(text: str, file: str, dataset: str | None) -> Points:

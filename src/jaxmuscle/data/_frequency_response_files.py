@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from jaxmuscle._common.text import choices
+from jaxmuscle._common.text import choices, printable
 from jaxmuscle.spectra._settings import require
 
 from ._frequency_response import COLUMNS, FrequencyResponse
@@ -62,7 +62,7 @@ def load_frequency_response(
     try:
         return FrequencyResponse.from_gain(
             column["frequency"], gain, phase, coherence=column.get("coherence"), segments=segments, stderr=stderr,
-            name=file.stem if name is None else name, source=file.name if source is None else source,
+            name=printable(file.stem) if name is None else name, source=printable(file.name) if source is None else source,
         )  # fmt: skip
     except ValueError as error:
         raise ValueError(f"{table.file}: {_at_its_line(str(error), table)}") from None

@@ -19,8 +19,8 @@ from jaxmuscle.spectra._welch import Spectrum, lowpass, spectrum_of
 
 from ._pooled import pooled_target
 from ._recording_choice import Reading, recording_of
-from ._recording_labs import frame_table
 from ._recording_quality import RecordingSummary, checked, clipping, plateau
+from ._recording_table import frame_table
 from ._target import Target
 from ._target_fields import Quantity
 from ._units import UNITS, known_unit

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from jaxmuscle._common.text import choices
+from jaxmuscle._common.text import choices, printable
 from jaxmuscle.spectra._settings import require
 
 from ._recording_quality import filled
@@ -52,8 +52,8 @@ def recording_of(make: Callable[..., Any], table: Table, reading: Reading, name:
     try:
         whole, start, closed = filled(signal, found, float(max_gap))
         samples = whole[:, 0] if whole.shape[1] == 1 else _principal(whole)
-        return make(samples, found, unit=unit, name=name or file.stem, source=", ".join(words), start=start,
-                    notices=(*notices, *closed))  # fmt: skip
+        return make(samples, found, unit=unit, name=name or printable(file.stem), source=printable(", ".join(words)),
+                    start=start, notices=(*notices, *closed))  # fmt: skip
     except ValueError as error:
         raise ValueError(f"{table.file}: column {chosen.name}: {error}") from None
 
@@ -88,8 +88,8 @@ def perturbed_of(
     source = f"{file.name}, columns {force} and {displacement}, {found:.6g} Hz"
     try:
         whole, start, closed = filled(signal, found, float(reading.max_gap))
-        return make(*whole.T, found, units=units, displacement_units=moved, name=file.stem, source=source, start=start,
-                    notices=(*notices, *closed), **options)  # fmt: skip
+        return make(*whole.T, found, units=units, displacement_units=moved, name=printable(file.stem), start=start,
+                    source=printable(source), notices=(*notices, *closed), **options)  # fmt: skip
     except ValueError as error:
         raise ValueError(f"{table.file}: {error}") from None
 

@@ -10,6 +10,7 @@ from ._recording_time import clock
 from ._text_tables import SIGNS, Line, cells_of, lines_of
 
 HEAD = 1 << 16  # bytes in which the first rows of numbers are expected
+WIDEST = 20_000  # columns
 
 
 def read_csv(data: bytes, file: str, skip_rows: int = 0) -> Table:
@@ -38,6 +39,8 @@ def read_csv(data: bytes, file: str, skip_rows: int = 0) -> Table:
     if delimiter is None and all(len(row) == 1 for row in later):
         cells = [[body.strip().strip('"')] for _, body in rows]
     width = _width(cells[len(cells) // 2 :])
+    if width > WIDEST:
+        raise ValueError(f"{file}, line {rows[-1][0]}: has {width} columns; a recording has at most {WIDEST}")
     trailing = width > 1 and all(not row[-1] for row in cells if len(row) == width)
     if trailing:
         cells, width = [row[:-1] if len(row) == width else row for row in cells], width - 1

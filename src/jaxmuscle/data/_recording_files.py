@@ -2,25 +2,23 @@
 
 import contextlib
 import os
-import re
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, overload
 
+from jaxmuscle._common.inputs import looked_at, read_bytes
+from jaxmuscle._common.text import printable
 from jaxmuscle.spectra._settings import require
 
+from ._apart import read_apart
 from ._perturbed import PerturbedRecording
 from ._recording import Recording
 from ._recording_choice import Reading, perturbed_of, recording_of, signals
 from ._recording_csv import read_csv
-from ._recording_formats import read_c3d, read_mat, read_npy, read_npz
-from ._recording_labs import read_acq, read_edf, read_smr, read_tdms, read_xlsx
-from ._recording_table import Table, find
+from ._recording_table import Table, channels_table, find
 from ._text_tables import TEXT
 
-ARRAYS = {".mat": read_mat, ".npy": read_npy, ".npz": read_npz}
-LABS = {".c3d": read_c3d, ".edf": read_edf, ".bdf": read_edf, ".tdms": read_tdms, ".acq": read_acq, ".smr": read_smr}
-KINDS = (*TEXT, ".xlsx", *ARRAYS, *LABS)
+KINDS = (*TEXT, ".xlsx", ".mat", ".npy", ".npz", ".c3d", ".edf", ".bdf", ".tdms", ".acq", ".smr")
 
 
 @overload
@@ -106,8 +104,10 @@ def load_columns(
     """
     table = read_table(path, skip_rows)
     names = signals(table, time) if columns is None else [find(table, column, "columns") for column in columns]
-    require(len(names) > 0, "columns", columns, "give the names of the columns that are recordings")
-    stem = Path(table.file).stem
+    require(columns is None or len(names) > 0, "columns", columns, "give the names of the columns that are recordings")
+    if not names:
+        raise ValueError(f"{table.file}: holds no column with numbers besides the time")
+    stem = printable(Path(table.file).stem)
     return [recording_of(Recording, table, Reading(name, time=time, **options), f"{stem} {name}") for name in names]
 
 
@@ -133,29 +133,13 @@ def read_table(path: str | os.PathLike[str] | Table, skip_rows: int = 0) -> Tabl
     require(isinstance(skip_rows, int) and skip_rows >= 0, "skip_rows", skip_rows, "give a number of lines")
     rows = kind in (*TEXT, ".xlsx")
     require(skip_rows == 0 or rows, "skip_rows", skip_rows, f"leave it out: {kind} has no lines")
-    try:
-        if file.is_dir():
-            raise ValueError(f"{file}: is a folder; give a recording ({', '.join(KINDS)})")
-        with file.open("rb") as stream:
-            data = stream.read(1 if kind in LABS else -1)
-    except FileNotFoundError:
-        raise ValueError(f"{file}: no such file") from None
-    except OSError as error:
-        raise ValueError(f"{file}: cannot be read: {error.strerror or error}") from None
+    instead = f"a recording ({', '.join(KINDS)})"
     if kind not in KINDS:
+        looked_at(file, instead=instead)
         raise ValueError(f"{file}: a recording is one of {', '.join(KINDS)}, not {kind or 'one without ending'}")
-    if not data:
-        raise ValueError(f"{file}: is empty")
     if kind in TEXT:
-        return read_csv(data, str(file), skip_rows)
-    try:
-        if kind == ".xlsx":
-            data = read_xlsx(data, str(file))
-        else:
-            return LABS[kind](str(file)) if kind in LABS else ARRAYS[kind](data, str(file))
-    except ImportError:
-        raise
-    except Exception as error:  # damaged files make the libraries fail in any way
-        words = re.sub(rf"^{re.escape(str(file))}: ", "", str(error)) or type(error).__name__
-        raise ValueError(f"{file}: cannot be read as {kind}: {words}") from None
-    return read_csv(data, str(file), skip_rows)
+        return read_csv(read_bytes(file, instead=instead), str(file), skip_rows)
+    found = read_apart(file, kind, instead=instead)
+    if isinstance(found, bytes):
+        return read_csv(found, str(file), skip_rows)
+    return channels_table(str(file), found, named=kind != ".npy")

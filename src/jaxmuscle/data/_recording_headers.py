@@ -2,16 +2,19 @@
 
 import functools
 import itertools
+import math
 import re
 from collections.abc import Callable, Sequence
-from pathlib import Path
+from pathlib import Path, PureWindowsPath
 from typing import NamedTuple
 
 import numpy as np
 
+from jaxmuscle._common.inputs import read_bytes
+
 from ._recording_body import Body, is_value
 from ._recording_table import Table
-from ._text_tables import Line, number_in, width_remedy
+from ._text_tables import Line, is_number, number_in, width_remedy
 from ._units import known_unit, seconds
 
 Rows = list[tuple[int, str]]
@@ -33,7 +36,7 @@ def head_of(
     lines: list[Line], above: Rows, cells: list[list[str]], width: int, delimiter: str | None, length: int, file: str
 ) -> Head:
     """The header: `above` are its rows, `cells` those in cells and the first row of numbers; a text has `length` lines."""
-    found = _labchart(above, width) or _acqknowledge(lines, cells[-1], above, width, length)
+    found = _labchart(above, width, file) or _acqknowledge(lines, cells[-1], above, width, length, file)
     return found or _names(above, cells[:-1], width, delimiter, file)
 
 
@@ -52,7 +55,15 @@ def _names(above: Rows, cells: list[list[str]], width: int, delimiter: str | Non
     return Head(row)
 
 
-def _labchart(above: Rows, width: int) -> Head | None:
+def _rate(step: str, unit: str | None, file: str) -> float:
+    """The rate [Hz] that follows from the time between two samples."""
+    interval = number_in(step, None) * (seconds(unit) or 1.0) if is_number(step, None) else 0.0
+    if not 1e-12 < interval < 1e12:
+        raise ValueError(f"{file}: its header says {step!r} where the time between two samples belongs; correct it")
+    return 1 / interval
+
+
+def _labchart(above: Rows, width: int, file: str) -> Head | None:
     """LabChart: `Interval=`, `ChannelTitle=`, `UnitName=` or the unit of `Range=`."""
     pairs = [body.strip().partition("=") for _, body in above]
     entries = {key: [cell.strip() for cell in re.sub(r"^ *\t?", "", rest).split("\t")] for key, _, rest in pairs}
@@ -66,16 +77,16 @@ def _labchart(above: Rows, width: int) -> Head | None:
     step, _, unit = entries["Interval"][0].partition(" ")
     timed = width == len(titles) + 1
     names, units = (["time", *titles], ["s", *units]) if timed else (titles, units)
-    return Head(names[:width] if len(names) >= width else None, units, 1 / (number_in(step, None) * (seconds(unit) or 1.0)))
+    return Head(names[:width] if len(names) >= width else None, units, _rate(step, unit, file))
 
 
-def _acqknowledge(lines: list[Line], first: list[str], above: Rows, width: int, length: int) -> Head | None:
+def _acqknowledge(lines: list[Line], first: list[str], above: Rows, width: int, length: int, file: str) -> Head | None:
     """AcqKnowledge: `0.5 msec/sample`, `2 channels`, name and unit of each on lines of their own, `CH1 CH2`, counts."""
     found = next(((i, match) for i, line in enumerate(lines[:20]) if (match := _PER_SAMPLE.match(line.body))), None)
-    if found is None:
+    if found is None or not above or found[0] + 1 == len(lines):
         return None
     at, match = found
-    count = int((re.match(r"\s*(\d+)", lines[at + 1].body) or [0, width])[1])
+    count = int((re.match(r"\s*(\d{1,6})", lines[at + 1].body) or [0, width])[1])
     texts = [line.body.strip().strip('"') for line in lines[at + 2 : at + 2 + 2 * count]]
     names, units = texts[::2], texts[1::2]
     if width == count + 1:
@@ -83,7 +94,7 @@ def _acqknowledge(lines: list[Line], first: list[str], above: Rows, width: int, 
         names, units = ["time", *names], [scale if seconds(scale) else "s", *units]
     numbers = [float(cell) for cell in first if cell and cell.isdigit()]
     counts = bool(numbers) and all(not c or c.isdigit() for c in first) and abs(max(numbers) - (length - above[-1][0])) <= 2
-    return Head(names if len(names) == width else None, units, 1 / (number_in(match[1], None) * (seconds(match[2]) or 1.0)),
+    return Head(names if len(names) == width else None, units, _rate(match[1], match[2], file),
                 int(counts))  # fmt: skip
 
 
@@ -102,7 +113,9 @@ def spike2(data: bytes, file: str) -> Table | None:
             continue
         number, name = lines[0][1].strip(), lines[3][0].strip()
         name = name if name and name not in columns else f"{name or 'channel'} {number}"
-        row = data.index(b"\n", sign) + 1
+        row = data.find(b"\n", sign, end) + 1
+        if sign < 0 or row == 0:
+            raise ValueError(f'{file}: {name} has no line "START" with values below it; export it again')
         again, first = data.find(b'"START"', row, end), data.count(b"\n", 0, row) + 1
         if again > 0:
             place = f"line {first + data.count(bytes([10]), row, again)}"
@@ -110,8 +123,8 @@ def spike2(data: bytes, file: str) -> Table | None:
         body = Body(data[row:end].rstrip(), 0, file, first, None, 1, False, ["0"])
         body.check()
         columns[name] = functools.partial(body.column, 0, name)
-        step = data[sign:row].decode().split()[-1]
-        rate[name], units[name] = rates.get(number) or 1 / number_in(step, None), lines[4][0].strip()
+        step = data[sign:row].decode("utf-8", errors="replace").split()[-1]
+        rate[name], units[name] = rates.get(number) or _rate(step, None, file), lines[4][0].strip()
         places.append(body.place)
     if not columns:
         raise ValueError(f"{file}: holds no waveform; export one from Spike2")
@@ -121,7 +134,8 @@ def spike2(data: bytes, file: str) -> Table | None:
 def _summary(text: str) -> dict[str, float]:
     """The rates [Hz] that a summary has for its channels: the ideal one, then the true one."""
     rows = [[cell.strip(' "') for cell in line.split("\t")] for line in text.splitlines()]
-    return {row[0]: number_in(row[5], None) for row in rows if len(row) >= 6 and is_value(row[5], None) and row[5]}
+    stated = {row[0]: number_in(row[5], None) for row in rows if len(row) >= 6 and is_number(row[5], None)}
+    return {number: rate for number, rate in stated.items() if 0 < rate < math.inf}
 
 
 def diadem(data: bytes, file: str, read: Callable[[bytes, str], Table]) -> Table | None:
@@ -136,9 +150,10 @@ def diadem(data: bytes, file: str, read: Callable[[bytes, str], Table]) -> Table
     channels = [dict(line.split(",", 1) for line in text.splitlines() if "," in line) for text in texts]
     channels = [{key.strip(): value.strip() for key, value in channel.items()} for channel in channels]
     steps = [c for c in channels if c.get("210", "").startswith("IMPLI")]
-    rate = next((1 / (number_in(c["241"], None) * (seconds(c.get("202")) or 1.0)) for c in steps), None)
+    rate = next((_rate(c.get("241", ""), c.get("202"), file) for c in steps), None)
     held = [channel for channel in channels if channel not in steps]
-    sources = {Path(file).parent / channel["211"] for channel in held if channel.get("211")}
+    # The last part of its name alone: the values lie beside the header, and no header points anywhere else.
+    sources = {Path(file).parent / PureWindowsPath(channel["211"]).name for channel in held if channel.get("211")}
     if Path(file) in sources:
         raise ValueError(f"{file}: its header names the file itself for the values; give the file that holds them")
     if len(sources) == 1 and held[0].get("214", "ASCII") in _TYPES:
@@ -157,15 +172,20 @@ def diadem(data: bytes, file: str, read: Callable[[bytes, str], Table]) -> Table
 
 
 def _bytes(source: Path, file: str) -> bytes:
-    try:
-        return source.read_bytes()
-    except OSError:
-        raise ValueError(f"{file}: its values are in {source.name}, which is not beside it") from None
+    if not source.exists():
+        raise ValueError(f"{file}: its values are in {source.name}, which is not beside it")
+    return read_bytes(source, instead="the file that holds the values")
 
 
 def _binary(channel: dict[str, str], count: int, source: Path, file: str) -> np.ndarray:
     """The values of a channel: one of several in every row (BLOCK), or all behind one another (CHANNEL)."""
-    raw = np.frombuffer(_bytes(source, file), _TYPES[channel["214"]])
-    first, size = int(channel.get("221", "1")) - 1, int(channel.get("220", "0"))
-    values = raw[first::count] if channel.get("213") == "BLOCK" else raw[first : first + size]
-    return values * float(channel.get("241", "1") or 1) + float(channel.get("240", "0") or 0)
+    kind, data = np.dtype(_TYPES.get(channel.get("214", ""), "<f8")), _bytes(source, file)
+    raw = np.frombuffer(data, kind, len(data) // kind.itemsize)
+    stated = [channel.get(key) or usual for key, usual in (("221", "1"), ("220", "0"), ("241", "1"), ("240", "0"))]
+    if not all(is_number(entry, None) for entry in stated):
+        raise ValueError(f"{file}: its header has {', '.join(stated)} where first row, length, factor and offset belong")
+    first, size, factor, offset = (number_in(entry, None) for entry in stated)
+    if not (1 <= first <= max(raw.size, 1) and 0 <= size <= raw.size):
+        raise ValueError(f"{file}: its header asks for {size:g} values from {first:g} on, {source.name} has {raw.size}")
+    start = int(first) - 1
+    return (raw[start::count] if channel.get("213") == "BLOCK" else raw[start : start + int(size)]) * factor + offset

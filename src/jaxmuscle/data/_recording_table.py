@@ -1,13 +1,15 @@
 """Tables of columns, whatever they came from: find a column, or a point of three columns."""
 
 import difflib
+import functools
 import re
-from collections.abc import Callable, Iterable, Mapping
-from typing import NamedTuple
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
+from ._recording_channels import Channel, numbers
 from ._units import name_and_unit
 
 TRIPLES = (
@@ -36,6 +38,36 @@ class Table(NamedTuple):
     units: Mapping[str, str] = {}
     words: frozenset[str] = frozenset()
     place: Callable[[int], str] = "sample {}".format
+
+
+def channels_table(file: str, channels: Sequence[Channel], *, named: bool = True) -> Table:
+    """The channels that a reader found in a file."""
+    columns = {channel.name: functools.partial(np.asarray, channel.samples, dtype=float) for channel in channels}
+    rates = {channel.name: channel.rate for channel in channels if channel.rate is not None}
+    return Table(file, columns, named, rates, {channel.name: channel.unit for channel in channels if channel.unit})
+
+
+def frame_table(frame: Any) -> Table:
+    """The columns of a pandas table, its index before them if that is more than a counter; times become seconds.
+
+    **Raises:** `ValueError` if it is no such table.
+    """
+    if not hasattr(frame, "columns"):
+        raise ValueError(f"frame={type(frame).__name__}: give a pandas DataFrame, a single column as frame.to_frame()")
+    index = frame.index
+    counter = index.dtype.kind not in "fmM" and index.name is None
+    given = [] if counter else [(str(index.name or "time"), index)]
+    given += [(" ".join(map(str, key)) if isinstance(key, tuple) else str(key), frame.iloc[:, i])
+              for i, key in enumerate(frame.columns)]  # fmt: skip
+    names = [name for name, _ in given]
+    twice = next((name for name in names if names.count(name) > 1), None)
+    if twice is not None or frame.empty:
+        raise ValueError("the table is empty" if frame.empty else f"the table has two columns {twice!r}; rename one")
+    columns = {name: lambda column=column: numbers(column.to_numpy()) for name, column in given}
+    kinds = {name: column.dtype.kind for name, column in given}
+    units = units_of(names) | {name: "s" for name, kind in kinds.items() if kind in "mM"}
+    words = frozenset(name for name, kind in kinds.items() if kind not in "iufbmM")
+    return Table("the table", columns, True, {}, units, words, "row {}".format)
 
 
 def bare(name: str) -> str:

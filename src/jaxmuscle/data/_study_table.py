@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from jaxmuscle._common.files import text_of
+from jaxmuscle._common.inputs import looked_at, read_text
 from jaxmuscle._common.text import choices
 from jaxmuscle.spectra._settings import NAMED, require
 
@@ -18,6 +18,7 @@ from ._text_tables import SIGNS, cells_of, lines_of, number_in
 from ._trials import Trials
 
 NEEDED = ("file", "person")
+TABLES = "the table of a study (.csv, .tsv, .txt or .toml)"
 LABELS = (*NEEDED, "group", "condition", "trial")
 FILES, SPECTRA = (*Reading._fields, "skip_rows"), ("spectrum", "mvc")  # of `load_recording`, of `Trials.target`
 EDGES = ("window_start", "window_stop")
@@ -69,9 +70,10 @@ def read_study(study: "str | os.PathLike[str] | Iterable[Mapping[str, Any]]") ->
     path = Path(study).expanduser()
     if path.suffix.lower() != ".toml":
         return StudyTable(_checked(_lines(path), path.parent, str(path)), {}, path.name)
+    text = read_text(path, instead=TABLES)
     try:
-        stated = tomllib.loads(text_of(_bytes(path), str(path)))
-    except tomllib.TOMLDecodeError as error:
+        stated = tomllib.loads(text)
+    except (ValueError, RecursionError) as error:
         raise ValueError(f"{path}: is not TOML: {error}") from None
     known = ("table", "recordings", *OPTIONS)
     for name in stated:
@@ -128,18 +130,9 @@ def _as_before(stated: dict[Any, tuple[Row, Any]], key: Any, row: Row, value: An
         raise ValueError(f"{name} = {value!r} here, {before!r} at {first.place}: {remedy}")
 
 
-def _bytes(path: Path) -> bytes:
-    try:
-        return path.read_bytes()
-    except FileNotFoundError:
-        raise ValueError(f"{path}: no such file") from None
-    except OSError as error:
-        raise ValueError(f"{path}: cannot be read: {error.strerror or error}") from None
-
-
 def _lines(path: Path) -> list[tuple[str, dict[str, Any]]]:
     """Place and cells of every row of a text table; empty cells left out."""
-    lines = [line for line in lines_of(text_of(_bytes(path), str(path))) if line.body.strip()]
+    lines = [line for line in lines_of(read_text(path, instead=TABLES)) if line.body.strip()]
     delimiter = next((sign for sign in SIGNS if lines and sign in lines[0].body), ",")
     head, *body = lines
     names = [name.casefold() for name in cells_of(head.body, delimiter)]
@@ -203,8 +196,10 @@ def _row(place: str, given: dict[str, Any], folder: Path) -> Row:
     if window.count(None) == 1:
         raise ValueError(f"{place}: give window_start and window_stop, or neither")
     file = folder / Path(str(given["file"])).expanduser()
-    if not file.is_file():
-        raise ValueError(f"{place}: {file}: no such file")
+    try:
+        looked_at(file, instead="a recording")
+    except ValueError as error:
+        raise ValueError(f"{place}: {error}") from None
     reading = {name: given[name] for name in (*FILES, *SPECTRA) if given.get(name) is not None}
     reading |= {"window": tuple(window)} if None not in window else {}
     person, group, condition, trial = (str(given.get(name, "")).strip() for name in LABELS[1:])

@@ -12,10 +12,12 @@ from jaxtyping import Float
 from jaxmuscle._common.bundled import bundled_text, list_targets
 from jaxmuscle._common.errors import TargetError
 from jaxmuscle._common.files import text_of
-from jaxmuscle._common.text import choices
+from jaxmuscle._common.inputs import read_bytes
+from jaxmuscle._common.text import choices, printable
 from jaxmuscle.spectra._settings import SpectrumSettings
 
-from ._digitised import AXES, Points, columns_of, read_datasets, read_project, read_tar
+from ._apart import read_apart
+from ._digitised import AXES, Points, columns_of, read_datasets, read_project
 from ._target_csv import merge_duplicates, read_csv
 from ._target_fields import (
     CHECKS,
@@ -79,19 +81,10 @@ def _read(name_or_path: str | os.PathLike[str]) -> tuple[str, str, str]:
     with contextlib.suppress(RuntimeError):
         path = path.expanduser()
     hint = f"; the bundled target is called {path.stem!r}" if path.stem in names else ""
-    try:
-        if path.is_dir():
-            raise TargetError(f"{path}: is a folder; give a .toml or .csv file, or a digitised .json or .tar")
-        data = path.read_bytes()
-    except FileNotFoundError:
-        raise TargetError(f"{path}: no such file{hint}") from None
-    except (OSError, ValueError) as error:
-        if isinstance(error, TargetError):
-            raise
-        raise TargetError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from None
-    kind = path.suffix.lower()
+    instead, kind = "a .toml or .csv file, or a digitised .json or .tar", path.suffix.lower()
+    data = read_bytes(path, TargetError, instead=instead, hint=hint) if kind != ".tar" else b""
     if kind == ".tar":
-        kind, data = ".json", read_tar(data, str(path)) if data.strip() else data
+        kind, data = ".json", read_apart(path, kind, TargetError, instead=instead, hint=hint)
     kind = ".csv" if kind in TEXT else kind
     if kind not in (".toml", ".csv", ".json"):
         problem = f"{path}: a target is a .toml or .csv file, not {kind or 'one without ending'}"
@@ -106,7 +99,7 @@ def _parse_csv(text: str, file: str, axis: str) -> Raw:
         return _digitised(points, file, axis, comment or path.name)
     _linear(axis, file)
     check_columns(columns, file, ordered=True)
-    fields = {"name": path.stem, "source": comment or path.name, "settings": SpectrumSettings()}
+    fields = {"name": printable(path.stem), "source": comment or printable(path.name), "settings": SpectrumSettings()}
     return Raw(file, fields, columns, [])
 
 
@@ -126,7 +119,12 @@ def _digitised(points: Points, file: str, axis: str, source: str) -> Raw:
     notice = f"{origin}: taken as points of a figure, {what}, sorted by frequency"
     notice += f", {averaged} near-duplicates averaged" if averaged else ""
     source = source if points.dataset is None else f"{source}, dataset {points.dataset!r}"
-    fields = {"name": Path(file).stem, "provenance": "digitised", "source": source, "settings": settings}
+    fields = {
+        "name": printable(Path(file).stem),
+        "provenance": "digitised",
+        "source": printable(source),
+        "settings": settings,
+    }
     return Raw(file, fields, merged, [notice], True, log_frequency)
 
 

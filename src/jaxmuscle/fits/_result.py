@@ -13,6 +13,7 @@ from jaxmuscle import plot
 from jaxmuscle._common.arrays import from_nulls, with_nulls
 from jaxmuscle._common.errors import ResultError
 from jaxmuscle._common.files import write_json
+from jaxmuscle._common.inputs import read_text
 from jaxmuscle._common.parts import of_only, only
 from jaxmuscle._common.tables import frame
 from jaxmuscle._common.text import choices, probability
@@ -261,10 +262,9 @@ def to_table(result: FitResult) -> dict[str, Any]:
 def load_result(path: str | Path) -> FitResult:
     """Read the `fit.json` at `path`, of one target or several. Raises `ResultError` naming the file and what is wrong."""
     path = Path(path)
+    text = read_text(path, ResultError, instead="a fit.json")
     try:
-        table = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise ResultError(f"{path}: cannot be read: {error.strerror}") from None
+        table = json.loads(text)
     except ValueError as error:
         raise ResultError(f"{path}: is not JSON: {error}") from None
     if not isinstance(table, dict) or table.get("format") != FORMAT:

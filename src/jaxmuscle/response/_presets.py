@@ -11,6 +11,7 @@ import tomli_w
 from jaxmuscle._common.bundled import bundled_text, list_presets
 from jaxmuscle._common.errors import PresetError
 from jaxmuscle._common.files import write_text
+from jaxmuscle._common.inputs import read_text
 from jaxmuscle._common.text import choices
 from jaxmuscle._common.units import NEWTONS
 from jaxmuscle.model._task_tables import task_from_table, task_to_table
@@ -69,11 +70,9 @@ def _carried(task: AbstractTask, mean: Any = None, unit: Any = None) -> Abstract
 
 
 def _read(path: Path) -> dict[str, Any]:
+    text = read_text(path, PresetError, instead="a preset (.toml) or a fit.json")
     try:
-        text = path.read_text(encoding="utf-8")
         table = json.loads(text) if path.suffix == ".json" else tomllib.loads(text)
-    except OSError as error:
-        raise PresetError(f"{path}: cannot be read: {error.strerror}") from None
     except ValueError as error:
         raise PresetError(f"{path}: is not valid {'JSON' if path.suffix == '.json' else 'TOML'}: {error}") from None
     if not isinstance(table, dict):
