@@ -28,6 +28,13 @@ def replacing(path: str | Path) -> Iterator[Path]:
         temporary.unlink(missing_ok=True)
 
 
+def expanded(path: str | os.PathLike[str]) -> Path:
+    """The path with ~ for the home folder, as far as there is one."""
+    with contextlib.suppress(RuntimeError):
+        return Path(path).expanduser()
+    return Path(path)
+
+
 def text_of(data: bytes, file: str, error: type[ValueError] = ValueError) -> str:
     """The UTF-8 text of a file's bytes. Raises `error`, naming the file, where there is none or it is something else."""
     if not data.strip():
@@ -39,6 +46,15 @@ def text_of(data: bytes, file: str, error: type[ValueError] = ValueError) -> str
     if "\0" in text:
         raise error(f"{file}: is not UTF-8 text (a binary file, or saved with another encoding)")
     return text
+
+
+def read_text(path: Path, error: type[ValueError] = ValueError) -> str:
+    """The UTF-8 text of a file. Raises `error`, naming the file, where it cannot be read or is something else."""
+    try:
+        data = path.read_bytes()
+    except (OSError, ValueError) as wrong:  # ValueError: no file can have that name
+        raise error(f"{path}: cannot be read: {getattr(wrong, 'strerror', None) or wrong}") from None
+    return text_of(data, str(path), error)
 
 
 def write_text(path: str | Path, text: str) -> None:

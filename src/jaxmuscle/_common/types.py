@@ -3,9 +3,11 @@
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PRNGKeyArray
 
 if TYPE_CHECKING:
     Scalar = Any  # a union of numbers and arrays supports no arithmetic in the eyes of a type checker
+    Key = PRNGKeyArray | Array | np.ndarray | np.integer | int
 else:
+    Key = Any  # checked by `keys.key_of`, with a sentence
     Scalar = Float[Array, "..."] | Float[np.ndarray, "..."] | float | int

@@ -69,6 +69,16 @@ def is_number(value: Any) -> bool:
     return True
 
 
+def numbers_of(values: Any, where: str) -> Float[np.ndarray, " rows"]:
+    """A list of numbers as an array. Raises `TargetError` naming the entry that is none."""
+    if not isinstance(values, list | tuple | np.ndarray) or not len(values):
+        raise TargetError(f"{where} must be a list of numbers")
+    for i, value in enumerate(values, 1):
+        if not is_number(value):
+            raise TargetError(f"{where}, entry {i}: {value!r} is not a number")
+    return np.array([float(value) for value in values])
+
+
 def metadata(name: str, value: Any) -> Any:
     """The value of the field `name` in its stored form: lists as tuples, `None` where it may be missing."""
     return None if value is None and name in OPTIONAL else CHECKS[name](name, value)

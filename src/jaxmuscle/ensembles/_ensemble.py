@@ -7,11 +7,14 @@ from typing import TYPE_CHECKING, Any, Literal, overload
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Int, PRNGKeyArray
+from jaxtyping import Int
 
+from jaxmuscle._common.arguments import count
 from jaxmuscle._common.arrays import all_concrete, as_arrays
+from jaxmuscle._common.keys import key_of, seeds_of
 from jaxmuscle._common.progress import told
 from jaxmuscle._common.text import listed
+from jaxmuscle._common.types import Key
 from jaxmuscle.model._stream import Draws
 from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.response._linearised import LinearTask
@@ -32,39 +35,39 @@ if TYPE_CHECKING:
 
 FURTHEST = 0.01  # quantiles that weak increments are good for
 
-Seeds = int | Int[np.ndarray, " seeds"]
+Seeds = Any if not TYPE_CHECKING else int | Sequence[int] | Int[np.ndarray, " seeds"]
 Progress = bool | Callable[[str, float], None] | Watch
 
 
 @overload
-def ensemble(task: AbstractTask, key: PRNGKeyArray, *, seeds: Seeds, reduce: Literal[False] = ..., store: None = ...,
+def ensemble(task: AbstractTask, key: Key, *, seeds: Seeds, reduce: Literal[False] = ..., store: None = ...,
              **given: Any) -> Trajectory: ...  # fmt: skip
 
 
 @overload
-def ensemble(task: Sweep | Sequence[AbstractTask], key: PRNGKeyArray, *, seeds: Seeds, reduce: Literal[False] = ...,
+def ensemble(task: Sweep | Sequence[AbstractTask], key: Key, *, seeds: Seeds, reduce: Literal[False] = ...,
              store: None = ..., **given: Any) -> Population: ...  # fmt: skip
 
 
 @overload
-def ensemble(task: AbstractTask | Sweep | Sequence[AbstractTask], key: PRNGKeyArray, *, seeds: Seeds, store: str | Path,
+def ensemble(task: AbstractTask | Sweep | Sequence[AbstractTask], key: Key, *, seeds: Seeds, store: str | Path,
              part: tuple[int, int], reduce: bool | tuple[float, ...] = ..., **given: Any) -> PartReport: ...  # fmt: skip
 
 
 @overload
-def ensemble(task: AbstractTask | Sweep | Sequence[AbstractTask], key: PRNGKeyArray, *, seeds: Seeds,
+def ensemble(task: AbstractTask | Sweep | Sequence[AbstractTask], key: Key, *, seeds: Seeds,
              reduce: Literal[True] | tuple[float, ...], store: str | Path | None = ..., part: None = ...,
              **given: Any) -> EnsembleSummary: ...  # fmt: skip
 
 
 @overload
-def ensemble(task: AbstractTask | Sweep | Sequence[AbstractTask], key: PRNGKeyArray, *, seeds: Seeds, store: str | Path,
+def ensemble(task: AbstractTask | Sweep | Sequence[AbstractTask], key: Key, *, seeds: Seeds, store: str | Path,
              reduce: Literal[False] = ..., part: None = ..., **given: Any) -> "xarray.Dataset": ...  # fmt: skip
 
 
 def ensemble(  # pyright: ignore[reportInconsistentOverload]
     task: AbstractTask | Sweep | Sequence[AbstractTask],
-    key: PRNGKeyArray,
+    key: Key,
     *,
     seeds: Seeds,
     duration: float = DURATION,
@@ -121,11 +124,9 @@ def ensemble(  # pyright: ignore[reportInconsistentOverload]
     """
     if not isinstance(task, AbstractTask | Sweep):
         task = Sweep.of(task)
-    numbers: Any = range(seeds) if isinstance(seeds, int) else np.asarray(seeds)
-    if len(numbers) == 0:
-        raise ValueError(f"seeds = {seeds}: an ensemble needs at least one seed")
-    if chunk is not None and chunk < 1:
-        raise ValueError(f"chunk = {chunk} must be at least 1")
+    key, numbers = key_of(key), seeds_of(seeds)
+    if chunk is not None:
+        count("chunk", chunk, 1)
     if resume and overwrite:
         raise ValueError("resume continues a store, overwrite replaces it: give one of the two")
     if (resume or states) and store is None:

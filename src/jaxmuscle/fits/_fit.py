@@ -4,9 +4,9 @@ from collections.abc import Callable, Iterable, Mapping
 from typing import Any, Literal
 
 import jax
-from jaxtyping import PRNGKeyArray
 
 from jaxmuscle._common.progress import told
+from jaxmuscle._common.types import Key
 from jaxmuscle.data._as_target import as_target
 from jaxmuscle.data._target import Target
 from jaxmuscle.model._noise import AbstractNoise
@@ -33,7 +33,7 @@ def fit(
     residual: str = "log",
     starts: int | None = None,
     seeds: int | None = None,
-    key: PRNGKeyArray | int = 0,
+    key: Key = 0,
     bounds: Mapping[str, tuple[float, float]] | None = None,
     priors: Mapping[str, float | None] | None = None,
     coefficient_of_variation: bool = True,

@@ -20,6 +20,7 @@ from jaxmuscle._common.files import remove, write_json, write_text
 from jaxmuscle._common.progress import Tell, told
 from jaxmuscle._common.tables import frame
 from jaxmuscle._common.text import WIDTH, choices, folded
+from jaxmuscle._common.types import Key
 from jaxmuscle.data._study_table import READING, Cell, cells_of_study, read_study
 from jaxmuscle.model._parameters import PARAMETERS
 from jaxmuscle.model._rungs import RUNGS
@@ -243,7 +244,7 @@ def run_study(
     alpha: float | None = None,
     correction: str | None = None,
     starts: int = 32,
-    key: int = 0,
+    key: Key = 0,
     progress: bool | Tell = False,
     **reading: Any,
 ) -> StudyResult:

@@ -156,6 +156,16 @@ class Sampled(AbstractSignal):
     level: Scalar = 1.0
     smoothness: ClassVar[int] = 4
 
+    def __check_init__(self):
+        pieces = len(self.breaks) - 1
+        require(
+            pieces >= 1 and np.shape(self.coefficients) == (pieces, 6),
+            f"breaks {np.shape(self.breaks)} and coefficients {np.shape(self.coefficients)} do not belong together: a "
+            "spline of n pieces has n + 1 breaks and n rows of 6 coefficients",
+        )
+        rising = self.breaks[1:] > self.breaks[:-1]
+        require(rising, "breaks must increase")
+
     @classmethod
     def through(cls, times: Float[np.ndarray, " samples"], values: Float[np.ndarray, " samples"]) -> "Sampled":
         """Spline through `values` at `times` [s], at least six, increasing. Raises `ValueError` otherwise."""

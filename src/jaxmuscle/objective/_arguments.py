@@ -2,17 +2,19 @@
 
 import dataclasses
 import itertools
+import math
 from collections.abc import Iterable, Mapping
 from typing import Any, Literal, NamedTuple, get_args
 
 import jax
 import numpy as np
-from jaxtyping import PRNGKeyArray
 
-from jaxmuscle._common.arrays import as_numbers
-from jaxmuscle._common.keys import key_of
+from jaxmuscle._common.arguments import count, is_real, positive
+from jaxmuscle._common.arrays import as_numbers, with_nulls
+from jaxmuscle._common.keys import key_of, number_of
 from jaxmuscle._common.progress import Tell, nothing
 from jaxmuscle._common.text import choices
+from jaxmuscle._common.types import Key
 from jaxmuscle.data._target import Target
 from jaxmuscle.model._muscle import Muscle
 from jaxmuscle.model._noise import AbstractNoise
@@ -29,6 +31,7 @@ from ._problem import FitProblem, Part, target_variation
 
 RESIDUALS = ("log", "linear", "cumulative")
 METHODS = ("linear", "montecarlo")
+MOST = 10**9  # of starts, seeds and steps: what is more is a slip
 DT = 2.5e-3
 # With an activation stiffness and damping stay nearer to their defaults: no spectrum determines them, and an underdamped
 # muscle, which swings at 8 Hz, would pass for tremor.
@@ -119,7 +122,7 @@ class FitOptions:
     starts: int | None = None
     seeds: int | None = None
     check_seeds: int | None = None
-    key: PRNGKeyArray | int = 0
+    key: Key = 0
     bounds: Mapping[str, tuple[float, float]] | None = None
     priors: Mapping[str, float | None] | None = None
     coefficient_of_variation: bool = True
@@ -136,14 +139,28 @@ class FitOptions:
             if getattr(self, name) not in known:
                 raise ValueError(f"{name} = {getattr(self, name)!r}: {choices(getattr(self, name), known)}")
         for name, least in (("starts", 1), ("seeds", 0), ("check_seeds", 0), ("max_steps", 1), ("rungs", 0)):
-            count = getattr(self, name)
-            if count is not None and count < least:
-                raise ValueError(f"{name} = {count} must be at least {least}")
+            if getattr(self, name) is not None:
+                count(name, getattr(self, name), least, MOST)
+        number_of(self.key)
+        positive("dt", self.dt)
+        for name, (low, high) in _pairs("bounds", self.bounds):
+            if not (is_real(low) or low == -math.inf) or not (is_real(high) or high == math.inf) or not low < high:
+                raise ValueError(f"bounds[{name!r}] = {(low, high)!r}: give two numbers, the lower first")
+        for name, value in dict(self.fix or {}).items():
+            if not is_real(value):
+                raise ValueError(f"fix[{name!r}] = {value!r}: give a finite number")
 
     @property
     def seed(self) -> int | None:
         """The key, if it was given as a number."""
-        return self.key if isinstance(self.key, int) else None
+        return number_of(self.key)
+
+
+def _pairs(argument: str, given: Mapping[str, Any] | None) -> Iterable[tuple[str, tuple[Any, Any]]]:
+    for name, pair in dict(given or {}).items():
+        if not isinstance(pair, tuple | list) or len(pair) != 2:
+            raise ValueError(f"{argument}[{name!r}] = {pair!r}: give two numbers, the lower first")
+        yield name, (pair[0], pair[1])
 
 
 def at_mean(task: AbstractTask, target: Target, options: FitOptions) -> tuple[AbstractTask, FitOptions]:
@@ -198,7 +215,7 @@ def planned(task: AbstractTask, target: Target, options: FitOptions) -> Plan:
     control = has_response(task, required=options.method == "linear")
     many = {"starts": 100, "seeds": 32, "check_seeds": 64} if control else {"starts": 8, "seeds": 48, "check_seeds": 200}
     many |= {} if spectral else {"seeds": 0, "check_seeds": 0}
-    counts = {name: count if getattr(options, name) is None else getattr(options, name) for name, count in many.items()}
+    counts = {name: number if getattr(options, name) is None else getattr(options, name) for name, number in many.items()}
     if options.method == "montecarlo" and counts["seeds"] < 1:
         raise ValueError("seeds = 0: a Monte Carlo fit needs at least one")
     usual = {n: PARAMETERS[n].prior_sd if n in PARAMETERS else 1.0 for n in names}
@@ -208,7 +225,7 @@ def planned(task: AbstractTask, target: Target, options: FitOptions) -> Plan:
     coordinates = Coordinates.of({n: float(task[n]) for n in names}, bounds, {n: sd or 1.0 for n, sd in sds.items()})
     variation = target_variation(target) if options.coefficient_of_variation else None
     part = Part("", task, target, coordinates, tuple(range(len(names))), variation, mean)
-    key = key_of(options.key) if isinstance(options.key, int) else options.key
+    key = key_of(options.key)
     problem = FitProblem((part,), coordinates, np.array([0.0 if sds[n] is None else 1.0 for n in names]), options.residual,
                          options.method, options.dt, key, counts["seeds"], control, options.progress)  # fmt: skip
     settings = {
@@ -242,7 +259,7 @@ def settings_of(problem: FitProblem, bounds: Mapping[str, tuple[float, float]]) 
         "residual": problem.residual,
         "prior_centre": dict(zip(c.names, map(float, c.centre), strict=True)),
         "prior_sd": {n: float(sd) if p else None for n, sd, p in zip(c.names, c.sd, problem.prior, strict=True)},
-        "bounds": {n: list(b) for n, b in bounds.items()},
+        "bounds": {n: with_nulls(np.array(b, dtype=float)) for n, b in bounds.items()},
     }
 
 

@@ -7,11 +7,12 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 import scipy
-from jaxtyping import Float, PRNGKeyArray
+from jaxtyping import Float
 
 from jaxmuscle._common.arrays import as_numbers, require
 from jaxmuscle._common.keys import key_of
 from jaxmuscle._common.text import choices
+from jaxmuscle._common.types import Key
 from jaxmuscle.data._target import Target
 from jaxmuscle.fits._result import FitResult
 from jaxmuscle.model._tasks import AbstractTask, PrescribedLength
@@ -46,7 +47,7 @@ def design_input(
     speed: float | None = None,
     spread: float = 0.1,
     target: str | None = None,
-    key: PRNGKeyArray | int = 0,
+    key: Key = 0,
 ) -> DesignedInput:
     """The motion of the insertion, within limits, whose record makes a quantity best known.
 
@@ -79,7 +80,7 @@ def design_input(
     require(2 * frequency[-1] < rate, f"band = {band} Hz reaches beyond half of rate = {rate} Hz: raise the rate")
     quantities = (quantity,) if isinstance(quantity, str) else tuple(quantity)
     limits, crest = np.array([np.inf if limit is None else limit for limit in (peak, speed)]), np.array(CREST)
-    rng = np.random.default_rng(np.asarray(jax.random.key_data(key_of(key) if isinstance(key, int) else key)).tolist())
+    rng = np.random.default_rng(np.asarray(jax.random.key_data(key_of(key))).tolist())
 
     def realised(power: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """A motion of these lines, made smaller where it must be, and the crest factors of position and velocity."""
