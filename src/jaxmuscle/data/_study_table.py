@@ -1,13 +1,15 @@
 """The table of a study: which file is which trial of whom, in which group and condition, and how files are read."""
 
 import os
-import tomllib
 from collections import defaultdict
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
-from jaxmuscle._common.files import text_of
+from msgspec import Meta
+
+from jaxmuscle._common.documents import Table, checked, parsed
+from jaxmuscle._common.files import expanded, text_of
 from jaxmuscle._common.text import choices
 from jaxmuscle.spectra._settings import NAMED, require
 
@@ -25,6 +27,53 @@ NUMBERS = ("rate", "max_gap", "skip_rows", "mvc", *EDGES)
 COLUMNS = (*LABELS, *FILES, *SPECTRA, *EDGES)
 READING = (*FILES, *SPECTRA, "window")
 OPTIONS = (*READING, "rung", "noise", "quantities", "alpha", "correction")
+
+
+def _told(text: str) -> Meta:
+    return Meta(description=text)
+
+
+Text, Positive = str | None, Annotated[float, Meta(gt=0)] | None
+
+
+class ReadingTable(Table, kw_only=True):
+    """How a recording is read: columns of a study's table, and options for all of them in a study.toml."""
+
+    column: Annotated[Text | int, _told("Column or point of the force")] = None
+    rate: Annotated[Positive, _told("Sampling rate [Hz]")] = None
+    units: Annotated[Text, _told("Unit of the column")] = None
+    axis: Annotated[Text, _told("Of a point: x, y, z or principal")] = None
+    reference: Annotated[Text | int, _told("Column or point that is subtracted")] = None
+    time: Annotated[Text | int, _told("Column of the time")] = None
+    max_gap: Annotated[Annotated[float, Meta(ge=0)] | None, _told("Longest gap that is closed [s]")] = None
+    skip_rows: Annotated[Annotated[int, Meta(ge=0)] | None, _told("Lines to leave out at the top")] = None
+    spectrum: Annotated[Text, _told("standard, slow, multitaper or pwelch; the same for all")] = None
+    mvc: Annotated[Positive, _told("Maximal voluntary contraction, in the recording's unit")] = None
+
+
+class RecordingTable(ReadingTable, kw_only=True):
+    """A recording: a row of a study's table, or an entry of `[[recordings]]`."""
+
+    file: Annotated[str, _told("Path, from the folder of the table")]
+    person: Annotated[str | int, _told("Who")]
+    group: Annotated[str | int | None, _told("Of the person: all recordings have one, or none")] = None
+    condition: Annotated[str | int | None, _told("Of the recording: all have one, or none")] = None
+    trial: Annotated[str | int | None, _told("Which of several in a condition")] = None
+    window_start: Annotated[float | None, _told("Part to analyse, from [s]")] = None
+    window_stop: Annotated[float | None, _told("To [s]")] = None
+
+
+class StudyFile(ReadingTable, kw_only=True):
+    """A study.toml: `table` or `recordings`, and options for all recordings."""
+
+    table: Annotated[str | None, _told("Path of a study.csv")] = None
+    recordings: Annotated[list[RecordingTable] | None, _told("The recordings themselves")] = None
+    window: Annotated[tuple[float, float] | Literal["all"] | None, _told("Part to analyse [s], or all")] = None
+    rung: Annotated[int | str | None, _told("Model of all people: 0 to 3, or auto")] = None
+    noise: Annotated[Text, _told("Colour of the noise")] = None
+    quantities: Annotated[list[str] | None, _told("What is compared")] = None
+    alpha: Annotated[float | None, _told("Level of the tests, between 0 and 1")] = None
+    correction: Annotated[Text, _told("holm, fdr or none")] = None
 
 
 class Row(NamedTuple):
@@ -66,22 +115,16 @@ def read_study(study: "str | os.PathLike[str] | Iterable[Mapping[str, Any]]") ->
     if not isinstance(study, str | os.PathLike):
         places = ((f"row {number}", dict(row)) for number, row in enumerate(study, 1))
         return StudyTable(_checked(places, Path(), "the table"), {}, "a table in memory")
-    path = Path(study).expanduser()
+    path = expanded(study)
     if path.suffix.lower() != ".toml":
         return StudyTable(_checked(_lines(path), path.parent, str(path)), {}, path.name)
-    try:
-        stated = tomllib.loads(text_of(_bytes(path), str(path)))
-    except tomllib.TOMLDecodeError as error:
-        raise ValueError(f"{path}: is not TOML: {error}") from None
-    known = ("table", "recordings", *OPTIONS)
-    for name in stated:
-        if name not in known:
-            raise ValueError(f"{path}: unknown option {name!r}; {choices(name, known)}")
+    stated = parsed(text_of(_bytes(path), str(path)), str(path), "TOML")
+    checked(stated, StudyFile, str(path))
     options = {name: value for name, value in stated.items() if name in OPTIONS}
     if ("table" in stated) == ("recordings" in stated):
         raise ValueError(f'{path}: give either table = "study.csv" or [[recordings]], each with file and person')
     if "table" in stated:
-        table = path.parent / Path(stated["table"]).expanduser()
+        table = path.parent / expanded(stated["table"])
         return StudyTable(_checked(_lines(table), table.parent, str(table)), options, path.name)
     places = ((f"{path}: recording {number}", dict(row)) for number, row in enumerate(stated["recordings"], 1))
     return StudyTable(_checked(places, path.parent, str(path)), options, path.name)
@@ -202,8 +245,12 @@ def _row(place: str, given: dict[str, Any], folder: Path) -> Row:
     window = [given.get(name) for name in EDGES]
     if window.count(None) == 1:
         raise ValueError(f"{place}: give window_start and window_stop, or neither")
-    file = folder / Path(str(given["file"])).expanduser()
-    if not file.is_file():
+    file = folder / expanded(str(given["file"]))
+    try:
+        there = file.is_file()
+    except OSError as error:  # a name that no file can have
+        raise ValueError(f"{place}: file: {error.strerror}") from None
+    if not there:
         raise ValueError(f"{place}: {file}: no such file")
     reading = {name: given[name] for name in (*FILES, *SPECTRA) if given.get(name) is not None}
     reading |= {"window": tuple(window)} if None not in window else {}

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxmuscle._common.errors import TargetError
-from jaxmuscle._common.text import choices
+from jaxmuscle._common.text import choices, listed
 from jaxmuscle.spectra._settings import SpectrumSettings
 
 Quantity = Literal["force", "torque", "displacement", "acceleration"]
@@ -152,7 +152,7 @@ def bin_numbers(values: Any, settings: SpectrumSettings) -> Int[np.ndarray, " bi
     bins, (first, last) = np.array(values), (settings.first_bin, settings.last_bin)
     whole = bins.ndim == 1 and np.issubdtype(bins.dtype, np.integer)
     if not whole or np.any(np.diff(bins) < 1) or np.any(bins < first) or np.any(bins > last):
-        raise TargetError(f"bins {values!r}: give increasing whole numbers from {first} to {last}")
+        raise TargetError(f"bins {listed(bins.ravel())}: give increasing whole numbers from {first} to {last}")
     return bins.astype(int)
 
 

@@ -57,9 +57,7 @@ class PresetFile(Table, kw_only=True):
     description: Annotated[str, Meta(description="What the task is")] = ""
     mean: Annotated[Any, Meta(description="Mean force to which the task is carried")] = None
     unit: Annotated[Any, Meta(description="N, mN or kN; with `mean` only")] = None
-    fit: Annotated[dict[str, Any], Meta(description="The fit that made it; for people")] = msgspec.field(
-        default_factory=dict
-    )
+    fit: Annotated[Any, Meta(description="The fit that made it, a table for people")] = None
     task_table: Annotated[dict[str, Any], Meta(description="The task, every number of it")]
 
 
