@@ -1,6 +1,7 @@
 """`jaxmuscle fit` with several targets."""
 
 import csv
+import io
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -67,8 +68,12 @@ def _reasons(failed: dict[str, str]) -> str:
 
 def _groups(path: Path) -> dict[str, str]:
     """The groups that a CSV with the columns target and group names."""
-    with open(path, encoding="utf-8-sig", newline="") as file:
-        rows = list(csv.DictReader(file))
+    from jaxmuscle._common.files import read_text
+
+    try:
+        rows = list(csv.DictReader(io.StringIO(read_text(path), newline="")))
+    except csv.Error as error:
+        raise ValueError(f"{path}: is no CSV: {error}") from None
     if not rows or not {"target", "group"} <= set(rows[0]):
         raise ValueError(f"{path}: needs a header with the columns target and group, and a line per target")
     found: dict[str, str] = {}

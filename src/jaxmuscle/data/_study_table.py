@@ -8,6 +8,7 @@ from typing import Annotated, Any, Literal, NamedTuple
 
 from msgspec import Meta
 
+from jaxmuscle._common.arguments import is_real
 from jaxmuscle._common.documents import Table, checked, parsed
 from jaxmuscle._common.files import expanded, text_of
 from jaxmuscle._common.text import choices
@@ -204,6 +205,8 @@ def _lines(path: Path) -> list[tuple[str, dict[str, Any]]]:
         for name in set(NUMBERS) & set(row):
             try:
                 row[name] = int(row[name]) if name == "skip_rows" else number_in(row[name], delimiter)
+                if not is_real(row[name]):
+                    raise ValueError(f"{row[name]} is not finite")
             except ValueError:
                 kind = "whole number" if name == "skip_rows" else "number"
                 raise ValueError(f"{place}: {name} = {row[name]!r} is not a {kind}") from None

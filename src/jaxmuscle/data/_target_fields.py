@@ -21,6 +21,7 @@ GRID_TOLERANCE = 0.02
 PIXEL_TOLERANCE = 0.1
 # or, as a fraction of the frequency, one pixel where a decade is 230 pixels wide.
 PIXEL_OF_LOG = 0.01
+MOST = 10**9  # segments of a trial
 
 
 class Columns(NamedTuple):
@@ -102,7 +103,7 @@ def _one_of(literal: Any) -> Callable[[str, Any], str]:
 
 
 def _count(name: str, value: Any) -> int:
-    if isinstance(value, bool) or not isinstance(value, Integral) or value < 1:
+    if isinstance(value, bool) or not isinstance(value, Integral) or not 1 <= value <= MOST:
         raise TargetError(f"{name} {value!r}: give whole numbers of at least 1")
     return int(value)
 

@@ -32,6 +32,7 @@ WIDTH, FEWEST = 0.15, 5  # of a step of the density: relative to its frequency; 
 TRIES = 4  # how often the density follows the crest factors of its motion
 CREST = (1.6, 2.0)  # of position and velocity, to begin with
 ENOUGH = 1e-6
+MOST = 10**8  # samples of a motion
 NOTHING = 1e-4  # of the relative variance, by which a motion must lower it
 
 
@@ -74,6 +75,7 @@ def design_input(
     for name, value, unit in (("rms", rms, "m"), ("peak", peak, "m"), ("speed", speed, "m/s"), ("rate", rate, "Hz")):
         require_positive(name, np.float64(1.0) if value is None else value, unit)
     require(0 <= spread <= 1, f"spread = {spread} must be a share, from 0 to 1")
+    require(seconds * rate <= MOST, f"seconds = {seconds} at rate = {rate} Hz are more than {MOST} samples: make it shorter")
     frequency, samples = lines_in(band, seconds), round(seconds * rate)
     require(abs(samples - seconds * rate) < ENOUGH * samples,
             f"seconds = {seconds}: rate = {rate} Hz makes no whole number of samples of it")  # fmt: skip
