@@ -260,8 +260,28 @@ def _changed(table: Any, rng: random.Random) -> tuple[Any, str | None]:
     return table, None
 
 
+def parsed_as(text: str, kind: str) -> dict[str, Any]:
+    """The table of a text of that kind."""
+    return json.loads(text) if kind == "json" else tomllib.loads(text)
+
+
+def keys_of(table: dict[str, Any]) -> list[tuple[Any, ...]]:
+    """Where keys stand, not the entries of lists."""
+    return [place for place in _places(table) if not isinstance(place[-1], int)]
+
+
+def without(table: dict[str, Any], place: tuple[Any, ...], kind: str) -> bytes:
+    """The file with a key left out."""
+    table = copy.deepcopy(table)
+    holder = table
+    for step in place[:-1]:
+        holder = holder[step]
+    del holder[place[-1]]
+    return (json.dumps(table) if kind == "json" else tomli_w.dumps(table)).encode()
+
+
 def _structured(text: str, kind: str, rng: random.Random) -> str | None:
-    table, twice = _changed(json.loads(text) if kind == "json" else tomllib.loads(text), rng)
+    table, twice = _changed(parsed_as(text, kind), rng)
     if kind == "json":
         text = json.dumps(table)
         return (

@@ -71,12 +71,15 @@ def converted(value: Any, kind: Any, where: str, error: type[ValueError] = Value
         raise error(f"{where} = {_shown(value)}: {_in_words(str(wrong)).removeprefix('the table ')}") from None
 
 
-def contradiction(stated: Any, meant: Any, place: str = "") -> str | None:
+def contradiction(stated: Any, meant: Any, place: str = "", *, whole: bool = True) -> str | None:
     """Where a table says something else than what follows from its other entries, in words; None if nowhere.
 
-    What only `meant` has was not written by an earlier version.
+    Without `whole` it may leave something out: what an earlier version did not write.
     """
     if isinstance(stated, dict) and isinstance(meant, dict):
+        missing = [key for key in meant if key not in stated]
+        if whole and missing:
+            return f"{place or 'the table'} has no key {missing[0]!r}"
         pairs = [(key, value, meant.get(key)) for key, value in stated.items()]
     elif isinstance(stated, list) and isinstance(meant, list | tuple) and len(stated) == len(meant):
         pairs = [(f"[{i}]", *pair) for i, pair in enumerate(zip(stated, meant, strict=True))]
@@ -84,7 +87,9 @@ def contradiction(stated: Any, meant: Any, place: str = "") -> str | None:
         return (
             None if _same(stated, meant) else f"{place} is {_shown(stated)}, but the rest of the file means {_shown(meant)}"
         )
-    found = (contradiction(one, other, f"{place}.{key}".lstrip(".").replace(".[", "[")) for key, one, other in pairs)
+    found = (
+        contradiction(one, other, f"{place}.{key}".lstrip(".").replace(".[", "["), whole=whole) for key, one, other in pairs
+    )
     return next(filter(None, found), None)
 
 

@@ -47,26 +47,39 @@ def number_of(key: Any) -> int | None:
     return seed_of(key, "key") if isinstance(key, int | np.integer) else None
 
 
-def key_of(key: Any) -> PRNGKeyArray:
-    """The key that is meant: a seed number, a key of `jax.random.key`, or the words of `jax.random.PRNGKey`.
-
-    Raises `ValueError` for anything else. Keys that are traced pass.
-    """
-    if isinstance(key, jax.Array) and jax.dtypes.issubdtype(key.dtype, jax.dtypes.prng_key):
+def check_key(key: Any) -> None:
+    """Raise a `ValueError` unless it is a seed number, a key of `jax.random.key`, or the words of `jax.random.PRNGKey`."""
+    if _is_typed(key):
         if key.shape:
             raise ValueError(f"key has shape {key.shape}: give one key, as jax.random.split(key)[0]")
+    elif not _is_words(key) and not (isinstance(key, jax.core.Tracer) and _is_whole(key)):
+        try:
+            seed_of(int(key) if _is_whole(key) else key, "key")
+        except ValueError as error:
+            raise ValueError(f"{error}, or a key, as jax.random.key(0)") from None
+
+
+def key_of(key: Any) -> PRNGKeyArray:
+    """The key that is meant, see `check_key`. Raises `ValueError` for anything else."""
+    check_key(key)
+    if _is_typed(key):
         return key
-    if isinstance(key, jax.Array | np.ndarray) and key.dtype == np.uint32 and key.shape == (2,):
+    if _is_words(key):
         return _wrapped(key)
-    if isinstance(key, jax.Array | np.ndarray) and np.issubdtype(key.dtype, np.integer) and not key.shape:
-        key = _key(key) if isinstance(key, jax.core.Tracer) else int(key)
-    if isinstance(key, jax.Array) and jax.dtypes.issubdtype(key.dtype, jax.dtypes.prng_key):
-        return key
-    try:
-        number = seed_of(key, "key")
-    except ValueError as error:
-        raise ValueError(f"{error}, or a key, as jax.random.key(0)") from None
-    return _key(np.asarray(number, np.uint32))
+    return _key(key if isinstance(key, jax.core.Tracer) else np.asarray(int(key), np.uint32))
+
+
+def _is_typed(key: Any) -> bool:
+    return isinstance(key, jax.Array) and jax.dtypes.issubdtype(key.dtype, jax.dtypes.prng_key)
+
+
+def _is_words(key: Any) -> bool:
+    return isinstance(key, jax.Array | np.ndarray) and key.dtype == np.uint32 and key.shape == (2,)
+
+
+def _is_whole(key: Any) -> bool:
+    """Whether it is an array of one whole number."""
+    return isinstance(key, jax.Array | np.ndarray) and key.shape == () and np.issubdtype(key.dtype, np.integer)
 
 
 def fold_in(key: PRNGKeyArray, number: int) -> PRNGKeyArray:

@@ -209,7 +209,9 @@ class Target(eqx.Module):
         fields = {key: value for key, value in fields.items() if value is not None}
         settings = settings_of(fields.pop("settings"), "target_table.settings", SpectrumSettings.names(whole=whole))
         given = fields.pop("frequency_hz")
-        frequency = numbers_of(given, "target_table.frequency_hz") if given or not fields.get("stiffness") else np.zeros(0)
+        frequency = (
+            numbers_of("frequency_hz", given, "target_table") if given or not fields.get("stiffness") else np.zeros(0)
+        )
         bins = np.rint(np.clip(frequency / settings.resolution, -1e9, 1e9)).astype(int)
         return cls(**fields, bins=bins, settings=settings)
 

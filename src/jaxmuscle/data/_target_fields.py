@@ -70,13 +70,13 @@ def is_number(value: Any) -> bool:
     return True
 
 
-def numbers_of(values: Any, where: str) -> Float[np.ndarray, " rows"]:
+def numbers_of(key: str, values: Any, file: str) -> Float[np.ndarray, " rows"]:
     """A list of numbers as an array. Raises `TargetError` naming the entry that is none."""
     if not isinstance(values, list | tuple | np.ndarray) or not len(values):
-        raise TargetError(f"{where} must be a list of numbers")
+        raise TargetError(f"{file}: {key} must be a list of numbers")
     for i, value in enumerate(values, 1):
         if not is_number(value):
-            raise TargetError(f"{where}, entry {i}: {value!r} is not a number")
+            raise TargetError(f"{file}, entry {i}: {key} {value!r} is not a number")
     return np.array([float(value) for value in values])
 
 

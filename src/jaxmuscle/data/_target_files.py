@@ -139,7 +139,7 @@ def _parse_toml(text: str, file: str, axis: str) -> Raw:
     _linear(axis, file)
     fields = fields_of(parsed(text, file, "TOML", TargetError), file)
     keys = [key for key in ("frequency_hz", "proportional_power", "sigma") if key in fields]
-    lists = [numbers_of(fields.pop(key), f"{file}: {key}") for key in keys]
+    lists = [numbers_of(key, fields.pop(key), file) for key in keys]
     for key, values in zip(keys, lists, strict=True):
         if values.size != lists[0].size:
             raise TargetError(f"{file}: {key} has {values.size} entries, frequency_hz {lists[0].size}; make them equal")

@@ -7,7 +7,7 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 
-from jaxmuscle._common.documents import Table
+from jaxmuscle._common.documents import Table, contradiction
 from jaxmuscle._common.keys import SEEDS
 from jaxmuscle.objective._arguments import METHODS, RESIDUALS, base_of, target_of
 
@@ -183,8 +183,14 @@ def disagreement(result: "FitResult") -> str | None:
         return f"settings.bounds names {_names(settings['bounds'])}, but free are {_names(free)}"
     if len(result.parts) > 1 and not {"separate", "proportional"} <= set(settings):
         return "settings has no key 'separate' or 'proportional', which the fit of several targets has"
+    spectra = {name: part.target.settings.to_dict() for name, part in result.parts.items()}
+    used = settings["spectrum"] if len(spectra) > 1 else {name: settings["spectrum"] for name in spectra}
+    if differs := contradiction(used, spectra, "settings.spectrum"):
+        return differs
     of = result.correlation
-    if of and (len(of["matrix"]), *map(len, of["matrix"])) != (len(of["parameters"]),) * (1 + len(of["parameters"])):
+    if len(of) == 1 or (
+        of and (len(of["matrix"]), *map(len, of["matrix"])) != (len(of["parameters"]),) * (1 + len(of["parameters"]))
+    ):
         return "correlation.matrix needs a row and a column for each of correlation.parameters"
     if result.profile is not None and len(result.profile[0]) != len(result.profile[1]):
         return "profile.chi2_rise needs a number for each of profile.frequency_hz"

@@ -275,8 +275,8 @@ def load_result(path: str | Path) -> FitResult:
     try:
         result = _from_table(table, str(path))
         # What can be made from the rest of the file must be what the file says; words may have changed since.
-        stated = {key: value for key, value in table.items() if key not in ("format", "verdict")}
-        wrong = disagreement(result) or contradiction(stated, to_table(result))
+        stated = {**table, "format": FORMAT, "verdict": result.verdict}
+        wrong = disagreement(result) or contradiction(stated, to_table(result), whole=table["format"] == FORMAT)
     except (ValueError, ArithmeticError) as error:
         raise error if isinstance(error, ResultError) else ResultError(f"{path}: {error}") from None
     if wrong:

@@ -17,7 +17,7 @@ from jaxmuscle import plot
 from jaxmuscle._common.arrays import with_nulls
 from jaxmuscle._common.environment import versions
 from jaxmuscle._common.files import remove, write_json, write_text
-from jaxmuscle._common.keys import number_of
+from jaxmuscle._common.keys import check_key
 from jaxmuscle._common.progress import Tell, told
 from jaxmuscle._common.tables import frame
 from jaxmuscle._common.text import WIDTH, choices, folded
@@ -291,7 +291,7 @@ def run_study(
     options = USUAL | table.options | {name: value for name, value in given.items() if value is not None}
     options = _checked(options)
     usual = {name: options.pop(name) for name in READING if name in options}
-    number_of(key)
+    check_key(key)
     options = options | {"starts": starts, "key": key}
     with told(progress, f"study of {len({row.person for row in table.rows})} people") as tell:
         tell("reading recordings", 0.0)

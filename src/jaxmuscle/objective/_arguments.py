@@ -11,7 +11,7 @@ import numpy as np
 
 from jaxmuscle._common.arguments import count, is_real, positive
 from jaxmuscle._common.arrays import as_numbers, with_nulls
-from jaxmuscle._common.keys import key_of, number_of
+from jaxmuscle._common.keys import check_key, key_of, number_of
 from jaxmuscle._common.progress import Tell, nothing
 from jaxmuscle._common.text import choices
 from jaxmuscle._common.types import Key
@@ -141,7 +141,7 @@ class FitOptions:
         for name, least in (("starts", 1), ("seeds", 0), ("check_seeds", 0), ("max_steps", 1), ("rungs", 0)):
             if getattr(self, name) is not None:
                 count(name, getattr(self, name), least, MOST)
-        number_of(self.key)
+        check_key(self.key)
         positive("dt", self.dt)
         for name, (low, high) in _pairs("bounds", self.bounds):
             if not (is_real(low) or low == -math.inf) or not (is_real(high) or high == math.inf) or not low < high:

@@ -58,7 +58,7 @@ def simulate(
     **Returns:** a `Trajectory`. **Raises:** `ValueError` for a grid that does not fit, `SimulationError` if the result is
     not finite (not under a JAX transformation, where it is returned as it is).
     """
-    seeds = jnp.asarray([seed_of(seed)], jnp.uint32) if all_concrete(seed) else jnp.atleast_1d(seed)
+    seeds = jnp.asarray([seed_of(seed)], jnp.uint32) if all_concrete(seed) else jnp.atleast_1d(jnp.asarray(seed))
     result = one(trajectories(task, None, key_of(key), seeds, schedule(task, duration, dt, rate, substeps, sampling)))
     require_finite(result)
     return result

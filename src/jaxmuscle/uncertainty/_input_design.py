@@ -10,7 +10,7 @@ import scipy
 from jaxtyping import Float
 
 from jaxmuscle._common.arrays import as_numbers, require
-from jaxmuscle._common.keys import key_of
+from jaxmuscle._common.keys import check_key, key_of
 from jaxmuscle._common.text import choices
 from jaxmuscle._common.types import Key
 from jaxmuscle.data._target import Target
@@ -75,6 +75,7 @@ def design_input(
     for name, value, unit in (("rms", rms, "m"), ("peak", peak, "m"), ("speed", speed, "m/s"), ("rate", rate, "Hz")):
         require_positive(name, np.float64(1.0) if value is None else value, unit)
     require(0 <= spread <= 1, f"spread = {spread} must be a share, from 0 to 1")
+    check_key(key)
     require(seconds * rate <= MOST, f"seconds = {seconds} at rate = {rate} Hz are more than {MOST} samples: make it shorter")
     frequency, samples = lines_in(band, seconds), round(seconds * rate)
     require(abs(samples - seconds * rate) < ENOUGH * samples,
