@@ -10,15 +10,18 @@ from jaxmuscle._common.keys import key_of, seed_of, seeds_of
 
 LAST = 2**32 - 1
 KEYS = {
-    "number": 7, "NumPy's number": np.int64(7), "unsigned": np.uint32(7), "array": np.array(7), "JAX's array": jax.numpy.asarray(7),
+    "number": 7, "NumPy's number": np.int64(7), "unsigned": np.uint32(7), "array": np.array(7),
+    "JAX's array": jax.numpy.asarray(7),
     "key": jax.random.key(7), "words": jax.random.PRNGKey(7), "NumPy's words": np.asarray(jax.random.PRNGKey(7)),
 }  # fmt: skip
 WRONG_KEYS = {
     "negative": -1, "too large": 2**32, "huge": 10**40, "fraction": 1.5, "whole float": 1.0, "switch": True, "text": "0",
-    "nothing": None, "list": [0, 1], "words of another type": np.array([0, 1]), "two keys": jax.random.split(jax.random.key(0)),
+    "nothing": None, "list": [0, 1], "words of another type": np.array([0, 1]),
+    "two keys": jax.random.split(jax.random.key(0)),
 }  # fmt: skip
 WRONG_SEEDS = {
-    "none": 0, "negative": -1, "too many": 2**32, "fraction": 2.0, "switch": True, "text": "ab", "empty": [], "two dimensions": [[0, 1]],
+    "none": 0, "negative": -1, "too many": 2**32, "fraction": 2.0, "switch": True, "text": "ab", "empty": [],
+    "two dimensions": [[0, 1]],
     "fractions": [0.0, 1.0], "switches": [True, False], "twice": [3, 1, 3], "below": [0, -1], "above": np.array([0, 2**32]),
     "ragged": [[0], [1, 2]], "nothing": None,
 }  # fmt: skip
@@ -64,7 +67,7 @@ def public_calls(key):
 @pytest.mark.parametrize("call", public_calls(0))
 @pytest.mark.parametrize("kind", ["negative", "fraction", "list"])
 def test_a_wrong_key_is_an_error_of_every_function(kind, call):
-    with pytest.raises(ValueError, match="key = .*: give a whole number from 0 to 2.32 - 1 = 4294967295, or a key, as jax"):
+    with pytest.raises(ValueError, match=r"key = .*: give a whole number from 0 to 2.32 - 1 = 4294967295, or a key, as jax"):
         public_calls(WRONG_KEYS[kind])[call]()
 
 
@@ -76,13 +79,13 @@ def test_a_wrong_key_is_refused(kind):
 
 @pytest.mark.parametrize("kind", WRONG_SEEDS)
 def test_wrong_seeds_are_refused_and_never_cut(kind):
-    with pytest.raises(ValueError, match="^seeds"):
+    with pytest.raises(ValueError, match=r"^seeds"):
         jm.ensemble(jm.Isometric(), 0, seeds=WRONG_SEEDS[kind])
 
 
 @pytest.mark.parametrize("seed", [-1, 2**32, 1.0, True, "0", None, [0]])
 def test_a_wrong_seed_is_refused(seed):
-    with pytest.raises(ValueError, match="^seed = "):
+    with pytest.raises(ValueError, match=r"^seed = "):
         jm.simulate(jm.Isometric(), 0, seed=seed)
 
 

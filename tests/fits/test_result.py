@@ -404,7 +404,7 @@ def test_a_result_of_the_format_before_is_read_without_loss(tmp_path):
     assert_equal(jm.load_preset(path), result.task)
     table["format"] = FORMAT
     path.write_text(json.dumps(table))
-    with pytest.raises(ResultError, match="has no key|is missing"):
+    with pytest.raises(ResultError, match=r"has no key|is missing"):
         jm.load_result(path)
 
 
@@ -549,7 +549,7 @@ WRONG = {
     "entry.toml": (preset_text(harmonic={"type": "Harmonic", "amplitudes": 1}), "task.harmonic.amplitudes: did you mean"),
     "setting.toml": (
         preset_text(settings=SETTINGS | {"overlap": 1.5}),
-        "setting.toml: task.settings: overlap=1.5: give a fr",
+        "setting.toml: task.settings: overlap=1.5: give",
     ),
     "initial.toml": (preset_text(initial=[1.0]), "initial has 1 entries"),
 }

@@ -22,7 +22,11 @@ def seed_of(seed: Any, name: str = "seed") -> int:
 
 def seeds_of(seeds: Any, name: str = "seeds") -> range | Int[np.ndarray, " seeds"]:
     """So many seeds from 0, or those given. Raises `ValueError` unless each is whole, in range and there once."""
-    if np.ndim(seeds) == 0:
+    try:
+        single = np.ndim(seeds) == 0
+    except ValueError:  # lists of several lengths
+        raise ValueError(f"{name} = {seeds!r}: give a number of seeds, or whole numbers in a list") from None
+    if single:
         number = seed_of(seeds, name)
         if number < 1:
             raise ValueError(f"{name} = {seeds!r}: give at least one seed")
