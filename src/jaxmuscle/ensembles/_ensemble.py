@@ -9,14 +9,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Int
 
-from jaxmuscle._common.arguments import count
+from jaxmuscle._common.arguments import count, is_real
 from jaxmuscle._common.arrays import all_concrete, as_arrays
 from jaxmuscle._common.keys import key_of, seeds_of
 from jaxmuscle._common.progress import told
 from jaxmuscle._common.text import listed
 from jaxmuscle._common.types import Key
 from jaxmuscle.model._stream import Draws
-from jaxmuscle.model._tasks import AbstractTask
+from jaxmuscle.model._tasks import AbstractTask, require_task
 from jaxmuscle.response._linearised import LinearTask
 from jaxmuscle.simulation._simulate import DT, DURATION, require_finite, trajectories
 from jaxmuscle.simulation._trajectory import Trajectory
@@ -123,7 +123,13 @@ def ensemble(  # pyright: ignore[reportInconsistentOverload]
     settings; `OSError` for one that cannot be written; `ProcessLostError` if another process died.
     """
     if not isinstance(task, AbstractTask | Sweep):
+        for each in task if isinstance(task, list | tuple) else [task]:
+            require_task(each, "ensemble(task, key, seeds=...)")
         task = Sweep.of(task)
+    if store is not None and not isinstance(store, str | Path):
+        raise ValueError(f"store = {store!r}: give a path or a URL")
+    if control is not None and not isinstance(control, bool):
+        raise ValueError(f"control = {control!r}: give True, False, or None to let it be decided")
     key, numbers = key_of(key), seeds_of(seeds)
     if chunk is not None:
         count("chunk", chunk, 1)
@@ -166,10 +172,10 @@ def _levels(reduce: bool | tuple[float, ...]) -> tuple[float, ...] | None:
     """Levels of the quantiles, None if nothing is reduced."""
     if reduce is False:
         return None
-    levels = LEVELS if reduce is True else tuple(float(level) for level in reduce)
-    if not all(0 < level < 1 for level in levels):
+    levels = LEVELS if reduce is True else reduce
+    if not isinstance(levels, tuple | list) or not levels or not all(is_real(level) and 0 < level < 1 for level in levels):
         raise ValueError(f"reduce = {reduce}: levels of quantiles lie between 0 and 1")
-    return tuple(sorted(levels))
+    return tuple(sorted(map(float, levels)))
 
 
 def _check_weak(levels: tuple[float, ...] | None) -> None:

@@ -2,14 +2,13 @@
 
 import dataclasses
 import itertools
-import math
 from collections.abc import Iterable, Mapping
 from typing import Any, Literal, NamedTuple, get_args
 
 import jax
 import numpy as np
 
-from jaxmuscle._common.arguments import count, is_real, positive
+from jaxmuscle._common.arguments import count, positive
 from jaxmuscle._common.arrays import as_numbers, with_nulls
 from jaxmuscle._common.keys import check_key, key_of, number_of
 from jaxmuscle._common.progress import Tell, nothing
@@ -27,6 +26,7 @@ from jaxmuscle.response._scaling import FORCES, at_force, is_scalable
 from jaxmuscle.spectra._settings import WINDOW, require, samples_in
 
 from ._coordinates import Coordinates
+from ._given import check_data, check_named
 from ._problem import FitProblem, Part, target_variation
 
 RESIDUALS = ("log", "linear", "cumulative")
@@ -143,24 +143,13 @@ class FitOptions:
                 count(name, getattr(self, name), least, MOST)
         check_key(self.key)
         positive("dt", self.dt)
-        for name, (low, high) in _pairs("bounds", self.bounds):
-            if not (is_real(low) or low == -math.inf) or not (is_real(high) or high == math.inf) or not low < high:
-                raise ValueError(f"bounds[{name!r}] = {(low, high)!r}: give two numbers, the lower first")
-        for name, value in dict(self.fix or {}).items():
-            if not is_real(value):
-                raise ValueError(f"fix[{name!r}] = {value!r}: give a finite number")
+        check_named(self.free, self.fix, self.bounds, self.priors)
+        check_data(self.coefficient_of_variation, self.mean_force)
 
     @property
     def seed(self) -> int | None:
         """The key, if it was given as a number."""
         return number_of(self.key)
-
-
-def _pairs(argument: str, given: Mapping[str, Any] | None) -> Iterable[tuple[str, tuple[Any, Any]]]:
-    for name, pair in dict(given or {}).items():
-        if not isinstance(pair, tuple | list) or len(pair) != 2:
-            raise ValueError(f"{argument}[{name!r}] = {pair!r}: give two numbers, the lower first")
-        yield name, (pair[0], pair[1])
 
 
 def at_mean(task: AbstractTask, target: Target, options: FitOptions) -> tuple[AbstractTask, FitOptions]:

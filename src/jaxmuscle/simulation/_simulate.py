@@ -16,7 +16,7 @@ from jaxmuscle._common.programs import kept
 from jaxmuscle._common.text import listed
 from jaxmuscle._common.types import Key
 from jaxmuscle.model._stream import Draws
-from jaxmuscle.model._tasks import AbstractTask
+from jaxmuscle.model._tasks import AbstractTask, require_task
 from jaxmuscle.response._equilibrium import fastest_rate
 from jaxmuscle.response._linearised import LinearTask, check_equilibrium, check_inputs, linearised
 from jaxmuscle.spectra._settings import WINDOW, Sampling
@@ -58,6 +58,7 @@ def simulate(
     **Returns:** a `Trajectory`. **Raises:** `ValueError` for a grid that does not fit, `SimulationError` if the result is
     not finite (not under a JAX transformation, where it is returned as it is).
     """
+    require_task(task, "simulate(task, key)")
     seeds = jnp.asarray([seed_of(seed)], jnp.uint32) if all_concrete(seed) else jnp.atleast_1d(jnp.asarray(seed))
     result = one(trajectories(task, None, key_of(key), seeds, schedule(task, duration, dt, rate, substeps, sampling)))
     require_finite(result)
