@@ -139,7 +139,10 @@ class AbstractTask(eqx.Module):
 
 def require_task(task: Any, example: str) -> None:
     """Raise a `ValueError` for what is no task, where one is needed."""
-    require(isinstance(task, AbstractTask), f"task: {task!r:.40}: give a task first, as jaxmuscle.Isometric(): {example}")
+    require(
+        isinstance(task, AbstractTask),
+        f"task: a {type(task).__name__}; give a task first, as jaxmuscle.Isometric(): {example}",
+    )
 
 
 def _check_task(task: AbstractTask) -> None:
