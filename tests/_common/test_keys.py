@@ -98,7 +98,7 @@ def test_seeds_that_are_right(given):
 
 def test_the_last_seed_is_one_of_its_own():
     np.testing.assert_array_equal(seeds_of([LAST, 0]), [LAST, 0])
-    task = jm.Isometric()
+    task = jm.Isometric(P_w=jm.model.Constant(5.0))
     runs = jm.ensemble(task, np.int64(5), seeds=[LAST, 0], duration=0.1, control=False)
     one = jm.simulate(task, jax.random.key(5), seed=LAST, duration=0.1)
     np.testing.assert_allclose(runs.output[0], one.output, rtol=1e-5)

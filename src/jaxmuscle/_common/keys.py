@@ -43,7 +43,7 @@ def seeds_of(seeds: Any, name: str = "seeds") -> range | Int[np.ndarray, " seeds
     if isinstance(numbers, np.ndarray) and len(np.unique(numbers)) < len(numbers):
         values, counts = np.unique(numbers, return_counts=True)
         raise ValueError(f"{name} holds {values[counts > 1][0]} more than once: every seed is one noise path, give it once")
-    return numbers
+    return numbers if isinstance(numbers, range) else numbers.astype(np.int64)
 
 
 def number_of(key: Any) -> int | None:

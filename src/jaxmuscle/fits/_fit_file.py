@@ -1,6 +1,6 @@
 """What `fit.json` holds: the schema of its keys, and whether they agree with each other."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import msgspec
@@ -9,10 +9,10 @@ from msgspec import Meta
 
 from jaxmuscle._common.documents import Table, contradiction
 from jaxmuscle._common.keys import SEEDS
+from jaxmuscle.data._target import Target
 from jaxmuscle.objective._arguments import METHODS, RESIDUALS, base_of, target_of
 
 if TYPE_CHECKING:
-    from ._part import FittedPart
     from ._result import FitResult
 
 FORMAT = 3
@@ -194,8 +194,7 @@ def disagreement(result: "FitResult") -> str | None:
         return "correlation.matrix needs a row and a column for each of correlation.parameters"
     if result.profile is not None and len(result.profile[0]) != len(result.profile[1]):
         return "profile.chi2_rise needs a number for each of profile.frequency_hz"
-    lengths = (_lengths(part) for part in result.parts.values())
-    return next(filter(None, lengths), None) or _values(result)
+    return _values(result)
 
 
 def _values(result: "FitResult") -> str | None:
@@ -216,18 +215,19 @@ def _values(result: "FitResult") -> str | None:
     return f"parameters has no key {sorted(missing)[0]!r}, which the task has" if missing else None
 
 
-def _lengths(part: "FittedPart") -> str | None:
-    bins = len(part.target.bins)
-    columns: Mapping[str, Any] = {"fitted": part.fitted, "harmonic_share": part.harmonic_share, "residual": part.residual,
-                                  "deviation": part.deviation, **part.components}  # fmt: skip
-    for name, column in columns.items():
-        if column is not None and np.shape(column) != (bins,):
-            return f"spectrum.{name} has {np.size(column)} numbers, the target {bins} bins"
-    if len(part.stretch[0]) != len(part.stretch[1]):
-        return "stretch.output needs a number for each of stretch.time"
-    known = 0 if part.target.stiffness is None else len(part.target.stiffness.known.frequency)
-    given = 0 if part.stiffness is None else len(part.stiffness)
-    return None if known == given else f"stiffness has {given} numbers, the target {known}"
+def check_lengths(table: PartTable, target: Target) -> None:
+    """Raise a `ValueError` for columns that have not a number for each bin, or for each time."""
+    spectrum, bins = table.spectrum, len(target.bins)
+    columns = {name: getattr(spectrum, name) for name in ("fitted", "harmonic_share", "residual", "deviation")}
+    for name, column in (columns | spectrum.components).items():
+        if column is not None and len(column) != bins:
+            raise ValueError(f"spectrum.{name} has {len(column)} numbers, the target {bins} bins")
+    if len(table.stretch.time) != len(table.stretch.output):
+        raise ValueError("stretch.output needs a number for each of stretch.time")
+    known = 0 if target.stiffness is None else len(target.stiffness.known.frequency)
+    real, imaginary = table.stiffness or ([], [])
+    if not len(real) == len(imaginary) == known:
+        raise ValueError(f"stiffness has {len(real)} real and {len(imaginary)} imaginary parts, the target {known}")
 
 
 def _names(names: Iterable[str]) -> str:

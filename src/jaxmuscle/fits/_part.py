@@ -13,7 +13,7 @@ from jaxmuscle.data._target import Target
 from jaxmuscle.model._task_tables import task_from_table, task_to_table
 from jaxmuscle.model._tasks import TASKS, AbstractTask
 
-from ._fit_file import EstimateTable, PartTable
+from ._fit_file import EstimateTable, PartTable, check_lengths
 
 if TYPE_CHECKING:
     import pandas
@@ -200,8 +200,10 @@ def part_to_table(part: FittedPart) -> dict[str, Any]:
 def read_part(table: PartTable, *, whole: bool) -> FittedPart:
     """The reverse of `part_to_table`; without `whole` task and target may leave out what they do not have."""
     spectrum, stretch, stiffness = table.spectrum, table.stretch, table.stiffness
+    target = Target.from_table(table.target_table, whole=whole)
+    check_lengths(table, target)
     return FittedPart(
-        target=Target.from_table(table.target_table, whole=whole),
+        target=target,
         task=task_from_table(table.task_table, whole=whole),
         chi2_per_bin=table.chi2_per_bin,
         rms_log_error=table.rms_log_error,
@@ -210,11 +212,5 @@ def read_part(table: PartTable, *, whole: bool) -> FittedPart:
         stretch=(from_nulls(stretch.time), from_nulls(stretch.output)),
         check=table.check,
         further=table.further,
-        stiffness=None if stiffness is None else _complex(*stiffness),
+        stiffness=None if stiffness is None else np.array(stiffness[0]) + 1j * np.array(stiffness[1]),
     )
-
-
-def _complex(real: list[float], imaginary: list[float]) -> Complex[np.ndarray, " points"]:
-    if len(real) != len(imaginary):
-        raise ValueError(f"stiffness has {len(real)} real and {len(imaginary)} imaginary parts")
-    return np.array(real) + 1j * np.array(imaginary)

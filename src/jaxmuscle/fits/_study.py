@@ -283,6 +283,7 @@ def run_study(
 
     **Raises:** `ValueError` naming file, line and column, or the argument, and the remedy.
     """
+    check_key(key)
     for name in reading:
         if name not in READING:
             raise ValueError(f"unknown argument {name!r}; {choices(name, READING)}")
@@ -291,7 +292,6 @@ def run_study(
     options = USUAL | table.options | {name: value for name, value in given.items() if value is not None}
     options = _checked(options)
     usual = {name: options.pop(name) for name in READING if name in options}
-    check_key(key)
     options = options | {"starts": starts, "key": key}
     with told(progress, f"study of {len({row.person for row in table.rows})} people") as tell:
         tell("reading recordings", 0.0)

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple, get_args
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Int, PRNGKeyArray
+from jaxtyping import Array, PRNGKeyArray
 
 from jaxmuscle._common.arguments import count, positive
 from jaxmuscle._common.arrays import all_concrete, as_arrays, as_numbers
@@ -14,7 +14,7 @@ from jaxmuscle._common.errors import OperatingPointError, SimulationError
 from jaxmuscle._common.keys import key_of, seed_of
 from jaxmuscle._common.programs import kept
 from jaxmuscle._common.text import listed
-from jaxmuscle._common.types import Key
+from jaxmuscle._common.types import Key, Seed
 from jaxmuscle.model._stream import Draws
 from jaxmuscle.model._tasks import AbstractTask, require_task
 from jaxmuscle.response._equilibrium import fastest_rate
@@ -37,7 +37,7 @@ def simulate(
     task: AbstractTask,
     key: Key,
     *,
-    seed: int | Int[Array, ""] = 0,
+    seed: Seed = 0,
     duration: float = DURATION,
     dt: float = DT,
     rate: float | None = None,
