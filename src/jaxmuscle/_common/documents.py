@@ -22,7 +22,7 @@ DISAGREE = 1e-9  # relative; numbers that follow from others may be rounded diff
 T = TypeVar("T")
 
 
-class Table(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
+class Table(msgspec.Struct, forbid_unknown_fields=True):
     """The schema of a table in a file: a field for each key, its type annotated with what it means."""
 
 

@@ -32,7 +32,7 @@ def check_data(coefficient_of_variation: Any, mean_force: Any) -> None:
         raise ValueError(f"coefficient_of_variation = {coefficient_of_variation!r}: give True or False, whether it is data")
     if mean_force is None or mean_force is False:
         return
-    pair = mean_force if isinstance(mean_force, tuple | list) and len(mean_force) == 2 else (None, None)
+    pair = mean_force if isinstance(mean_force, tuple | list) and len(mean_force) == 2 else (math.nan, math.nan)
     if not (is_real(pair[0]) and is_real(pair[1]) and pair[1] > 0):
         raise ValueError(f"mean_force = {mean_force!r}: give the mean and its standard error [N], as (20.0, 0.4), or False")
 

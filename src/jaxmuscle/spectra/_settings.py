@@ -13,6 +13,7 @@ import numpy as np
 import scipy
 from jaxtyping import Float
 
+from jaxmuscle._common.documents import converted
 from jaxmuscle._common.text import choices
 
 Window = Literal["hann", "hamming", "boxcar", "dpss"]
@@ -212,8 +213,12 @@ class SpectrumSettings(eqx.Module):
             near = difflib.get_close_matches(name, known, n=1, cutoff=0.0)[0]
             remedy = f"no such spectrum setting, did you mean {near!r}? Known are {', '.join(known)}"
             require(name in known, name, value, remedy)
-        unfiltered = {"filter_cutoff": None} if values.get("filter_cutoff") == "none" else {}
-        return cls(**{**values, **unfiltered})
+        given = {**values, **({"filter_cutoff": None} if values.get("filter_cutoff") == "none" else {})}
+        for field in dataclasses.fields(cls):
+            if field.name in given:  # ranges are checked by the constructor
+                kind: Any = field.type
+                converted(_python(given[field.name]), kind, field.name)
+        return cls(**given)
 
     def replace(self, **changes: Any) -> "SpectrumSettings":
         """A copy with some fields changed; raises as `from_dict` does."""
