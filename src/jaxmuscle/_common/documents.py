@@ -1,6 +1,5 @@
 """JSON and TOML that people may have changed: parsed strictly, and held against a schema that says what each key is."""
 
-import functools
 import json
 import math
 import re
@@ -152,7 +151,10 @@ def _located(table: dict[str, Any], kind: Any, message: str) -> str:
     while "[...]" in message:
         way = message.rpartition("`$")[2].partition("[...]")[0]
         steps = [int(index) if index else name for name, index in re.findall(r"\.([^.\[\]`]+)|\[(\d+)\]", way)]
-        entries = functools.reduce(lambda held, step: held[step], steps, table).items()
+        holder: Any = table
+        for step in steps:
+            holder = holder[step]
+        entries = holder.items()
         wrong = next((key for key, entry in entries if _is_refused(_with(table, steps, {key: entry}), kind)), None)
         if wrong is None:
             break

@@ -1,10 +1,10 @@
 """Random keys and seeds, checked; keys are made by programs that are kept: JAX's own would be compiled in every process."""
 
-import operator
 from typing import Any
 
 import jax
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Int, PRNGKeyArray
 
 from .programs import kept
@@ -15,9 +15,10 @@ SEEDS = 2**32  # how many there are
 def seed_of(seed: Any, name: str = "seed") -> int:
     """A seed as a number. Raises `ValueError` naming the argument unless it is a whole number from 0 to 2³² - 1."""
     whole = not isinstance(seed, bool | np.bool_) and isinstance(seed, int | np.integer)
-    if not whole or not 0 <= operator.index(seed) < SEEDS:
+    number = int(seed) if whole else -1
+    if not 0 <= number < SEEDS:
         raise ValueError(f"{name} = {seed!r}: give a whole number from 0 to 2^32 - 1 = {SEEDS - 1}")
-    return operator.index(seed)
+    return number
 
 
 def seeds_of(seeds: Any, name: str = "seeds") -> range | Int[np.ndarray, " seeds"]:
@@ -56,7 +57,7 @@ def check_key(key: Any) -> None:
     if _is_typed(key):
         if key.shape:
             raise ValueError(f"key has shape {key.shape}: give one key, as jax.random.split(key)[0]")
-    elif not _is_words(key) and not (isinstance(key, jax.core.Tracer) and _is_whole(key)):
+    elif not _is_words(key) and not (isinstance(key, Tracer) and _is_whole(key)):
         try:
             seed_of(int(key) if _is_whole(key) else key, "key")
         except ValueError as error:
@@ -70,11 +71,11 @@ def key_of(key: Any) -> PRNGKeyArray:
         return key
     if _is_words(key):
         return _wrapped(key)
-    return _key(key if isinstance(key, jax.core.Tracer) else np.asarray(int(key), np.uint32))
+    return _key(key if isinstance(key, Tracer) else np.asarray(int(key), np.uint32))
 
 
 def _is_typed(key: Any) -> bool:
-    return isinstance(key, jax.Array) and jax.dtypes.issubdtype(key.dtype, jax.dtypes.prng_key)
+    return isinstance(key, jax.Array) and jax.numpy.issubdtype(key.dtype, jax.dtypes.prng_key)
 
 
 def _is_words(key: Any) -> bool:

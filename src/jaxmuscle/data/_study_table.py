@@ -34,22 +34,22 @@ def _told(text: str) -> Meta:
     return Meta(description=text)
 
 
-Text, Positive = str | None, Annotated[float, Meta(gt=0)] | None
+Above0 = Annotated[float, Meta(gt=0)]
 
 
 class ReadingTable(Table, kw_only=True):
     """How a recording is read: columns of a study's table, and options for all of them in a study.toml."""
 
-    column: Annotated[Text | int, _told("Column or point of the force")] = None
-    rate: Annotated[Positive, _told("Sampling rate [Hz]")] = None
-    units: Annotated[Text, _told("Unit of the column")] = None
-    axis: Annotated[Text, _told("Of a point: x, y, z or principal")] = None
-    reference: Annotated[Text | int, _told("Column or point that is subtracted")] = None
-    time: Annotated[Text | int, _told("Column of the time")] = None
+    column: Annotated[str | int | None, _told("Column or point of the force")] = None
+    rate: Annotated[Above0 | None, _told("Sampling rate [Hz]")] = None
+    units: Annotated[str | None, _told("Unit of the column")] = None
+    axis: Annotated[str | None, _told("Of a point: x, y, z or principal")] = None
+    reference: Annotated[str | int | None, _told("Column or point that is subtracted")] = None
+    time: Annotated[str | int | None, _told("Column of the time")] = None
     max_gap: Annotated[Annotated[float, Meta(ge=0)] | None, _told("Longest gap that is closed [s]")] = None
     skip_rows: Annotated[Annotated[int, Meta(ge=0)] | None, _told("Lines to leave out at the top")] = None
-    spectrum: Annotated[Text, _told("standard, slow, multitaper or pwelch; the same for all")] = None
-    mvc: Annotated[Positive, _told("Maximal voluntary contraction, in the recording's unit")] = None
+    spectrum: Annotated[str | None, _told("standard, slow, multitaper or pwelch; the same for all")] = None
+    mvc: Annotated[Above0 | None, _told("Maximal voluntary contraction, in the recording's unit")] = None
 
 
 class RecordingTable(ReadingTable, kw_only=True):
@@ -71,10 +71,10 @@ class StudyFile(ReadingTable, kw_only=True):
     recordings: Annotated[list[RecordingTable] | None, _told("The recordings themselves")] = None
     window: Annotated[tuple[float, float] | Literal["all"] | None, _told("Part to analyse [s], or all")] = None
     rung: Annotated[int | str | None, _told("Model of all people: 0 to 3, or auto")] = None
-    noise: Annotated[Text, _told("Colour of the noise")] = None
+    noise: Annotated[str | None, _told("Colour of the noise")] = None
     quantities: Annotated[list[str] | None, _told("What is compared")] = None
     alpha: Annotated[float | None, _told("Level of the tests, between 0 and 1")] = None
-    correction: Annotated[Text, _told("holm, fdr or none")] = None
+    correction: Annotated[str | None, _told("holm, fdr or none")] = None
 
 
 class Row(NamedTuple):

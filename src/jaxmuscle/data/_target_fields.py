@@ -103,7 +103,7 @@ def _one_of(literal: Any) -> Callable[[str, Any], str]:
 
 
 def _count(name: str, value: Any) -> int:
-    if isinstance(value, bool) or not isinstance(value, Integral) or not 1 <= value <= MOST:
+    if isinstance(value, bool) or not isinstance(value, Integral) or not 1 <= int(value) <= MOST:
         raise TargetError(f"{name} {value!r}: give whole numbers of at least 1")
     return int(value)
 

@@ -7,14 +7,13 @@ from typing import TYPE_CHECKING, Any, Literal, overload
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Int
 
 from jaxmuscle._common.arguments import count, is_real
 from jaxmuscle._common.arrays import all_concrete, as_arrays
 from jaxmuscle._common.keys import key_of, seeds_of
 from jaxmuscle._common.progress import told
 from jaxmuscle._common.text import listed
-from jaxmuscle._common.types import Key
+from jaxmuscle._common.types import Key, Seeds
 from jaxmuscle.model._stream import Draws
 from jaxmuscle.model._tasks import AbstractTask, require_task
 from jaxmuscle.response._linearised import LinearTask
@@ -35,7 +34,6 @@ if TYPE_CHECKING:
 
 FURTHEST = 0.01  # quantiles that weak increments are good for
 
-Seeds = Any if not TYPE_CHECKING else int | Sequence[int] | Int[np.ndarray, " seeds"]
 Progress = bool | Callable[[str, float], None] | Watch
 
 
