@@ -90,7 +90,10 @@ def _same_fit(result: jm.fits.FitResult, text: str) -> bool:
 
 
 def _same_preset(task: Any, text: str) -> bool:
-    return _close(json.loads(json.dumps(task_to_table(task))), tomllib.loads(text)["task_table"])
+    said = tomllib.loads(text)["task_table"]
+    if not isinstance(said["noise"]["amplitude"], list):  # one number is that of all four coefficients
+        said["noise"]["amplitude"] = 4 * [said["noise"]["amplitude"]]
+    return _close(json.loads(json.dumps(task_to_table(task))), said)
 
 
 def _same_target(target: jm.Target, text: str) -> bool:

@@ -115,6 +115,8 @@ class Target(eqx.Module):
         self.reason = check.metadata("reason", reason)
         self.settings = settings
         self.stiffness = FrequencyResponse.from_table(stiffness) if isinstance(stiffness, Mapping) else stiffness
+        if self.stiffness is not None and not isinstance(self.stiffness, FrequencyResponse):
+            raise TargetError(f"stiffness: this is a {type(stiffness).__name__}; give a FrequencyResponse, or its table")
         if proportional_power is None and stiffness is not None:
             proportional_power, bins = np.zeros(0), np.zeros(0, int)
         selected = np.arange(settings.first_bin, settings.last_bin + 1)
@@ -212,7 +214,8 @@ class Target(eqx.Module):
         frequency = (
             numbers_of("frequency_hz", given, "target_table") if given or not fields.get("stiffness") else np.zeros(0)
         )
-        bins = np.rint(np.clip(frequency / settings.resolution, -1e9, 1e9)).astype(int)
+        with np.errstate(over="ignore"):
+            bins = np.rint(np.clip(frequency / settings.resolution, -1e9, 1e9)).astype(int)
         return cls(**fields, bins=bins, settings=settings)
 
     def with_stiffness(self, stiffness: FrequencyResponse) -> "Target":

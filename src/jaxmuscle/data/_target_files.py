@@ -239,7 +239,8 @@ def on_grid(raw: Raw) -> tuple[OnBins, list[str]]:
     Raises `TargetError` if fewer than 2 bins are covered, and for spectra of trials that are off the bins.
     """
     columns, settings, trials = raw.columns, raw.fields["settings"], raw.fields.get("trial_power")
-    position = np.minimum(columns.frequency / settings.resolution, 1e9)
+    with np.errstate(over="ignore"):
+        position = np.minimum(columns.frequency / settings.resolution, 1e9)
     tolerance = np.full(position.size, PIXEL_TOLERANCE if raw.digitised else GRID_TOLERANCE)
     if raw.log_frequency:
         tolerance = np.maximum(tolerance, PIXEL_OF_LOG * position)

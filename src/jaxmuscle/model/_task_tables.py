@@ -112,7 +112,8 @@ def _value(kind: type, field: Any, value: Any, where: str, whole: bool) -> Any:
         entries = [(each, f"{where}[{i}]") for i, each in enumerate(converted(value, list, where, PresetError))]
         return tuple(_part(inner, each, at, whole) if _is_part(inner) else _number(each, at) for each, at in entries)
     if _is_part(meant):
-        number = issubclass(meant, _signals.AbstractSignal) and field.metadata.get("converter") is not None
+        # A number stands for a step with default times, so no file of today may hold one.
+        number = not whole and issubclass(meant, _signals.AbstractSignal) and field.metadata.get("converter") is not None
         return _number(value, where) if number and not isinstance(value, dict) else _part(meant, value, where, whole)
     several = "converter" in field.metadata or kind not in _KINDS.values()  # one for each input, or what a user's class has
     if hasattr(meant, "dims") and (float not in options or (several and isinstance(value, list))):
