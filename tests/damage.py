@@ -352,7 +352,7 @@ def fault(of: Format, data: bytes, path: Path) -> str | None:
         if "\n" in said or not said.strip():
             return f"not one sentence: {said[:200]!r}"
         return None if path.name in said else f"names no file: {said[:200]}"
-    return "" if of.same(found, data.decode("utf-8-sig")) else "read as something else than it says"
+    return "" if of.same(found, data.decode("utf-8-sig", errors="replace")) else "read as something else than it says"
 
 
 def tried(of: Format, count: int, folder: Path, seed: int = 0) -> tuple[collections.Counter, list[tuple[str, bytes]]]:
