@@ -136,7 +136,7 @@ def _same_csv(target: jm.Target, text: str) -> bool:
     if rows[0][0].replace(".", "").isdigit():  # without its header it is a figure's
         return target.provenance == "digitised"
     names = [cell.lower() for cell in rows[0]]
-    power = {round(float(row[names.index("frequency_hz")]) / 0.390625, 6): float(row[names.index("proportional_power")])
+    power = {round(min(float(row[names.index("frequency_hz")]), 1e9) / 0.390625, 6): float(row[names.index("proportional_power")])
              for row in rows[1:]}  # fmt: skip
     if any(abs(bin - round(bin)) > 0.02 for bin in power):
         return any("interpolated" in notice for notice in target.notices)
