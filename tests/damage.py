@@ -136,8 +136,8 @@ def _same_csv(target: jm.Target, text: str) -> bool:
     if rows[0][0].replace(".", "").isdigit():  # without its header it is a figure's
         return target.provenance == "digitised"
     names = [cell.lower() for cell in rows[0]]
-    power = {round(min(float(row[names.index("frequency_hz")]), 1e9) / 0.390625, 6): float(row[names.index("proportional_power")])
-             for row in rows[1:]}  # fmt: skip
+    at, of = names.index("frequency_hz"), names.index("proportional_power")
+    power = {round(min(float(row[at]), 1e9) / 0.390625, 6): float(row[of]) for row in rows[1:]}
     if any(abs(bin - round(bin)) > 0.02 for bin in power):
         return any("interpolated" in notice for notice in target.notices)
     stated = {round(bin): value for bin, value in power.items() if 1 <= round(bin) <= 30}
