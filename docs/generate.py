@@ -1,9 +1,18 @@
-"""Writes docs/reference/parameters.md from the parameter table: `python docs/generate.py`."""
+"""Writes docs/reference/parameters.md and files.md from the tables in the code: `python docs/generate.py`."""
 
 import math
+import types
+import typing
 from pathlib import Path
 
+import msgspec
+
+from jaxmuscle.data._frequency_response import ResponseTable
+from jaxmuscle.data._study_table import RecordingTable, StudyFile
+from jaxmuscle.data._target_files import TargetFile
+from jaxmuscle.fits import _fit_file
 from jaxmuscle.model._parameters import DEFAULT_FREE, PARAMETERS, Parameter
+from jaxmuscle.response._presets import PresetFile
 
 PAGE = Path(__file__).parent / "reference" / "parameters.md"
 HEAD = """# Parameters and units
@@ -41,6 +50,34 @@ The table by name, a dictionary of `Parameter`.
 
 ::: jaxmuscle.model.Parameter
 """
+FILES = Path(__file__).parent / "reference" / "files.md"
+FILES_HEAD = """# Files, key by key
+
+Every file that jaxmuscle reads as a table has a schema. A key that is unknown, missing, there twice, of a wrong type or out
+of range is an error that names the file and the key. Nothing gets a silent default. Numbers are finite; `true` is not 1;
+`1.0` is not a whole number. This page is written by `docs/generate.py` from the schemas.
+
+*Since* is the version of the format that has the key. A later version of jaxmuscle reads earlier formats.
+"""
+FIT_FILE = """JSON, format 3. Written by `FitResult.save`, read by `load_result`; `load_preset` takes its `task_table`. Of
+one target it has the keys of both tables, of several those of the second stand under `parts`, by name. Keys must agree: the
+value of a parameter with its `task_table`, the spectrum with its `target_table`. Format 2 may leave out what task and target
+do not have."""
+PRESET = """TOML, format 2. Written by `save_preset`, read by `load_preset`. The `task_table` has every field of the task and
+of its parts, each part with its class as `type`. What a task does not have (`activation`, `initial`, a low-pass) is
+`"none"`. Format 1, without the key `format`, may leave these out."""
+TARGET = """TOML, format 1. Written by `Target.save`, read by `load_target`. As `target_table` of a fit.json it has all keys
+but `format`, and `null` for what is not stated."""
+STUDY = """TOML, read by `run_study`. A study.csv has the columns of the second table."""
+F = _fit_file
+SECTIONS = (
+    ("fit.json", FIT_FILE, 2, (F.FitTable, F.PartTable, F.EstimateTable, F.AdequacyTable, F.RungTable, F.StartTable,
+                          F.CorrelationTable, F.ProfileTable, F.SettingsTable, F.SpectrumTable, F.StretchTable)),
+    ("Preset", PRESET, 1, (PresetFile,)),
+    ("Target", TARGET, 1, (TargetFile, ResponseTable)),
+    ("Study", STUDY, 1, (StudyFile, RecordingTable)),
+)  # fmt: skip
+NAMES = {float: "number", int: "whole number", str: "text", bool: "true or false", dict: "table", type(None): "null"}
 POWERS = str.maketrans("23", "²³")
 
 
@@ -76,5 +113,44 @@ def page() -> str:
     return HEAD + "".join(values) + FIT + "".join(fits) + TAIL
 
 
+def kind(given: typing.Any) -> str:
+    """A type in words."""
+    origin, inside = typing.get_origin(given), typing.get_args(given)
+    if origin is typing.Annotated:
+        about = inside[1]
+        limits = ((about.gt, "above"), (about.ge, "at least"), (about.lt, "below"), (about.le, "at most"))
+        said = [f"{word} {limit}" for limit, word in limits if limit is not None]
+        return " ".join([kind(inside[0]), ", ".join(said)]).strip()
+    if origin in (types.UnionType, typing.Union):
+        return " or ".join(dict.fromkeys(kind(each) for each in inside))
+    if origin is typing.Literal:
+        return ", ".join(f"`{each}`" for each in inside)
+    if origin in (list, tuple):
+        return (
+            f"list of: {kind(inside[0])}" if origin is list or ... in inside else f"{len(inside)} times: {kind(inside[0])}"
+        )
+    if origin is dict:
+        return f"table by name: {kind(inside[1])}" if inside[1] is not typing.Any else "table"
+    return NAMES.get(given, "table" if isinstance(given, type) and issubclass(given, msgspec.Struct) else "any")
+
+
+def files_page() -> str:
+    """The text of the page of files."""
+    text = FILES_HEAD
+    for title, said, since, tables in SECTIONS:
+        text += f"\n## {title}\n\n{said}\n"
+        for table in tables:
+            hints = typing.get_type_hints(table, include_extras=True)
+            text += f"\n### {(table.__doc__ or '').strip().rstrip('.')}\n\n"
+            text += "| key | type and range | required | since | meaning |\n|---|---|---|---|---|\n"
+            for field in msgspec.structs.fields(table):
+                given, about = typing.get_args(hints[field.name])[:2]
+                told = about.extra["type"] if about.extra else kind(given)
+                needed = "yes" if field.required else "no"
+                text += f"| `{field.name}` | {told} | {needed} | {since} | {about.description} |\n"
+    return text
+
+
 if __name__ == "__main__":
     PAGE.write_text(page(), encoding="utf-8")
+    FILES.write_text(files_page(), encoding="utf-8")

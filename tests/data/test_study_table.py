@@ -156,10 +156,10 @@ def test_mistakes_in_a_table(text, message, folder):
     ("text", "message"),
     [
         ('table = "no.csv"', r"no.csv: no such file"),
-        ('table = "study.csv"\nrungs = 2', r"unknown option 'rungs'; did you mean 'rung'\?"),
+        ('table = "study.csv"\nrungs = 2', r"unknown key 'rungs'; did you mean 'rung'\?"),
         ("alpha = 0.05", r"give either table"),
-        ("alpha = ", r"study.toml: is not TOML"),
-        ('[[recordings]]\nfile = "a1.npy"\nperson = "a"\nunit = "N"', r"recording 1: unknown column 'unit'"),
+        ("alpha = ", r"study.toml: is not valid TOML"),
+        ('[[recordings]]\nfile = "a1.npy"\nperson = "a"\nunit = "N"', r"recordings\[0\] has the unknown key 'unit'"),
     ],
 )
 def test_mistakes_in_a_toml(text, message, folder):

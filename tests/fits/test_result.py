@@ -16,9 +16,9 @@ from jaxmuscle._common.errors import PresetError, ResultError
 from jaxmuscle._common.files import replacing, write_json, write_text
 from jaxmuscle.fits import Estimate
 from jaxmuscle.fits._adequacy import Adequacy
+from jaxmuscle.fits._fit_file import FORMAT
 from jaxmuscle.fits._ladder import Rung
 from jaxmuscle.fits._part import Start
-from jaxmuscle.fits._result import FORMAT
 from jaxmuscle.model._task_tables import task_from_table, task_to_table
 
 POWER = 1 / (1 + np.arange(1, 31) ** 2)
@@ -70,7 +70,23 @@ def made_result(**changes: Any) -> jm.fits.FitResult:
         "stiffness": None,
         "notices": ("a notice",),
         "seed": 3,
-        "settings": {"free": ["k_w", "c_w"], "starts": 2, "bounds": {"k_w": [1.0, 2e6]}, "mean_force": None},
+        "settings": {
+            "free": ["k_w", "c_w"],
+            "residual": "log",
+            "prior_centre": {"k_w": 5e5, "c_w": 60.0},
+            "prior_sd": {"k_w": 1.0, "c_w": None},
+            "bounds": {"k_w": [1.0, 2e6]},
+            "starts": 2,
+            "seeds": 32,
+            "check_seeds": 64,
+            "max_steps": 40,
+            "dt": 2.5e-3,
+            "coefficient_of_variation": True,
+            "mean_force": None,
+            "carried": None,
+            "spectrum": TARGET.settings.to_dict(),
+            "steps_per_sample": 4,
+        },
         "versions": {"jaxmuscle": "0.1", "jax": "0.8"},
     } | changes
     own = {name: fields.pop(name) for name in PART}
@@ -294,13 +310,16 @@ def test_json_refuses_what_it_has_no_word_for(tmp_path):
     ("text", "message"),
     [
         (None, "fit.json: no such file"),
-        ("{", "fit.json: is not JSON"),
+        ("{", "fit.json: is not valid JSON"),
         ("", "fit.json: is empty"),
         (b"\xff\xfe\x00", "fit.json: is not UTF-8 text"),
-        ("[1, 2]", f"is not a fit result of format {FORMAT}; write it with FitResult.save"),
-        ("{}", f"is not a fit result of format {FORMAT}"),
+        ("[1, 2]", "fit.json: holds no table, but a list"),
+        ("{}", f"is not a fit result of format 2 or {FORMAT}; write it with FitResult.save"),
+        (f'{{"format": {FORMAT}, "format": {FORMAT}}}', "is not valid JSON: the key 'format' is there twice"),
+        ('{"format": true}', "is not a fit result of format"),
+        ('{"a": ' + "[" * 100_000, "fit.json: is nested too deeply"),
         ('{"format": 99}', "is not a fit result of format"),
-        (f'{{"format": {FORMAT}, "message": "m"}}', "has no entry 'target'"),
+        (f'{{"format": {FORMAT}, "message": "m"}}', "the key '.*' is missing; needed are"),
     ],
 )
 def test_what_is_not_a_result(text, message, tmp_path):
@@ -318,8 +337,82 @@ def test_a_missing_entry_is_named(entry, tmp_path):
     table = json.loads(path.read_text())
     del table[entry]
     path.write_text(json.dumps(table))
-    with pytest.raises(ResultError, match=f"fit.json: has no entry '{entry}'"):
+    with pytest.raises(ResultError, match=f"fit.json: the key '{entry}' is missing"):
         jm.load_result(path)
+
+
+def changed(path, key, value):
+    """The file with one entry changed, "a.b.c" by name."""
+    table = json.loads(path.read_text())
+    *way, last = key.split(".")
+    holder = table
+    for step in way:
+        holder = holder[step]
+    holder[last] = value
+    path.write_text(json.dumps(table))
+
+
+CONTRADICTIONS = {
+    "the fitted value": (
+        "parameters.k_w.value",
+        456540.0,
+        "parameters.k_w.value is 456540.0, but 500000.0 in the task_table",
+    ),
+    "the task": ("task_table.muscle.stiffness_w.k", 456540.0, "parameters.k_w.value is 500000.0, but 456540.0 in the task"),
+    "its name": ("task", "prescribed-force", 'task is "prescribed-force", but the rest of the file means "isometric"'),
+    "the target": ("target", "other", 'target is "other", but the rest of the file means "made"'),
+    "the verdict": ("adequate", False, "adequate is false, but the rest of the file means true"),
+    "the spectrum": ("spectrum.fitted", [1.0], "spectrum.fitted has 1 numbers, the target 30 bins"),
+    "who is free": (
+        "parameters.m_w.free",
+        True,
+        "settings.free names c_w, k_w, but free among the parameters are c_w, k_w, m_w",
+    ),
+    "the prior": ("settings.prior_centre", {"c_w": 60.0}, "settings.prior_centre names c_w, but free among"),
+    "the settings": ("settings.spectrum.overlap", 0.4, "settings.spectrum.made.overlap is 0.4, but"),
+    "a type": ("derived.K_w0.value", "200", "derived.K_w0.value must be a number or nothing, not a text"),
+    "a switch": (
+        "starts",
+        [{"cost": 1.5, "success": 1, "steps": 12}],
+        "starts.0..success must be true or false, not a whole",
+    ),
+    "a range": ("seed", -1, "seed must be a whole number >= 0"),
+}
+
+
+@pytest.mark.parametrize("case", CONTRADICTIONS)
+def test_a_result_that_contradicts_itself_is_refused(case, tmp_path):
+    key, value, message = CONTRADICTIONS[case]
+    path = tmp_path / "fit.json"
+    made_result().save(path)
+    changed(path, key, value)
+    with pytest.raises(ResultError, match=f"fit.json: {message}"):
+        jm.load_result(path)
+
+
+def test_a_result_of_the_format_before_is_read_without_loss(tmp_path):
+    """Format 2 left out what task and target do not have."""
+    path, result = tmp_path / "fit.json", made_result()
+    result.save(path)
+    table = json.loads(path.read_text())
+    table["format"] = 2
+    table["target_table"] = {key: value for key, value in table["target_table"].items() if value is not None}
+    del table["target_table"]["settings"]["tapers"], table["task_table"]["settings"]["tapers"]
+    del table["task_table"]["activation"], table["task_table"]["initial"]
+    path.write_text(json.dumps(table))
+    assert_equal(jm.load_result(path), result)
+    assert_equal(jm.load_preset(path), result.task)
+    table["format"] = FORMAT
+    path.write_text(json.dumps(table))
+    with pytest.raises(ResultError, match=r"has no key|is missing"):
+        jm.load_result(path)
+
+
+def test_open_bounds_are_saved(tmp_path):
+    settings = made_result().settings | {"bounds": {"k_w": [None, 2e6], "c_w": [1.0, None]}}
+    result = made_result(settings=settings)
+    result.save(tmp_path / "fit.json")
+    assert jm.load_result(tmp_path / "fit.json").settings["bounds"] == settings["bounds"]
 
 
 # --- presets
@@ -432,9 +525,12 @@ def test_bundled_presets_load():
         assert_equal(task_from_table(task_to_table(task)), task)
 
 
+PRESET = task_to_table(jm.Isometric())
+NOISE, SETTINGS = PRESET["noise"], PRESET["settings"]
+
+
 def preset_text(**changes):
-    table = task_to_table(jm.Isometric())
-    return tomli_w.dumps({"task_table": table | changes})
+    return tomli_w.dumps({"task_table": PRESET | changes})
 
 
 WRONG = {
@@ -442,15 +538,19 @@ WRONG = {
     "broken.toml": ("[task_table", "broken.toml: is not valid TOML"),
     "broken.json": ("{", "broken.json: is not valid JSON"),
     "binary.toml": (b"\xff\xfe\x00", "binary.toml: is not UTF-8 text"),
-    "list.json": ("[]", "list.json: is not a preset"),
+    "list.json": ("[]", "list.json: holds no table, but a list"),
     "empty.toml": ("", "empty.toml: is empty"),
     "target.toml": ('name = "t"', r"has no \[task_table\]: is it a preset"),
     "task.toml": (preset_text(task="isometrics"), "task.toml: task = 'isometrics': did you mean 'isometric'"),
     "key.toml": (preset_text(muscles=1), "key.toml: unknown key task.muscles: did you mean 'muscle'"),
     "kind.toml": (preset_text(noise={"type": "WhiteNoises"}), "task.noise.type = 'WhiteNoises': did you mean 'WhiteNoise'"),
-    "value.toml": (preset_text(noise={"type": "BandLimitedNoise", "rate": -1.0}), "task.noise: .*rate = -1.0 Hz"),
+    "value.toml": (preset_text(noise=NOISE | {"rate": -1.0}), "task.noise: .*rate = -1.0 Hz"),
+    "missing.toml": (preset_text(noise={"type": "BandLimitedNoise", "rate": 1.0}), "task.noise has no key 'amplitude'"),
     "entry.toml": (preset_text(harmonic={"type": "Harmonic", "amplitudes": 1}), "task.harmonic.amplitudes: did you mean"),
-    "setting.toml": (preset_text(settings={"overlap": 1.5}), "setting.toml: overlap=1.5: give a fraction"),
+    "setting.toml": (
+        preset_text(settings=SETTINGS | {"overlap": 1.5}),
+        "setting.toml: task.settings: overlap=1.5: give",
+    ),
     "initial.toml": (preset_text(initial=[1.0]), "initial has 1 entries"),
 }
 
@@ -469,11 +569,11 @@ NOT_TABLES = {
     "another table": {"muscle": {"type": "Constant", "level": 1.0}},
     "a table for a number": {"x_z": {"type": "Constant", "level": 1.0}},
     "a text for a signal": {"P_w": "far"},
-    "a number for yes or no": {"noise": {"type": "BandLimitedNoise", "shared": 1}},
+    "a number for yes or no": {"noise": NOISE | {"shared": 1}},
     "a number for the settings": {"settings": 3},
     "a text for a number": {"x_z": "far"},
-    "a text in a list": {"noise": {"type": "BandLimitedNoise", "amplitude": ["a", 1, 1, 1]}},
-    "a ragged list": {"noise": {"type": "BandLimitedNoise", "amplitude": [[1], 1, 1, 1]}},
+    "a text in a list": {"noise": NOISE | {"amplitude": ["a", 1, 1, 1]}},
+    "a ragged list": {"noise": NOISE | {"amplitude": [[1], 1, 1, 1]}},
 }
 
 

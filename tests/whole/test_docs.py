@@ -137,6 +137,7 @@ def test_the_citation_names_the_current_version():
 def test_parameter_page_is_current():
     generate = module(ROOT / "docs" / "generate.py")
     assert generate.PAGE.read_text(encoding="utf-8") == generate.page(), "run `python docs/generate.py`"
+    assert generate.FILES.read_text(encoding="utf-8") == generate.files_page(), "run `python docs/generate.py`"
 
 
 def test_the_picture_of_the_layers_is_current():

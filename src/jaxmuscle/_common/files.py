@@ -48,6 +48,13 @@ def _to_disk(path: Path) -> None:
         os.close(handle)
 
 
+def expanded(path: str | os.PathLike[str]) -> Path:
+    """The path with ~ for the home folder, as far as there is one."""
+    with contextlib.suppress(RuntimeError):
+        return Path(path).expanduser()
+    return Path(path)
+
+
 def text_of(data: bytes, file: str, error: type[ValueError] = ValueError) -> str:
     """The UTF-8 text of a file's bytes. Raises `error`, naming the file, where there is none or it is something else."""
     if not data.strip():

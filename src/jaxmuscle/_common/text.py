@@ -44,10 +44,10 @@ def probability(p: float) -> str:
     return "p <= 0.001" if p <= 0.001 else f"p = {p:.2g}"
 
 
-def choices(word: str, options: Iterable[str]) -> str:
+def choices(word: object, options: Iterable[str]) -> str:
     """The end of a message about an unknown word: the nearest option, then all of them."""
     options = list(options)
-    near = difflib.get_close_matches(word.lower(), options, n=1, cutoff=0.4)
+    near = difflib.get_close_matches(str(word).lower(), options, n=1, cutoff=0.4)
     hint = f"did you mean {near[0]!r}? " if near else ""
     return f"{hint}Known: {', '.join(options)}"
 

@@ -1,11 +1,16 @@
 """Types that many modules share."""
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PRNGKeyArray
 
 if TYPE_CHECKING:
     Scalar = Any  # a union of numbers and arrays supports no arithmetic in the eyes of a type checker
+    Key = PRNGKeyArray | Array | np.ndarray | np.integer | int
+    Seed = Array | np.integer | int
+    Seeds = int | np.integer | Sequence[int] | np.ndarray
 else:
+    Key = Seed = Seeds = Any  # checked by `keys.key_of` and `keys.seed_of`, with a sentence
     Scalar = Float[Array, "..."] | Float[np.ndarray, "..."] | float | int

@@ -5,9 +5,10 @@ from typing import Any
 
 import jax
 import numpy as np
-from jax import Array
 
+from jaxmuscle._common.keys import number_of
 from jaxmuscle._common.progress import told
+from jaxmuscle._common.types import Key
 from jaxmuscle.fits._reopened import reopened
 from jaxmuscle.fits._result import FitResult
 from jaxmuscle.fits._search import search_together
@@ -29,7 +30,7 @@ def bootstrap(
     result: FitResult,
     *,
     replicates: int = 50,
-    key: Array | int = 0,
+    key: Key = 0,
     progress: bool | Callable[[str, float], None] = False,
 ) -> Bootstrap:
     """Whether the standard errors of a fit hold: data are made from the fitted task and fitted again.
@@ -66,7 +67,7 @@ def bootstrap(
              if e.stderr is not None} if len(fits) > 1 else {}  # fmt: skip
     laws = {SIMULATED if target.segments is not None else DRAWN for target in result.targets.values()}
     return Bootstrap(result.title, result.tasks, found, replicates, dict(sorted((failed | more).items())),
-                     "; ".join(sorted(laws, reverse=True)), key if isinstance(key, int) else None)  # fmt: skip
+                     "; ".join(sorted(laws, reverse=True)), number_of(key))  # fmt: skip
 
 
 def _read(fits: list[FitResult], name: str) -> tuple[np.ndarray, np.ndarray]:

@@ -10,9 +10,11 @@ from jaxtyping import Float
 
 from jaxmuscle import plot
 from jaxmuscle._common.environment import versions
+from jaxmuscle._common.keys import number_of
 from jaxmuscle._common.parts import of_only, only
 from jaxmuscle._common.tables import frame
 from jaxmuscle._common.text import folded, probability
+from jaxmuscle._common.types import Key
 from jaxmuscle.data._target import Target
 from jaxmuscle.fits._reopened import reopened
 from jaxmuscle.fits._result import FitResult
@@ -170,7 +172,7 @@ class Goodness(eqx.Module):
         return plot.goodness(self, ax)
 
 
-def goodness(result: FitResult, target: Target | None = None, *, replicates: int = 999, key: Array | int = 0) -> Goodness:
+def goodness(result: FitResult, target: Target | None = None, *, replicates: int = 999, key: Key = 0) -> Goodness:
     """Whether a fit is as good as the scatter of its target allows, by parametric bootstrap with refits.
 
     Three numbers, from the residuals `z_k = (ln(p_k / fitted_k) - bias_k - mean) / sd_k`: chi² per bin
@@ -215,7 +217,7 @@ def goodness(result: FitResult, target: Target | None = None, *, replicates: int
     observed = {f"{n}@{name}": np.array([x]) for name, part in parts.items() for n, x in part.observed.items()}
     reference = {f"{n}@{name}": x for name, part in parts.items() for n, x in part.reference.items()}
     together = p_values(observed, reference)["all"]
-    return Goodness(parts, together, int(np.sum(~kept)), key if isinstance(key, int) else None)
+    return Goodness(parts, together, int(np.sum(~kept)), number_of(key))
 
 
 def residuals_of(power: Rows, expected: Rows, target: Target, share: Rows) -> Rows:

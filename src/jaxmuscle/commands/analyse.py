@@ -5,9 +5,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from jaxmuscle._common.arguments import positive
+
 from .console import absent, csv_text, err, out, plain, record, reporting, save_figure, writable
-from .options import Force, Json, Output, Recordings, SpectrumName, Window
-from .recordings import perturbed, read_perturbed, read_trials, reads_perturbed
+from .options import READING, Force, Json, Output, Recordings, SpectrumName, Window
+from .recordings import perturbed, read_perturbed, read_trials, reads_perturbed, unused
 
 if TYPE_CHECKING:
     from jaxmuscle import PerturbedRecording, Trials
@@ -56,6 +58,8 @@ def analyse(
         jaxmuscle analyse perturbed.csv --force-column force_N --displacement displacement_mm
     """
     with reporting(as_json):
+        if mvc is not None:
+            positive("--mvc", mvc)
         if save_target is not None and save_target.suffix.lower() != ".toml":
             raise ValueError(f"--save-target {save_target}: a target is saved as TOML; give a name that ends in .toml")
         if save_target is not None:
@@ -67,6 +71,7 @@ def analyse(
             if len(paths) > 1:
                 raise ValueError(f"{len(paths)} files with force and displacement: give one at a time")
             return _write_perturbed(read_perturbed(paths, reading, window)[0], str(spectrum), output)
+        unused(reading, *READING, what="a perturbation experiment; name its columns with --force-column and --displacement")
         _write(read_trials(paths, reading, window), str(spectrum), mvc, output, save_target)
 
 

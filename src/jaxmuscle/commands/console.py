@@ -67,7 +67,8 @@ def reporting(as_json: bool = False) -> Iterator[None]:
     try:
         yield
     except (ValueError, OSError) as error:
-        err.print(f"[bold red]error:[/] {plain(_words(error))}", highlight=False)
+        said = _words(error).replace("\n", "\\n")  # of a file's name: a mistake is one line
+        err.print(f"[bold red]error:[/] {plain(said)}", highlight=False)
         raise typer.Exit(BAD_INPUT) from None
     except SimulationError as error:
         err.print(f"[bold red]failed:[/] {plain(error)}", highlight=False)
@@ -104,8 +105,9 @@ def _as_options(message: str) -> str:
 
 
 def plain(text: object) -> str:
-    """Text as it is: no markup in it, and no letters that do something to the terminal (they may come out of a file)."""
-    shown = "".join(letter if letter.isprintable() or letter in "\n\t" else ascii(letter)[1:-1] for letter in str(text))
+    """Text without markup, each control character and half character as its escape: a file may be called anything."""
+    whole = str(text).encode("utf-8", "backslashreplace").decode()
+    shown = "".join(sign if sign.isprintable() or sign == "\n" else sign.encode("unicode_escape").decode() for sign in whole)
     return shown.replace("[", r"\[")
 
 

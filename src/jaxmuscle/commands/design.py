@@ -41,7 +41,8 @@ def design(
         keep_compiled_programs()
         writable(output, "motor.csv", "design.json", force=force)
         found = jm.design_input(
-            _source(source), names_in(quantity) or (), rms=rms / 1e3, band=_band(band), seconds=seconds, rate=rate,
+            _source(source), names_in(quantity, "--quantity") or (), rms=rms / 1e3, band=_band(band), seconds=seconds,
+            rate=rate,
             peak=None if peak is None else peak / 1e3, speed=None if speed is None else speed / 1e3, spread=spread, key=seed,
         )  # fmt: skip
         found.save(output / "motor.csv")

@@ -62,7 +62,7 @@ def ensemble(
         Increments, typer.Option(help="Of the noise; weak ones are faster and for --reduce only.")
     ] = Increments.gaussian,
     generator: Annotated[Generator, typer.Option(help="Of random numbers; threefry is JAX's, slower.")] = Generator.hash,
-    chunk: Annotated[int | None, typer.Option(min=1, help="Seeds (times points) simulated at once.")] = None,
+    chunk: Annotated[int | None, typer.Option(min=1, max=2**32, help="Seeds (times points) simulated at once.")] = None,
     devices: Devices = None,
     coordinator: Annotated[str | None, typer.Option(metavar="HOST:PORT", help="Process 0 of several.")] = None,
     processes: Annotated[int | None, typer.Option(min=1, help="How many processes.")] = None,

@@ -41,7 +41,7 @@ from .options import (
     fixed_values,
     names_in,
 )
-from .recordings import read_recordings, reads_perturbed
+from .recordings import read_recordings, reads_perturbed, unused
 
 
 @reads_perturbed
@@ -138,7 +138,7 @@ def fit(
         keep_compiled_programs()
         fixed = fixed_values(fix)
         names = names_in(free)
-        read = {"quantity": quantity, "segments": segments, "dataset": dataset, "axis": axis or "linear"}
+        read = {"quantity": quantity, "segments": segments, "dataset": dataset, "axis": "linear" if axis is None else axis}
         recorded = [jm.data.is_recording(name) for name in target]
         if any(recorded) and not all(recorded):
             raise ValueError(f"{target[recorded.index(True)]} is a recording, {target[recorded.index(False)]} a spectrum: "
@@ -154,6 +154,8 @@ def fit(
         }
         if len(target) > 1 and not any(recorded):
             from .cohort import fit_together
+
+            unused(reading, "axis", window=window, what="recordings; these are spectra")
 
             if method != MethodName.linear or seeds is not None or quick:
                 raise ValueError("several targets are fitted together in linear response, without checks: leave out "
@@ -175,8 +177,10 @@ def fit(
             else:
                 aim = aimed(found.target(quantity=quantity), task)
         elif jm.data.is_frequency_response(target[0]):
+            unused(reading, "axis", "lever_arm", window=window, what="recordings; this is a frequency response")
             aim = aim_of(target[0], task, {"segments": segments, "lever_arm": reading["lever_arm"]})
         else:
+            unused(reading, "axis", window=window, what="recordings; this is a spectrum")
             aim = aim_of(target[0], task, read)
         writable(output, "fit.json", force=force)
         converged = _fit_one(*aim, output, options, quick=quick)

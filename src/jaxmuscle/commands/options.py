@@ -1,5 +1,6 @@
 """Options that several commands have."""
 
+import math
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any
@@ -47,7 +48,7 @@ class Observed(StrEnum):
 Output = Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for the results.")]
 Force = Annotated[bool, typer.Option("--force", help="Overwrite an earlier result.")]
 Json = Annotated[bool, typer.Option("--json", help="Print the result as one JSON object instead of text.")]
-Seed = Annotated[int, typer.Option(help="Seed of all random numbers.")]
+Seed = Annotated[int, typer.Option(min=0, max=2**32 - 1, help="Seed of all random numbers.")]
 Preset = Annotated[str, typer.Argument(help="Bundled preset (see `jaxmuscle presets`), preset file or fit.json.")]
 OtherTask = Annotated[TaskName | None, typer.Option(help="Put the same muscle into another task.")]
 Observe = Annotated[Observed | None, typer.Option(help="What is observed of the motion in prescribed-force.")]
@@ -59,7 +60,7 @@ Free = Annotated[
     str | None, typer.Option(metavar="NAMES", help="Parameters to fit instead of the usual ones, comma-separated.")
 ]
 Fix = Annotated[list[str] | None, typer.Option(metavar="NAME=VALUE", help="Set a parameter and keep it; repeatable.")]
-Segments = Annotated[int | None, typer.Option(min=1, help="How many Welch segments were averaged.")]
+Segments = Annotated[int | None, typer.Option(min=1, max=10**9, help="How many Welch segments were averaged.")]
 Quantity = Annotated[str | None, typer.Option(help="force, torque, displacement or acceleration.")]
 Window = Annotated[
     str | None, typer.Option(metavar="A:B", help="Part to analyse [s], or `all`; by default the steady part.")
@@ -108,9 +109,14 @@ SAME_NAME = (
 )  # arguments in messages that are options of the same name
 
 
-def names_in(free: str | None) -> list[str] | None:
-    """The names of --free, or None for the usual ones."""
-    return None if free is None else [name.strip() for name in free.split(",") if name.strip()]
+def names_in(given: str | None, option: str = "--free") -> list[str] | None:
+    """The names that an option lists, or None for the usual ones."""
+    if given is None:
+        return None
+    names = [name.strip() for name in given.split(",") if name.strip()]
+    if not names:
+        raise ValueError(f"{option} {given!r}: name at least one, several with commas between them")
+    return names
 
 
 def fixed_values(pairs: list[str] | None) -> dict[str, float]:
@@ -122,7 +128,7 @@ def fixed_values(pairs: list[str] | None) -> dict[str, float]:
             number = float(value)
         except ValueError:
             number = None
-        if not (name.strip() and equals) or number is None:
+        if not (name.strip() and equals) or number is None or not math.isfinite(number):
             raise ValueError(f"--fix {pair!r}: write NAME=VALUE with a number, --fix k_w=500000 say")
         if name.strip() in fixed:
             raise ValueError(f"--fix {pair!r}: {name.strip()} is fixed twice")

@@ -1,6 +1,5 @@
 """`jaxmuscle posterior`."""
 
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -38,9 +37,9 @@ def posterior(
     fix: Fix = None,
     segments: Segments = None,
     quantity: Quantity = None,
-    chains: Annotated[int, typer.Option(min=2, help="Chains, from dispersed starts.")] = 4,
-    draws: Annotated[int, typer.Option(min=100, help="Draws of each chain.")] = 1000,
-    warmup: Annotated[int, typer.Option(min=1, help="Steps of each chain before its draws.")] = 500,
+    chains: Annotated[int, typer.Option(min=2, max=10**6, help="Chains, from dispersed starts.")] = 4,
+    draws: Annotated[int, typer.Option(min=100, max=10**9, help="Draws of each chain.")] = 1000,
+    warmup: Annotated[int, typer.Option(min=1, max=10**9, help="Steps of each chain before its draws.")] = 500,
     seed: Seed = 0,
     output: Output = Path("out"),
     force: Force = False,
@@ -86,7 +85,7 @@ def posterior(
 def _fitted(target: str, read: dict[str, Any], asked: dict[str, Any], seed: int) -> "FitResult":
 
     path = Path(target)
-    if path.suffix == ".json" and path.is_file() and "task_table" in json.loads(path.read_text(encoding="utf-8")):
+    if path.suffix == ".json" and path.is_file() and b'"task_table"' in path.read_bytes():
         if any(v is not None for v in read.values()) or any(asked[n] is not None for n in ("task", "free", "fix")):
             raise ValueError(f"{target}: is a fit; its task, parameters and target stay as they are, so leave out --task, "
                              "--free, --fix, --segments and --quantity")  # fmt: skip

@@ -42,6 +42,15 @@ def reads_perturbed(command: Callable[..., None]) -> Callable[..., None]:
     return reads_recordings(command, READING | PERTURBED)
 
 
+def unused(reading: dict[str, Any], *used: str, window: str | None = None, what: str) -> None:
+    """Raise a `ValueError` for an option that is given and of no use here."""
+    given = [name for name, value in reading.items() if name not in used and value != (READING | PERTURBED)[name][1]]
+    if window is not None:
+        given.append("window")
+    if given:
+        raise ValueError(f"--{given[0].replace('_', '-')} belongs to {what}: leave it out")
+
+
 def perturbed(reading: dict[str, Any]) -> bool:
     """Whether the options name the two channels of a perturbation experiment."""
     return reading["force_column"] is not None or reading["displacement"] is not None

@@ -28,7 +28,7 @@ def speed(
     with reporting(as_json):
         os.environ["JAXMUSCLE_CACHE"] = "off"  # compile time is what it takes, not what loading takes
         use(precision, devices, cores(None, None))
-        model = task_of(preset, task) if preset else jm.Isometric() if task is None else jm.model.TASKS[task]()
+        model = task_of(preset, task) if preset is not None else jm.Isometric() if task is None else jm.model.TASKS[task]()
         found = jm.ensembles.measure(model, seeds, duration)
         record(found)
         for name, value in found.items():

@@ -52,7 +52,7 @@ def study(
             table,
             rung=int(rung) if rung is not None and rung.isdigit() else rung,
             noise=None if noise is None else str(noise),
-            quantities=names_in(quantities),
+            quantities=names_in(quantities, "--quantities"),
             alpha=alpha,
             correction=correction,
             key=seed,

@@ -6,11 +6,12 @@ from typing import Any, TypeVar
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
 
 from jaxmuscle._common.arrays import as_numbers
+from jaxmuscle._common.keys import number_of
 from jaxmuscle._common.progress import told
 from jaxmuscle._common.text import choices
+from jaxmuscle._common.types import Key
 from jaxmuscle.data._target import Target
 from jaxmuscle.fits._adequacy import Endpoint
 from jaxmuscle.model._noises import NOISES, with_noise
@@ -40,7 +41,7 @@ def compare_noise(
     priors: Mapping[str, float | None] | None = None,
     bounds: Mapping[str, tuple[float, float]] | None = None,
     groups: int = 10,
-    key: Array | int = 0,
+    key: Key = 0,
     progress: bool | Callable[[str, float], None] = False,
 ) -> Comparison:
     """Fit a spectrum with every colour of noise, with and without harmonic, and say which can be told apart.
@@ -88,7 +89,7 @@ def compare_noise(
     sought = any("harmonic_frequency" in problem.coordinates.names for problem in problems.values())
     needed = NEEDED + 2 * np.log(len(target.bins)) * sought
     tasks, fitted = ({model: values.pop(name) for model, values in found.items()} for name in ("task", "fitted"))
-    seed = key if isinstance(key, int) else None
+    seed = number_of(key)
     return Comparison(target, _rows(found), left_out, tasks, fitted, float(needed), groups, seed)
 
 
@@ -121,7 +122,7 @@ def _setups(
     fix: dict[str, float],
     priors: dict[str, float | None],
     bounds: dict[str, tuple[float, float]],
-    key: Array | int,
+    key: Key,
 ) -> dict[str, FitProblem]:
     """The fit of each noise; what concerns a parameter that only other noises have is left to them."""
     everywhere = {name for task in carried.values() for name in task.parameter_names}

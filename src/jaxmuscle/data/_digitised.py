@@ -5,12 +5,12 @@ ignores the stored values too: (x, y) = A (px, py) + c with A mapping the pixel 
 of the axis values, in log10 on a logarithmic axis.
 """
 
-import json
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
+from jaxmuscle._common.documents import parsed
 from jaxmuscle._common.errors import TargetError
 from jaxmuscle._common.text import choices
 
@@ -22,6 +22,7 @@ AXES: tuple[str, ...] = ("linear", "log-log")
 LABELS = ["X", "Y"]
 # Calibration lines that meet at a smaller angle [rad] do not span the figure.
 SMALLEST_ANGLE = 1e-3
+FURTHEST = 1e100  # of a pixel, and of a value on an axis
 EXPORT = "export the points as CSV instead (View Data, Download .CSV)"
 
 
@@ -41,10 +42,7 @@ def read_project(text: str, file: str, dataset: str | None) -> Points:
 
     **Raises:** `TargetError` naming file and dataset, point or axes.
     """
-    try:
-        project = json.loads(text)
-    except (ValueError, RecursionError) as error:
-        raise TargetError(f"{file}: is not valid JSON: {error}") from None
+    project = parsed(text, file, "JSON", TargetError)
     axes, datasets = _collections(project, file)
     names = [str(_get(entry, "name", str, file)) for entry in datasets]
     filled = [i for i, entry in enumerate(datasets) if _get(entry, "data", list, f"{file}, dataset {names[i]!r}")]
@@ -206,7 +204,7 @@ def _number(table: Any, key: str, where: str) -> float:
         number = float(value) if isinstance(value, str) or is_number(value) else np.nan
     except ValueError:
         number = np.nan
-    if not np.isfinite(number):
+    if not abs(number) < FURTHEST:
         raise TargetError(f"{where}: {key} {value!r} is not a number; write 0.001 or 1e-3, with a decimal point")
     return number
 

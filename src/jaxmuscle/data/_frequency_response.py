@@ -3,20 +3,36 @@
 import os
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import equinox as eqx
 import numpy as np
 from jaxtyping import Complex, Float
+from msgspec import Meta
 
 from jaxmuscle import plot
+from jaxmuscle._common.documents import Table, checked
 from jaxmuscle._common.files import write_text
 from jaxmuscle._common.text import folded
 from jaxmuscle.spectra._settings import require
 
 from ._target_fields import frozen
 
+Numbers = list[float]
 COLUMNS = ("frequency_hz", "gain_N/m", "phase_deg", "stderr_N/m", "coherence")
+
+
+class ResponseTable(Table, kw_only=True):
+    """A dynamic stiffness as a table: `stiffness` of a target."""
+
+    name: Annotated[str, Meta(description="How reports call it")]
+    source: Annotated[str, Meta(description="Where it comes from")]
+    notices: Annotated[list[str], Meta(description="What was done to it")]
+    frequency_hz: Annotated[Numbers, Meta(description="Frequencies [Hz], rising, above 0")]
+    real: Annotated[Numbers, Meta(description="Real part [N/m]")]
+    imaginary: Annotated[Numbers, Meta(description="Imaginary part [N/m]")]
+    stderr: Annotated[list[float | Literal["inf"]], Meta(description="Standard error of both [N/m], inf where of no use")]
+    coherence: Annotated[Numbers | None, Meta(description="Squared coherence, 0 to 1")] = None
 
 
 class FrequencyResponse(eqx.Module):
@@ -167,11 +183,19 @@ class FrequencyResponse(eqx.Module):
 
     @classmethod
     def from_table(cls, table: Mapping[str, Any]) -> "FrequencyResponse":
-        """The reverse of `to_table`, exactly."""
-        value = np.asarray(table["real"], float) + 1j * np.asarray(table["imaginary"], float)
-        stderr = [float(error) for error in table["stderr"]]
-        fields = {key: table[key] for key in ("name", "source", "notices")}
-        return cls(table["frequency_hz"], value, stderr, table.get("coherence"), **fields)
+        """The reverse of `to_table`, exactly. Raises `ValueError` for a key that is missing, unknown or of a wrong type."""
+        said = checked(dict(table), ResponseTable, "stiffness")
+        require(
+            len(said.real) == len(said.imaginary),
+            "imaginary",
+            len(said.imaginary),
+            f"give {len(said.real)} numbers, as in real",
+        )
+        value = np.asarray(said.real, float) + 1j * np.asarray(said.imaginary, float)
+        stderr = [float(error) for error in said.stderr]
+        return cls(
+            said.frequency_hz, value, stderr, said.coherence, name=said.name, source=said.source, notices=said.notices
+        )
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write a CSV that `jaxmuscle.load_frequency_response` reads; an existing file is replaced in one step.

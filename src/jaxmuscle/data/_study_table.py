@@ -1,12 +1,16 @@
 """The table of a study: which file is which trial of whom, in which group and condition, and how files are read."""
 
 import os
-import tomllib
 from collections import defaultdict
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
+from msgspec import Meta
+
+from jaxmuscle._common.arguments import is_real
+from jaxmuscle._common.documents import Table, checked, parsed
+from jaxmuscle._common.files import expanded
 from jaxmuscle._common.inputs import looked_at, read_text
 from jaxmuscle._common.text import choices
 from jaxmuscle.spectra._settings import NAMED, require
@@ -26,6 +30,53 @@ NUMBERS = ("rate", "max_gap", "skip_rows", "mvc", *EDGES)
 COLUMNS = (*LABELS, *FILES, *SPECTRA, *EDGES)
 READING = (*FILES, *SPECTRA, "window")
 OPTIONS = (*READING, "rung", "noise", "quantities", "alpha", "correction")
+
+
+def _told(text: str) -> Meta:
+    return Meta(description=text)
+
+
+Above0 = Annotated[float, Meta(gt=0)]
+
+
+class ReadingTable(Table, kw_only=True):
+    """How a recording is read: columns of a study's table, and options for all of them in a study.toml."""
+
+    column: Annotated[str | int | None, _told("Column or point of the force")] = None
+    rate: Annotated[Above0 | None, _told("Sampling rate [Hz]")] = None
+    units: Annotated[str | None, _told("Unit of the column")] = None
+    axis: Annotated[str | None, _told("Of a point: x, y, z or principal")] = None
+    reference: Annotated[str | int | None, _told("Column or point that is subtracted")] = None
+    time: Annotated[str | int | None, _told("Column of the time")] = None
+    max_gap: Annotated[Annotated[float, Meta(ge=0)] | None, _told("Longest gap that is closed [s]")] = None
+    skip_rows: Annotated[Annotated[int, Meta(ge=0)] | None, _told("Lines to leave out at the top")] = None
+    spectrum: Annotated[str | None, _told("standard, slow, multitaper or pwelch; the same for all")] = None
+    mvc: Annotated[Above0 | None, _told("Maximal voluntary contraction, in the recording's unit")] = None
+
+
+class RecordingTable(ReadingTable, kw_only=True):
+    """A recording: a row of a study's table, or an entry of `[[recordings]]`."""
+
+    file: Annotated[str, _told("Path, from the folder of the table")]
+    person: Annotated[str | int, _told("Who")]
+    group: Annotated[str | int | None, _told("Of the person: all recordings have one, or none")] = None
+    condition: Annotated[str | int | None, _told("Of the recording: all have one, or none")] = None
+    trial: Annotated[str | int | None, _told("Which of several in a condition")] = None
+    window_start: Annotated[float | None, _told("Part to analyse, from [s]")] = None
+    window_stop: Annotated[float | None, _told("To [s]")] = None
+
+
+class StudyFile(ReadingTable, kw_only=True):
+    """A study.toml: `table` or `recordings`, and options for all recordings."""
+
+    table: Annotated[str | None, _told("Path of a study.csv")] = None
+    recordings: Annotated[list[RecordingTable] | None, _told("The recordings themselves")] = None
+    window: Annotated[tuple[float, float] | Literal["all"] | None, _told("Part to analyse [s], or all")] = None
+    rung: Annotated[int | str | None, _told("Model of all people: 0 to 3, or auto")] = None
+    noise: Annotated[str | None, _told("Colour of the noise")] = None
+    quantities: Annotated[list[str] | None, _told("What is compared")] = None
+    alpha: Annotated[float | None, _told("Level of the tests, between 0 and 1")] = None
+    correction: Annotated[str | None, _told("holm, fdr or none")] = None
 
 
 class Row(NamedTuple):
@@ -67,23 +118,16 @@ def read_study(study: "str | os.PathLike[str] | Iterable[Mapping[str, Any]]") ->
     if not isinstance(study, str | os.PathLike):
         places = ((f"row {number}", dict(row)) for number, row in enumerate(study, 1))
         return StudyTable(_checked(places, Path(), "the table"), {}, "a table in memory")
-    path = Path(study).expanduser()
+    path = expanded(study)
     if path.suffix.lower() != ".toml":
         return StudyTable(_checked(_lines(path), path.parent, str(path)), {}, path.name)
-    text = read_text(path, instead=TABLES)
-    try:
-        stated = tomllib.loads(text)
-    except (ValueError, RecursionError) as error:
-        raise ValueError(f"{path}: is not TOML: {error}") from None
-    known = ("table", "recordings", *OPTIONS)
-    for name in stated:
-        if name not in known:
-            raise ValueError(f"{path}: unknown option {name!r}; {choices(name, known)}")
+    stated = parsed(read_text(path, instead=TABLES), str(path), "TOML")
+    checked(stated, StudyFile, str(path))
     options = {name: value for name, value in stated.items() if name in OPTIONS}
     if ("table" in stated) == ("recordings" in stated):
         raise ValueError(f'{path}: give either table = "study.csv" or [[recordings]], each with file and person')
     if "table" in stated:
-        table = path.parent / Path(stated["table"]).expanduser()
+        table = path.parent / expanded(stated["table"])
         return StudyTable(_checked(_lines(table), table.parent, str(table)), options, path.name)
     places = ((f"{path}: recording {number}", dict(row)) for number, row in enumerate(stated["recordings"], 1))
     return StudyTable(_checked(places, path.parent, str(path)), options, path.name)
@@ -154,6 +198,8 @@ def _lines(path: Path) -> list[tuple[str, dict[str, Any]]]:
         for name in set(NUMBERS) & set(row):
             try:
                 row[name] = int(row[name]) if name == "skip_rows" else number_in(row[name], delimiter)
+                if not is_real(row[name]):
+                    raise ValueError(f"{row[name]} is not finite")
             except ValueError:
                 kind = "whole number" if name == "skip_rows" else "number"
                 raise ValueError(f"{place}: {name} = {row[name]!r} is not a {kind}") from None
@@ -195,7 +241,7 @@ def _row(place: str, given: dict[str, Any], folder: Path) -> Row:
     window = [given.get(name) for name in EDGES]
     if window.count(None) == 1:
         raise ValueError(f"{place}: give window_start and window_stop, or neither")
-    file = folder / Path(str(given["file"])).expanduser()
+    file = folder / expanded(str(given["file"]))
     try:
         looked_at(file, instead="a recording")
     except ValueError as error:

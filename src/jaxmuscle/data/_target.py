@@ -20,8 +20,8 @@ from jaxmuscle.spectra._settings import SpectrumSettings
 
 from . import _target_fields as check
 from ._frequency_response import FrequencyResponse
-from ._target_fields import Provenance, Quantity
-from ._target_files import KEYS, on_grid, read_target
+from ._target_fields import Provenance, Quantity, numbers_of
+from ._target_files import KEYS, REQUIRED, fields_of, on_grid, read_target, settings_of
 
 # A sum this near to 1 is rounding of the printed numbers, not another scale.
 SUM_TOLERANCE = 1e-3
@@ -115,6 +115,8 @@ class Target(eqx.Module):
         self.reason = check.metadata("reason", reason)
         self.settings = settings
         self.stiffness = FrequencyResponse.from_table(stiffness) if isinstance(stiffness, Mapping) else stiffness
+        if self.stiffness is not None and not isinstance(self.stiffness, FrequencyResponse):
+            raise TargetError(f"stiffness: this is a {type(stiffness).__name__}; give a FrequencyResponse, or its table")
         if proportional_power is None and stiffness is not None:
             proportional_power, bins = np.zeros(0), np.zeros(0, int)
         selected = np.arange(settings.first_bin, settings.last_bin + 1)
@@ -191,23 +193,29 @@ class Target(eqx.Module):
         centre = self.proportional_power * np.exp(-statistics.bias)
         return centre * np.exp(-statistics.sd), centre * np.exp(statistics.sd)
 
-    def to_table(self) -> dict[str, Any]:
-        """The target as the table that a TOML file holds."""
+    def to_table(self, *, whole: bool = False) -> dict[str, Any]:
+        """The target as the table that a TOML file holds; `whole`, with None for what it does not state, as in fit.json."""
         sigma = None if self.sigma is None else self.sigma.tolist()
-        arrays = {"frequency_hz": self.frequency.tolist(), "settings": self.settings.to_dict()}
+        arrays = {"frequency_hz": self.frequency.tolist(), "settings": self.settings.to_dict(whole=whole)}
         arrays |= {"proportional_power": self.proportional_power.tolist(), "sigma": sigma}
         arrays["trial_power"] = None if self.trial_power is None else self.trial_power.tolist()
         arrays["dispersion"] = self.dispersion if self.trial_power is None else None
         arrays["stiffness"] = None if self.stiffness is None else self.stiffness.to_table()
         table = {key: arrays[key] if key in arrays else getattr(self, key) for key in KEYS}
-        return {key: value for key, value in table.items() if value not in (None, ())}
+        return table if whole else {key: value for key, value in table.items() if value not in (None, ())}
 
     @classmethod
-    def from_table(cls, table: Mapping[str, Any]) -> "Target":
-        """The reverse of `to_table`; its frequencies lie on the bins."""
-        fields = dict(table)
-        settings = SpectrumSettings.from_dict(fields.pop("settings"))
-        bins = np.rint(np.asarray(fields.pop("frequency_hz")) / settings.resolution).astype(int)
+    def from_table(cls, table: Mapping[str, Any], *, whole: bool = False) -> "Target":
+        """The reverse of `to_table`; its frequencies lie on the bins. Raises `TargetError`."""
+        fields = fields_of(table, "target_table", needed=KEYS if whole else (*REQUIRED, "settings"))
+        fields = {key: value for key, value in fields.items() if value is not None}
+        settings = settings_of(fields.pop("settings"), "target_table.settings", SpectrumSettings.names(whole=whole))
+        given = fields.pop("frequency_hz")
+        frequency = (
+            numbers_of("frequency_hz", given, "target_table") if given or not fields.get("stiffness") else np.zeros(0)
+        )
+        with np.errstate(over="ignore"):
+            bins = np.rint(np.clip(frequency / settings.resolution, -1e9, 1e9)).astype(int)
         return cls(**fields, bins=bins, settings=settings)
 
     def with_stiffness(self, stiffness: FrequencyResponse) -> "Target":

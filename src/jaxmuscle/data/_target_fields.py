@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxmuscle._common.errors import TargetError
-from jaxmuscle._common.text import choices
+from jaxmuscle._common.text import choices, listed
 from jaxmuscle.spectra._settings import SpectrumSettings
 
 Quantity = Literal["force", "torque", "displacement", "acceleration"]
@@ -21,6 +21,7 @@ GRID_TOLERANCE = 0.02
 PIXEL_TOLERANCE = 0.1
 # or, as a fraction of the frequency, one pixel where a decade is 230 pixels wide.
 PIXEL_OF_LOG = 0.01
+MOST = 10**9  # segments of a trial
 
 
 class Columns(NamedTuple):
@@ -69,6 +70,16 @@ def is_number(value: Any) -> bool:
     return True
 
 
+def numbers_of(key: str, values: Any, file: str) -> Float[np.ndarray, " rows"]:
+    """A list of numbers as an array. Raises `TargetError` naming the entry that is none."""
+    if not isinstance(values, list | tuple | np.ndarray) or not len(values):
+        raise TargetError(f"{file}: {key} must be a list of numbers")
+    for i, value in enumerate(values, 1):
+        if not is_number(value):
+            raise TargetError(f"{file}, entry {i}: {key} {value!r} is not a number")
+    return np.array([float(value) for value in values])
+
+
 def metadata(name: str, value: Any) -> Any:
     """The value of the field `name` in its stored form: lists as tuples, `None` where it may be missing."""
     return None if value is None and name in OPTIONAL else CHECKS[name](name, value)
@@ -92,7 +103,7 @@ def _one_of(literal: Any) -> Callable[[str, Any], str]:
 
 
 def _count(name: str, value: Any) -> int:
-    if isinstance(value, bool) or not isinstance(value, Integral) or value < 1:
+    if isinstance(value, bool) or not isinstance(value, Integral) or not 1 <= int(value) <= MOST:
         raise TargetError(f"{name} {value!r}: give whole numbers of at least 1")
     return int(value)
 
@@ -142,7 +153,7 @@ def bin_numbers(values: Any, settings: SpectrumSettings) -> Int[np.ndarray, " bi
     bins, (first, last) = np.array(values), (settings.first_bin, settings.last_bin)
     whole = bins.ndim == 1 and np.issubdtype(bins.dtype, np.integer)
     if not whole or np.any(np.diff(bins) < 1) or np.any(bins < first) or np.any(bins > last):
-        raise TargetError(f"bins {values!r}: give increasing whole numbers from {first} to {last}")
+        raise TargetError(f"bins {listed(bins.ravel())}: give increasing whole numbers from {first} to {last}")
     return bins.astype(int)
 
 

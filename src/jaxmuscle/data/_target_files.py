@@ -2,14 +2,15 @@
 
 import contextlib
 import os
-import tomllib
+from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple, get_args
 
 import numpy as np
-from jaxtyping import Float
+from msgspec import Meta
 
 from jaxmuscle._common.bundled import bundled_text, list_targets
+from jaxmuscle._common.documents import Table, checked, parsed
 from jaxmuscle._common.errors import TargetError
 from jaxmuscle._common.files import text_of
 from jaxmuscle._common.inputs import read_bytes
@@ -25,15 +26,19 @@ from ._target_fields import (
     PIXEL_OF_LOG,
     PIXEL_TOLERANCE,
     Columns,
+    Provenance,
+    Quantity,
     check_columns,
-    is_number,
     metadata,
+    numbers_of,
 )
 from ._text_tables import TEXT
 
 REQUIRED = ("name", "quantity", "provenance", "source", "frequency_hz", "proportional_power")
 METADATA = ("segments", "coefficient_of_variation", "mvc_fraction", "mean", "unit", "dispersion", "reason", "notices")
 KEYS = (*REQUIRED, "sigma", *METADATA, "trial_power", "stiffness", "settings")
+QUANTITIES, PROVENANCES = ("one of " + ", ".join(get_args(kind)) for kind in (Quantity, Provenance))
+POSITIVES = "list of numbers above 0"
 
 
 class Raw(NamedTuple):
@@ -130,45 +135,91 @@ def _digitised(points: Points, file: str, axis: str, source: str) -> Raw:
 
 def _parse_toml(text: str, file: str, axis: str) -> Raw:
     _linear(axis, file)
-    try:
-        fields: dict[str, Any] = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise TargetError(f"{file}: is not valid TOML: {error}") from None
-    for key in fields:
-        if key not in KEYS:
-            raise TargetError(f"{file}: unknown key {key!r}; {choices(key, KEYS)}")
-    for key in REQUIRED:
-        if key not in fields:
-            raise TargetError(f"{file}: the key {key!r} is missing; needed are {', '.join(REQUIRED)}")
-    try:
-        fields |= {key: metadata(key, value) for key, value in fields.items() if key in CHECKS}
-    except TargetError as error:
-        raise TargetError(f"{file}: {error}") from None
+    fields = fields_of(parsed(text, file, "TOML", TargetError), file)
     keys = [key for key in ("frequency_hz", "proportional_power", "sigma") if key in fields]
-    lists = [_numbers(file, key, fields.pop(key)) for key in keys]
+    lists = [numbers_of(key, fields.pop(key), file) for key in keys]
     for key, values in zip(keys, lists, strict=True):
         if values.size != lists[0].size:
             raise TargetError(f"{file}: {key} has {values.size} entries, frequency_hz {lists[0].size}; make them equal")
     places = tuple(f"entry {i}" for i in range(1, lists[0].size + 1))
     columns = Columns(lists[0], lists[1], lists[2] if len(lists) > 2 else None, places)
     check_columns(columns, file, ordered=True)
-    settings = fields.get("settings", {})
-    if not isinstance(settings, dict):
-        raise TargetError(f"{file}: settings must be a table: a line [settings], then one setting per line")
-    try:
-        fields["settings"] = SpectrumSettings.from_dict(settings)
-    except ValueError as error:
-        raise TargetError(f"{file}: [settings]: {error}") from None
+    fields["settings"] = settings_of(fields.get("settings", {}), f"{file}: [settings]")
     return Raw(file, fields, columns, [])
 
 
-def _numbers(file: str, key: str, values: Any) -> Float[np.ndarray, " rows"]:
-    if not isinstance(values, list) or not values:
-        raise TargetError(f"{file}: {key} must be a list of numbers")
-    for i, value in enumerate(values, 1):
-        if not is_number(value):
-            raise TargetError(f"{file}, entry {i}: {key} {value!r} is not a number")
-    return np.array([float(value) for value in values])
+class TargetFile(Table, kw_only=True):
+    """A target: in a .toml, and as `target_table` in a fit.json."""
+
+    format: Annotated[Any, Meta(description="Version of the format, 1", extra={"type": "1"})] = 1
+    name: Annotated[Any, Meta(description="How reports call it", extra={"type": "text"})]
+    quantity: Annotated[Any, Meta(description="What was recorded", extra={"type": QUANTITIES})]
+    provenance: Annotated[Any, Meta(description="From where the numbers are", extra={"type": PROVENANCES})]
+    source: Annotated[Any, Meta(description="Article, figure, recording", extra={"type": "text"})]
+    frequency_hz: Annotated[Any, Meta(description="Frequencies [Hz], rising", extra={"type": "list of numbers, 0 or more"})]
+    proportional_power: Annotated[
+        Any, Meta(description="Power at each, of any scale; empty with a stiffness alone", extra={"type": POSITIVES})
+    ]
+    sigma: Annotated[Any, Meta(description="Standard deviation of each power", extra={"type": POSITIVES})] = None
+    segments: Annotated[
+        Any, Meta(description="Welch segments that were averaged, of each trial", extra={"type": "whole numbers from 1"})
+    ] = None
+    coefficient_of_variation: Annotated[
+        Any, Meta(description="Standard deviation over mean, of each trial", extra={"type": "numbers above 0, at most 1"})
+    ] = None
+    mvc_fraction: Annotated[
+        Any, Meta(description="Mean level as a share of the maximum", extra={"type": "number above 0, at most 1"})
+    ] = None
+    mean: Annotated[Any, Meta(description="Mean force or torque of each trial, in `unit`", extra={"type": POSITIVES})] = None
+    unit: Annotated[Any, Meta(description="Unit of `mean`", extra={"type": "text"})] = None
+    dispersion: Annotated[
+        Any, Meta(description="By how much trials differ beyond their segments, and its error", extra={"type": POSITIVES})
+    ] = None
+    reason: Annotated[
+        Any, Meta(description="What was assumed; needed where it is reconstructed", extra={"type": "text"})
+    ] = None
+    notices: Annotated[Any, Meta(description="What was done to the numbers", extra={"type": "list of texts"})] = None
+    trial_power: Annotated[
+        Any, Meta(description="Spectrum of each trial [unit²/Hz]", extra={"type": "a list of numbers for each trial"})
+    ] = None
+    stiffness: Annotated[
+        Any, Meta(description="Dynamic stiffness measured beside it", extra={"type": "table, see below"})
+    ] = None
+    settings: Annotated[
+        Any,
+        Meta(
+            description="How the spectrum was estimated; each has a default",
+            extra={"type": "table, see below"},
+        ),
+    ] = None
+
+
+def fields_of(table: Mapping[str, Any], file: str, needed: Iterable[str] = ()) -> dict[str, Any]:
+    """The keys of a target's table, those that are checked alone in their stored form; what is not stated may be None.
+
+    **Raises:** `TargetError` for a key that is unknown, missing or wrong.
+    """
+    checked(dict(table), TargetFile, file, TargetError)
+    for key in needed:
+        if key not in table:
+            raise TargetError(f"{file}: the key {key!r} is missing; needed are {', '.join(needed)}")
+    if type(table.get("format", 1)) is not int or table.get("format", 1) != 1:
+        raise TargetError(f"{file}: format = {table['format']!r}: this version of jaxmuscle reads format 1")
+    try:
+        fields = {key: metadata(key, value) if key in CHECKS else value for key, value in table.items() if key != "format"}
+    except TargetError as error:
+        raise TargetError(f"{file}: {error}") from None
+    return fields
+
+
+def settings_of(table: Any, where: str, needed: Iterable[str] = ()) -> SpectrumSettings:
+    """Spectrum settings of a target's table. Raises `TargetError`."""
+    if not isinstance(table, dict):
+        raise TargetError(f"{where}: settings must be a table: a line [settings], then one setting per line")
+    try:
+        return SpectrumSettings.from_dict(table, needed=needed)
+    except ValueError as error:
+        raise TargetError(f"{where}: {error}") from None
 
 
 class OnBins(NamedTuple):
@@ -186,7 +237,8 @@ def on_grid(raw: Raw) -> tuple[OnBins, list[str]]:
     Raises `TargetError` if fewer than 2 bins are covered, and for spectra of trials that are off the bins.
     """
     columns, settings, trials = raw.columns, raw.fields["settings"], raw.fields.get("trial_power")
-    position = np.minimum(columns.frequency / settings.resolution, 1e9)
+    with np.errstate(over="ignore"):
+        position = np.minimum(columns.frequency / settings.resolution, 1e9)
     tolerance = np.full(position.size, PIXEL_TOLERANCE if raw.digitised else GRID_TOLERANCE)
     if raw.log_frequency:
         tolerance = np.maximum(tolerance, PIXEL_OF_LOG * position)

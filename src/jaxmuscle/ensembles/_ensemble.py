@@ -7,13 +7,15 @@ from typing import TYPE_CHECKING, Any, Literal, overload
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Int, PRNGKeyArray
 
+from jaxmuscle._common.arguments import count, is_real
 from jaxmuscle._common.arrays import all_concrete, as_arrays
+from jaxmuscle._common.keys import key_of, seeds_of
 from jaxmuscle._common.progress import told
 from jaxmuscle._common.text import listed
+from jaxmuscle._common.types import Key, Seeds
 from jaxmuscle.model._stream import Draws
-from jaxmuscle.model._tasks import AbstractTask
+from jaxmuscle.model._tasks import AbstractTask, require_task
 from jaxmuscle.response._linearised import LinearTask
 from jaxmuscle.simulation._simulate import DT, DURATION, require_finite, trajectories
 from jaxmuscle.simulation._trajectory import Trajectory
@@ -33,39 +35,38 @@ if TYPE_CHECKING:
 
 FURTHEST = 0.01  # quantiles that weak increments are good for
 
-Seeds = int | Int[np.ndarray, " seeds"]
 Progress = bool | Callable[[str, float], None] | Watch
 
 
 @overload
-def ensemble(task: AbstractTask, key: PRNGKeyArray, *, seeds: Seeds, reduce: Literal[False] = ..., store: None = ...,
+def ensemble(task: AbstractTask, key: Key, *, seeds: Seeds, reduce: Literal[False] = ..., store: None = ...,
              **given: Any) -> Trajectory: ...  # fmt: skip
 
 
 @overload
-def ensemble(task: Sweep | Sequence[AbstractTask], key: PRNGKeyArray, *, seeds: Seeds, reduce: Literal[False] = ...,
+def ensemble(task: Sweep | Sequence[AbstractTask], key: Key, *, seeds: Seeds, reduce: Literal[False] = ...,
              store: None = ..., **given: Any) -> Population: ...  # fmt: skip
 
 
 @overload
-def ensemble(task: AbstractTask | Sweep | Sequence[AbstractTask], key: PRNGKeyArray, *, seeds: Seeds, store: str | Path,
+def ensemble(task: AbstractTask | Sweep | Sequence[AbstractTask], key: Key, *, seeds: Seeds, store: str | Path,
              part: tuple[int, int], reduce: bool | tuple[float, ...] = ..., **given: Any) -> PartReport: ...  # fmt: skip
 
 
 @overload
-def ensemble(task: AbstractTask | Sweep | Sequence[AbstractTask], key: PRNGKeyArray, *, seeds: Seeds,
+def ensemble(task: AbstractTask | Sweep | Sequence[AbstractTask], key: Key, *, seeds: Seeds,
              reduce: Literal[True] | tuple[float, ...], store: str | Path | None = ..., part: None = ...,
              **given: Any) -> EnsembleSummary: ...  # fmt: skip
 
 
 @overload
-def ensemble(task: AbstractTask | Sweep | Sequence[AbstractTask], key: PRNGKeyArray, *, seeds: Seeds, store: str | Path,
+def ensemble(task: AbstractTask | Sweep | Sequence[AbstractTask], key: Key, *, seeds: Seeds, store: str | Path,
              reduce: Literal[False] = ..., part: None = ..., **given: Any) -> "xarray.Dataset": ...  # fmt: skip
 
 
 def ensemble(  # pyright: ignore[reportInconsistentOverload]
     task: AbstractTask | Sweep | Sequence[AbstractTask],
-    key: PRNGKeyArray,
+    key: Key,
     *,
     seeds: Seeds,
     duration: float = DURATION,
@@ -121,12 +122,16 @@ def ensemble(  # pyright: ignore[reportInconsistentOverload]
     settings; `OSError` for one that cannot be written; `ProcessLostError` if another process died.
     """
     if not isinstance(task, AbstractTask | Sweep):
+        for each in task if isinstance(task, list | tuple) else [task]:
+            require_task(each, "ensemble(task, key, seeds=...)")
         task = Sweep.of(task)
-    numbers: Any = range(seeds) if isinstance(seeds, int) else np.asarray(seeds)
-    if len(numbers) == 0:
-        raise ValueError(f"seeds = {seeds}: an ensemble needs at least one seed")
-    if chunk is not None and chunk < 1:
-        raise ValueError(f"chunk = {chunk} must be at least 1")
+    if store is not None and not isinstance(store, str | Path):
+        raise ValueError(f"store = {store!r}: give a path or a URL")
+    if control is not None and not isinstance(control, bool):
+        raise ValueError(f"control = {control!r}: give True, False, or None to let it be decided")
+    key, numbers = key_of(key), seeds_of(seeds)
+    if chunk is not None:
+        count("chunk", chunk, 1)
     if resume and overwrite:
         raise ValueError("resume continues a store, overwrite replaces it: give one of the two")
     if (resume or states) and store is None:
@@ -166,10 +171,10 @@ def _levels(reduce: bool | tuple[float, ...]) -> tuple[float, ...] | None:
     """Levels of the quantiles, None if nothing is reduced."""
     if reduce is False:
         return None
-    levels = LEVELS if reduce is True else tuple(float(level) for level in reduce)
-    if not all(0 < level < 1 for level in levels):
+    levels = LEVELS if reduce is True else reduce
+    if not isinstance(levels, tuple | list) or not levels or not all(is_real(level) and 0 < level < 1 for level in levels):
         raise ValueError(f"reduce = {reduce}: levels of quantiles lie between 0 and 1")
-    return tuple(sorted(levels))
+    return tuple(sorted(map(float, levels)))
 
 
 def _check_weak(levels: tuple[float, ...] | None) -> None:

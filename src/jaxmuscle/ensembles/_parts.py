@@ -43,6 +43,8 @@ class Part(NamedTuple):
     @staticmethod
     def checked(part: tuple[int, int], *, store: bool, overwrite: bool) -> "Part":
         """**Raises:** `ValueError` for numbers out of range, and for what does not go with a part."""
+        if not isinstance(part, tuple | list) or len(part) != 2 or not all(type(n) is int for n in part):
+            raise ValueError(f"part = {part!r}: give the number of the part and their count, as (1, 4)")
         number, count = part
         if not 1 <= number <= count:
             raise ValueError(f"part = {number}/{count}: parts are numbered from 1 to their count, as 1/4 to 4/4")

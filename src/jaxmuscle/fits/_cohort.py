@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING, Any
 import equinox as eqx
 import jax
 import numpy as np
-from jaxtyping import PRNGKeyArray
 
 from jaxmuscle import plot
 from jaxmuscle._common.environment import versions
 from jaxmuscle._common.progress import told
 from jaxmuscle._common.tables import frame
+from jaxmuscle._common.types import Key
 from jaxmuscle.data._target import Target
 from jaxmuscle.model._noise import AbstractNoise
 from jaxmuscle.model._noises import with_noise
@@ -154,7 +154,7 @@ def fit_cohort(
     priors: Mapping[str, float | None] | None = None,
     coefficient_of_variation: bool = True,
     max_steps: int = 40,
-    key: PRNGKeyArray | int = 0,
+    key: Key = 0,
     rung: int = 0,
     progress: bool | Callable[[str, float], None] = False,
 ) -> CohortResult:

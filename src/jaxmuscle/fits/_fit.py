@@ -4,15 +4,15 @@ from collections.abc import Callable, Iterable, Mapping
 from typing import Any, Literal
 
 import jax
-from jaxtyping import PRNGKeyArray
 
 from jaxmuscle._common.progress import told
+from jaxmuscle._common.types import Key
 from jaxmuscle.data._as_target import as_target
 from jaxmuscle.data._target import Target
 from jaxmuscle.model._noise import AbstractNoise
 from jaxmuscle.model._noises import with_noise
 from jaxmuscle.model._rungs import QUIET, RUNGS, is_base
-from jaxmuscle.model._tasks import AbstractTask
+from jaxmuscle.model._tasks import AbstractTask, require_task
 from jaxmuscle.model._white_noise import BandLimitedNoise
 from jaxmuscle.objective._arguments import DT, FitOptions, at_mean, planned
 
@@ -33,7 +33,7 @@ def fit(
     residual: str = "log",
     starts: int | None = None,
     seeds: int | None = None,
-    key: PRNGKeyArray | int = 0,
+    key: Key = 0,
     bounds: Mapping[str, tuple[float, float]] | None = None,
     priors: Mapping[str, float | None] | None = None,
     coefficient_of_variation: bool = True,
@@ -77,9 +77,7 @@ def fit(
     **Raises:** `ValueError` for bad arguments (unknown names with the nearest known, too few bins, values outside
     bounds); `FitInterrupted` on Ctrl-C, with what was reached.
     """
-    if not isinstance(task, AbstractTask):
-        raise ValueError(f"task: this is a {type(task).__name__}; give a task first, as jaxmuscle.Isometric(), then the "
-                         "target: fit(task, target)")  # fmt: skip
+    require_task(task, "fit(task, target)")
     recordings = recordings_of(target, task)
     aim = recordings[0].name if recordings else (target := as_target(target)).name
     with told(progress, f"fitting {aim}") as tell, jax.enable_x64(True):

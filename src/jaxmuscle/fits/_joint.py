@@ -5,10 +5,10 @@ from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 import jax
-from jaxtyping import PRNGKeyArray
 
 from jaxmuscle._common.progress import told
 from jaxmuscle._common.text import choices
+from jaxmuscle._common.types import Key
 from jaxmuscle.data._target import Target
 from jaxmuscle.model._noise import AbstractNoise
 from jaxmuscle.model._noises import with_noise
@@ -48,7 +48,7 @@ def fit_joint(
     starts: int = 32,
     seeds: int = 32,
     check_seeds: int = 0,
-    key: PRNGKeyArray | int = 0,
+    key: Key = 0,
     residual: str = "log",
     bounds: Mapping[str, tuple[float, float]] | None = None,
     priors: Mapping[str, float | None] | None = None,

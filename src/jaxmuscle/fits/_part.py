@@ -13,6 +13,8 @@ from jaxmuscle.data._target import Target
 from jaxmuscle.model._task_tables import task_from_table, task_to_table
 from jaxmuscle.model._tasks import TASKS, AbstractTask
 
+from ._fit_file import EstimateTable, PartTable, check_lengths
+
 if TYPE_CHECKING:
     import pandas
 
@@ -163,10 +165,10 @@ def estimates_to_table(table: dict[str, Estimate]) -> dict[str, Any]:
             for n, p in table.items()}  # fmt: skip
 
 
-def read_estimates(table: dict[str, Any]) -> dict[str, Estimate]:
+def read_estimates(table: dict[str, EstimateTable]) -> dict[str, Estimate]:
     """The reverse of `estimates_to_table`."""
-    return {n: Estimate(np.nan if p["value"] is None else p["value"], p["unit"], p["stderr"], p["free"], p["identifiable"],
-                        None if p["interval"] is None else tuple(p["interval"])) for n, p in table.items()}  # fmt: skip
+    return {n: Estimate(np.nan if p.value is None else p.value, p.unit, p.stderr, p.free, p.identifiable, p.interval)
+            for n, p in table.items()}  # fmt: skip
 
 
 def part_to_table(part: FittedPart) -> dict[str, Any]:
@@ -190,23 +192,25 @@ def part_to_table(part: FittedPart) -> dict[str, Any]:
         "stiffness": None
         if part.stiffness is None
         else [np.real(part.stiffness).tolist(), np.imag(part.stiffness).tolist()],
-        "target_table": part.target.to_table(),
+        "target_table": part.target.to_table(whole=True),
         "task_table": task_to_table(part.task),
     }
 
 
-def read_part(table: dict[str, Any]) -> FittedPart:
-    """The reverse of `part_to_table`."""
-    spectrum, stretch = table["spectrum"], table["stretch"]
+def read_part(table: PartTable, *, whole: bool) -> FittedPart:
+    """The reverse of `part_to_table`; without `whole` task and target may leave out what they do not have."""
+    spectrum, stretch, stiffness = table.spectrum, table.stretch, table.stiffness
+    target = Target.from_table(table.target_table, whole=whole)
+    check_lengths(table, target)
     return FittedPart(
-        target=Target.from_table(table["target_table"]),
-        task=task_from_table(table["task_table"]),
-        chi2_per_bin=table["chi2_per_bin"],
-        rms_log_error=table["rms_log_error"],
-        **{field: from_nulls(spectrum[field]) for field in SPECTRUM},
-        components={name: np.asarray(from_nulls(share)) for name, share in spectrum["components"].items()},
-        stretch=(from_nulls(stretch["time"]), from_nulls(stretch["output"])),
-        check=table["check"],
-        further=table["further"],
-        stiffness=None if (found := table.get("stiffness")) is None else np.array(found[0]) + 1j * np.array(found[1]),
+        target=target,
+        task=task_from_table(table.task_table, whole=whole),
+        chi2_per_bin=table.chi2_per_bin,
+        rms_log_error=table.rms_log_error,
+        **{field: from_nulls(getattr(spectrum, field)) for field in SPECTRUM},
+        components={name: np.asarray(from_nulls(share)) for name, share in spectrum.components.items()},
+        stretch=(from_nulls(stretch.time), from_nulls(stretch.output)),
+        check=table.check,
+        further=table.further,
+        stiffness=None if stiffness is None else np.array(stiffness[0]) + 1j * np.array(stiffness[1]),
     )

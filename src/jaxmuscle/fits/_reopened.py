@@ -4,12 +4,12 @@ import dataclasses
 from collections.abc import Iterable, Mapping
 
 import numpy as np
-from jax import Array
 
+from jaxmuscle._common.types import Key
 from jaxmuscle.data._target import Target
 from jaxmuscle.model._parameters import PARAMETERS
 from jaxmuscle.model._tasks import AbstractTask
-from jaxmuscle.objective._arguments import DT, FitOptions, base_of, planned, target_of
+from jaxmuscle.objective._arguments import FitOptions, base_of, planned, target_of
 from jaxmuscle.objective._problem import FitProblem
 from jaxmuscle.response._linearised import has_response
 from jaxmuscle.response._second_order import warn_beyond
@@ -25,7 +25,7 @@ def reopened(
     free: Iterable[str] | None = None,
     bounds: Mapping[str, tuple[float, float]] | None = None,
     priors: Mapping[str, float | tuple[float, float | None] | None] | None = None,
-    key: Array | int = 0,
+    key: Key = 0,
 ) -> FitProblem:
     """The problem of the fit that gave the result, in linear response; needs double precision.
 
@@ -38,7 +38,8 @@ def reopened(
         raise ValueError(f"target: this fit has several ({', '.join(result.parts)}), so none of them can be exchanged")
     settings = result.settings
     names = tuple(settings["free"] if free is None else free)
-    centres = {n: settings["prior_centre"].get(n, _default(result, n)) for n in names}
+    fitted = settings["prior_centre"]
+    centres = {n: fitted[n] if n in fitted else _default(result, n) for n in names}
     sds = {
         n: settings["prior_sd"].get(n, PARAMETERS[base_of(n)].prior_sd if base_of(n) in PARAMETERS else 1.0) for n in names
     }
@@ -46,17 +47,20 @@ def reopened(
         if name not in names:
             raise ValueError(f"priors: {name} is not free; free are {', '.join(names)}")
         centres[name], sds[name] = given if isinstance(given, tuple) else (centres[name], given)
-    limits = {n: tuple(b) for n, b in settings["bounds"].items() if n in names} | dict(bounds or {})
+    limits = {n: _open(*b) for n, b in settings["bounds"].items() if n in names} | dict(bounds or {})
     for name, (low, high) in limits.items():
         if name in centres and not low < centres[name] < high:
             raise ValueError(f"the prior of {name} is centred at {centres[name]:g}, outside its bounds ({low:g}, {high:g}): "
                              "give priors={name: (centre, sd)} inside them, or wider bounds")  # fmt: skip
-    options = FitOptions(
-        free=names, residual=settings["residual"], key=key, bounds=limits, priors=sds, dt=settings.get("dt", DT)
-    )
+    options = FitOptions(free=names, residual=settings["residual"], key=key, bounds=limits, priors=sds, dt=settings["dt"])
     problem = _problem(result, target, options, centres)
     return problem.scattering_as([task.with_parts(settings=part.target.settings)
                                   for task, part in zip(result.tasks.values(), problem.parts, strict=True)])  # fmt: skip
+
+
+def _open(low: float | None, high: float | None) -> tuple[float, float]:
+    """Bounds as a result keeps them: None where there is none."""
+    return (-np.inf if low is None else low, np.inf if high is None else high)
 
 
 def _problem(result: FitResult, target: Target | None, options: FitOptions, centres: dict[str, float]) -> FitProblem:

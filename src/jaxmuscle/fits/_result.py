@@ -1,18 +1,20 @@
 """The result of a fit, of one target or of several: what was found, how sure it is, and what it cannot say."""
 
-import json
+import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
+import msgspec
 import numpy as np
 from jaxtyping import Float
 
 from jaxmuscle import plot
 from jaxmuscle._common.arrays import from_nulls, with_nulls
+from jaxmuscle._common.documents import checked, contradiction, converted, parsed
 from jaxmuscle._common.errors import ResultError
-from jaxmuscle._common.files import write_json
+from jaxmuscle._common.files import expanded, write_json
 from jaxmuscle._common.inputs import read_text
 from jaxmuscle._common.parts import of_only, only
 from jaxmuscle._common.tables import frame
@@ -22,6 +24,7 @@ from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.objective._consequences import derived_names
 
 from ._adequacy import Adequacy
+from ._fit_file import FORMAT, FORMATS, FitTable, PartTable, disagreement
 from ._ladder import Rung
 from ._part import Estimate, FittedPart, Start, estimates_to_table, part_to_table, read_estimates, read_part
 from ._result_text import per_newton, text_of
@@ -32,7 +35,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure, SubFigure
 
 
-FORMAT = 2
 ALIASES = {
     "resonance_frequency": "tremor_frequency",
     "resonance_width": "tremor_width",
@@ -260,42 +262,63 @@ def to_table(result: FitResult) -> dict[str, Any]:
 
 
 def load_result(path: str | Path) -> FitResult:
-    """Read the `fit.json` at `path`, of one target or several. Raises `ResultError` naming the file and what is wrong."""
-    path = Path(path)
-    text = read_text(path, ResultError, instead="a fit.json")
+    """Read the `fit.json` at `path`, of one target or several. Raises `ResultError` naming the file and what is wrong.
+
+    Nothing gets a default: a key that is missing, unknown, of a wrong type, or that contradicts another is an error.
+    """
+    if not isinstance(path, str | os.PathLike):
+        raise ResultError(f"path {path!r}: give the path of a fit.json")
+    path = expanded(path)
+    table = parsed(read_text(path, ResultError, instead="a fit.json"), str(path), "JSON", ResultError)
+    if type(table.get("format")) is not int or table["format"] not in FORMATS:
+        raise ResultError(f"{path}: is not a fit result of format {' or '.join(map(str, FORMATS))}; write it with "
+                          "FitResult.save")  # fmt: skip
     try:
-        table = json.loads(text)
-    except ValueError as error:
-        raise ResultError(f"{path}: is not JSON: {error}") from None
-    if not isinstance(table, dict) or table.get("format") != FORMAT:
-        raise ResultError(f"{path}: is not a fit result of format {FORMAT}; write it with FitResult.save")
-    try:
-        return _from_table(table)
-    except KeyError as error:
-        raise ResultError(f"{path}: has no entry {error}; {choices(str(error.args[0]), table)}") from None
+        result = _from_table(table, str(path))
+        # What can be made from the rest of the file must be what the file says; words may have changed since.
+        stated = {**table, "format": FORMAT, "verdict": result.verdict}
+        wrong = disagreement(result) or contradiction(stated, to_table(result), whole=table["format"] == FORMAT)
+    except (ValueError, ArithmeticError) as error:
+        raise error if isinstance(error, ResultError) else ResultError(f"{path}: {error}") from None
+    if wrong:
+        raise ResultError(f"{path}: {wrong}: the file was changed or damaged, fit again")
+    return result
 
 
-def _from_table(table: dict[str, Any]) -> FitResult:
-    parts = table["parts"] if "parts" in table else {table["target"]: table}
-    profile = table["profile"]
+def _from_table(table: dict[str, Any], file: str) -> FitResult:
+    own = {field.name for field in msgspec.structs.fields(PartTable)}
+    several = "parts" in table
+    parts = converted(table["parts"], dict[str, dict[str, Any]], "parts") if several else {
+        "": {key: value for key, value in table.items() if key in own}
+    }  # fmt: skip
+    rest = {key: value for key, value in table.items() if key != "parts" and (several or key not in own)}
+    said = checked(rest, FitTable, file, ResultError)
+    whole = said.format > 2
+    read = {
+        name: read_part(checked(part, PartTable, f"{file}: parts.{name}" if several else file, ResultError), whole=whole)
+        for name, part in parts.items()
+    }
+    if several and len(read) < 2:
+        raise ResultError(f"{file}: parts holds {len(read)} targets, where several belong")
+    adequacy = said.adequacy
     return FitResult(
-        success=table["success"],
-        message=table["message"],
-        adequacy=None if table["adequacy"] is None else Adequacy(**table["adequacy"]),
-        parts={name: read_part(part) for name, part in parts.items()},
-        method=table["method"],
-        parameters=read_estimates(table["parameters"]),
-        derived=read_estimates(table["derived"]),
-        products=tuple(table["products"]),
+        success=said.success,
+        message=said.message,
+        adequacy=None if adequacy is None else Adequacy(**msgspec.structs.asdict(adequacy)),
+        parts=read if several else {part.target.name: part for part in read.values()},
+        method=said.method,
+        parameters=read_estimates(said.parameters),
+        derived=read_estimates(said.derived),
+        products=tuple(said.products),
         correlation=table["correlation"],
-        undetermined=tuple(table["undetermined"]),
-        ladder=tuple(Rung(**rung) for rung in table["ladder"]),
-        singular_values=from_nulls(table["singular_values"]),
-        starts=tuple(Start(s["cost"], s["success"], s["steps"]) for s in table["starts"]),
-        profile=None if profile is None else tuple(from_nulls(profile[name]) for name in PROFILE),
-        harmonic_p_value=table["harmonic_p_value"],
-        notices=tuple(table["notices"]),
-        seed=table["seed"],
+        undetermined=tuple(said.undetermined),
+        ladder=tuple(Rung(**msgspec.structs.asdict(rung)) for rung in said.ladder),
+        singular_values=from_nulls(said.singular_values),
+        starts=tuple(Start(s.cost, s.success, s.steps) for s in said.starts),
+        profile=None if said.profile is None else tuple(from_nulls(getattr(said.profile, name)) for name in PROFILE),
+        harmonic_p_value=said.harmonic_p_value,
+        notices=tuple(said.notices),
+        seed=said.seed,
         settings=table["settings"],
-        versions=table["versions"],
+        versions=said.versions,
     )

@@ -17,9 +17,11 @@ from jaxmuscle import plot
 from jaxmuscle._common.arrays import with_nulls
 from jaxmuscle._common.environment import versions
 from jaxmuscle._common.files import remove, write_json, write_text
+from jaxmuscle._common.keys import check_key
 from jaxmuscle._common.progress import Tell, told
 from jaxmuscle._common.tables import frame
 from jaxmuscle._common.text import WIDTH, choices, folded
+from jaxmuscle._common.types import Key
 from jaxmuscle.data._study_table import READING, Cell, cells_of_study, read_study
 from jaxmuscle.model._parameters import PARAMETERS
 from jaxmuscle.model._rungs import RUNGS
@@ -243,7 +245,7 @@ def run_study(
     alpha: float | None = None,
     correction: str | None = None,
     starts: int = 32,
-    key: int = 0,
+    key: Key = 0,
     progress: bool | Tell = False,
     **reading: Any,
 ) -> StudyResult:
@@ -281,6 +283,7 @@ def run_study(
 
     **Raises:** `ValueError` naming file, line and column, or the argument, and the remedy.
     """
+    check_key(key)
     for name in reading:
         if name not in READING:
             raise ValueError(f"unknown argument {name!r}; {choices(name, READING)}")

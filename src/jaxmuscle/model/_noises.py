@@ -33,7 +33,7 @@ def with_noise(
         return task
     if isinstance(noise, AbstractNoise):
         return task.with_parts(noise=noise)
-    if noise not in NOISES:
+    if not isinstance(noise, str) or noise not in NOISES:
         raise ValueError(f"noise = {noise!r}: {choices(noise, NOISES)}")
     kind: Any = NOISES[noise]
     made = kind().per_channel()

@@ -197,6 +197,8 @@ def set_parameters(task: Any, values: dict[str, Any]) -> Any:
             task = task.with_input(name)
     for name, value in values.items():
         row = PARAMETERS.get(name)
+        if isinstance(value, bool | str | None):
+            raise ValueError(f"{name} = {value!r}: give a number")
         if row is not None:
             message = f"{name} = {value} {row.unit} is outside [{row.lower}, {row.upper}]: {row.meaning}"
             finite = np.isfinite(value) if is_concrete(value) else jax.numpy.isfinite(value)

@@ -3,7 +3,7 @@
 import abc
 from collections.abc import Callable
 from functools import partial
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -156,6 +156,16 @@ class Sampled(AbstractSignal):
     level: Scalar = 1.0
     smoothness: ClassVar[int] = 4
 
+    def __check_init__(self):
+        pieces = len(self.breaks) - 1
+        require(
+            pieces >= 1 and np.shape(self.coefficients) == (pieces, 6),
+            f"breaks {np.shape(self.breaks)} and coefficients {np.shape(self.coefficients)} do not belong together: a "
+            "spline of n pieces has n + 1 breaks and n rows of 6 coefficients",
+        )
+        rising = self.breaks[1:] > self.breaks[:-1]
+        require(rising, "breaks must increase")
+
     @classmethod
     def through(cls, times: Float[np.ndarray, " samples"], values: Float[np.ndarray, " samples"]) -> "Sampled":
         """Spline through `values` at `times` [s], at least six, increasing. Raises `ValueError` otherwise."""
@@ -210,12 +220,18 @@ def _row_jvp(order, interval, primals, tangents):
 
 def as_signal(value: AbstractSignal | Scalar) -> AbstractSignal:
     """A signal as it is; a number as a smooth step to that level."""
-    return value if isinstance(value, AbstractSignal) else SmoothStep(value)
+    return value if isinstance(value, AbstractSignal) else SmoothStep(_level(value))
 
 
 def as_held(value: AbstractSignal | Scalar) -> AbstractSignal:
     """A signal as it is; a number as that level from the start."""
-    return value if isinstance(value, AbstractSignal) else Constant(value)
+    return value if isinstance(value, AbstractSignal) else Constant(_level(value))
+
+
+def _level(value: Any) -> Any:
+    if isinstance(value, bool | str | bytes | list | tuple | dict | None):
+        raise ValueError(f"an input is {value!r}: give a number or a signal, as jaxmuscle.model.SmoothStep(5.0)")
+    return value
 
 
 def derivatives(signal: Callable[[Scalar], Scalar], t: Scalar, order: int) -> tuple[Scalar, ...]:

@@ -1,12 +1,14 @@
-"""Tasks as tables: one holds the muscle, its perturbation, the inputs and the spectrum settings."""
+"""Tasks as tables: one holds the muscle, its perturbation, the inputs and the spectrum settings, every number of them."""
 
 import dataclasses
-from typing import Any, Literal, get_args, get_origin
+from types import NoneType, UnionType
+from typing import Any, Union, get_args, get_origin
 
 import equinox as eqx
 import numpy as np
 
 from jaxmuscle._common.arrays import as_numbers
+from jaxmuscle._common.documents import converted
 from jaxmuscle._common.errors import PresetError
 from jaxmuscle._common.text import choices
 from jaxmuscle.spectra._settings import SpectrumSettings
@@ -14,13 +16,17 @@ from jaxmuscle.spectra._settings import SpectrumSettings
 from . import _activation, _muscle, _noise, _pink_noise, _resonant_noise, _signals, _tasks, _white_noise
 from ._tasks import TASKS, AbstractTask
 
+ABSENT = "none"  # what stands for a part that a task does not have: TOML has no null
+LARGEST = 1e50  # of any number, whatever its unit: what is larger overflows in the equations
+
+_BASES = (_muscle.AbstractMuscle, _muscle.AbstractLaw, _noise.AbstractNoise, _signals.AbstractSignal)
+_PARTS = (*_BASES, _activation.Activation, _signals.Harmonic, AbstractTask)
 _KINDS: dict[str, type] = {
     kind.__name__: kind
     for module in (_activation, _muscle, _noise, _pink_noise, _resonant_noise, _signals, _tasks, _white_noise)
     for kind in vars(module).values()
-    if isinstance(kind, type) and issubclass(kind, eqx.Module) and not kind.__name__.startswith("Abstract")
+    if isinstance(kind, type) and issubclass(kind, _PARTS) and not kind.__name__.startswith("Abstract")
 }
-_BASES = (_muscle.AbstractMuscle, _muscle.AbstractLaw, _noise.AbstractNoise, _signals.AbstractSignal)
 _NAMES = {kind: name for name, kind in TASKS.items()}
 
 
@@ -45,13 +51,14 @@ def _refuse(value: Any) -> dict[str, Any]:
 
 
 def _fields_to_table(module: eqx.Module) -> dict[str, Any]:
-    values = {field.name: getattr(module, field.name) for field in dataclasses.fields(module)}
-    return {name: _to_table(value) for name, value in values.items() if value is not None}
+    return {field.name: _to_table(getattr(module, field.name)) for field in dataclasses.fields(module)}
 
 
 def _to_table(value: Any) -> Any:
+    if value is None:
+        return ABSENT
     if isinstance(value, SpectrumSettings):
-        return value.to_dict()
+        return value.to_dict(whole=True)
     if isinstance(value, eqx.Module):
         if _known().get(type(value).__name__) is not type(value):
             _refuse(value)
@@ -61,57 +68,101 @@ def _to_table(value: Any) -> Any:
     return [_to_table(each) for each in value] if isinstance(value, tuple) else value
 
 
-def task_from_table(table: dict[str, Any]) -> AbstractTask:
-    """The task of a table. Raises `PresetError` for one that is not whole."""
+def task_from_table(table: dict[str, Any], *, whole: bool = True) -> AbstractTask:
+    """The task of a table. Raises `PresetError` naming the key that is missing, unknown or wrong: nothing gets a default.
+
+    Without `whole` what a task does not have may be left out, as the first format did.
+    """
     table = dict(table)
     name = table.pop("task", None)
-    if name not in TASKS:
+    if not isinstance(name, str) or name not in TASKS:
         raise PresetError(f"task = {name!r}: {choices(str(name), TASKS)}")
-    return _build(TASKS[name], table, "task")
+    return _build(TASKS[name], table, "task", whole)
 
 
-def _build(kind: type, table: dict[str, Any], where: str) -> Any:
+def _build(kind: type, table: dict[str, Any], where: str, whole: bool) -> Any:
     fields = {field.name: field for field in dataclasses.fields(kind)}
-    values = {}
-    for key, value in table.items():
+    for key in table:
         if key not in fields:
             raise PresetError(f"unknown key {where}.{key}: {choices(key, fields)}")
-        values[key] = _from_table(key, value, f"{where}.{key}")
-        if not _fits(fields[key].type, values[key]):
-            raise PresetError(f"{where}.{key} = {value!r} is of the wrong kind")
+    absent = {} if whole else {name: ABSENT for name, field in fields.items() if NoneType in get_args(field.type)}
+    values = {}
+    for name, field in fields.items():
+        if name not in table and name not in absent:
+            raise PresetError(f"{where} has no key {name!r}: give it; a number that is not there gets no default")
+        values[name] = _value(kind, field, (absent | table)[name], f"{where}.{name}", whole)
     if kind in (_white_noise.OrnsteinUhlenbeckNoise, _resonant_noise.ResonantNoise, _pink_noise.PinkNoise):
-        values["std"] = values.pop("amplitude", None)
+        values["std"] = values.pop("amplitude")
     try:
         return kind(**values)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, ArithmeticError) as error:
         raise PresetError(f"{where}: {error}") from None
 
 
-def _fits(kind: Any, value: Any) -> bool:
-    """Whether a value can be that of a field: a module where one is meant, else a switch, a word, or numbers."""
-    if type(None) in get_args(kind):
-        kind = get_args(kind)[0]
-    if isinstance(kind, type) and issubclass(kind, eqx.Module):
-        number = isinstance(value, int | float) and not isinstance(value, bool)
-        return isinstance(value, kind) or (kind is _signals.AbstractSignal and number)
-    if kind is bool or isinstance(value, bool):
-        return kind is bool and isinstance(value, bool)
-    return isinstance(value, str) == (get_origin(kind) is Literal) and not isinstance(value, eqx.Module)
+def _value(kind: type, field: Any, value: Any, where: str, whole: bool) -> Any:
+    """That of a field: a part, several, numbers, a switch or a word, as the class declares it."""
+    options = get_args(field.type) if get_origin(field.type) in (Union, UnionType) else (field.type,)
+    if NoneType in options and value == ABSENT:
+        return None
+    meant = options[0]
+    if meant is SpectrumSettings:
+        return _settings(converted(value, dict, where, PresetError), where, whole)
+    if get_origin(meant) is tuple:
+        inner = get_args(meant)[0]
+        entries = [(each, f"{where}[{i}]") for i, each in enumerate(converted(value, list, where, PresetError))]
+        return tuple(_part(inner, each, at, whole) if _is_part(inner) else _number(each, at) for each, at in entries)
+    if _is_part(meant):
+        # A number stands for a step with default times, so no file of today may hold one.
+        number = not whole and issubclass(meant, _signals.AbstractSignal) and field.metadata.get("converter") is not None
+        return _number(value, where) if number and not isinstance(value, dict) else _part(meant, value, where, whole)
+    several = "converter" in field.metadata or kind not in _KINDS.values()  # one for each input, or what a user's class has
+    if hasattr(meant, "dims") and (float not in options or (several and isinstance(value, list))):
+        return _numbers(meant, value, where)
+    return _number(value, where) if float in options else converted(value, meant, where, PresetError)
 
 
-def _from_table(key: str, value: Any, where: str) -> Any:
-    if key == "settings" and isinstance(value, dict):
-        return SpectrumSettings.from_dict(value)
-    if isinstance(value, dict):
-        kind = value.get("type")
-        known = _known()
-        if kind not in known:
-            raise PresetError(
-                f"{where}.type = {kind!r}: {choices(str(kind), known)}; a class of your own must be imported first"
-            )
-        return _build(known[kind], {k: v for k, v in value.items() if k != "type"}, where)
-    if isinstance(value, list) and any(isinstance(each, dict) for each in value):
-        return tuple(_from_table(key, each, f"{where}[{i}]") for i, each in enumerate(value))
-    if isinstance(value, list):
-        return tuple(value) if key == "initial" else np.array(value, dtype=float)
-    return value
+def _settings(table: dict[str, Any], where: str, whole: bool) -> SpectrumSettings:
+    try:
+        return SpectrumSettings.from_dict(table, needed=SpectrumSettings.names(whole=whole))
+    except ValueError as error:
+        raise PresetError(f"{where}: {error}") from None
+
+
+def _is_part(kind: Any) -> bool:
+    return isinstance(kind, type) and issubclass(kind, eqx.Module)
+
+
+def _part(kind: type, value: Any, where: str, whole: bool) -> Any:
+    table = converted(value, dict, where, PresetError)
+    name, known = table.get("type"), _known()
+    if not isinstance(name, str) or name not in known:
+        raise PresetError(
+            f"{where}.type = {name!r}: {choices(str(name), known)}; a class of your own must be imported first"
+        )
+    if not issubclass(known[name], kind):
+        raise PresetError(
+            f"{where}.type = {name!r} is of the wrong kind: a {kind.__name__.removeprefix('Abstract')} belongs there"
+        )
+    return _build(known[name], {k: v for k, v in table.items() if k != "type"}, where, whole)
+
+
+def _number(value: Any, where: str) -> float:
+    number = converted(value, float, where, PresetError)
+    if abs(number) > LARGEST:
+        raise PresetError(f"{where} = {number:g} is out of range: numbers are below {LARGEST:g}, in SI units")
+    return number
+
+
+def _numbers(kind: Any, value: Any, where: str) -> np.ndarray:
+    """An array of as many dimensions as the field has."""
+    rows = converted(value, list, where, PresetError)
+    nested = any(isinstance(row, list) for row in rows)
+    rows = converted(rows, list[list[float]] if nested else list[float], where, PresetError)
+    if nested and len({len(row) for row in rows}) > 1:
+        raise PresetError(f"{where}: its rows differ in length")
+    array = np.array(rows, dtype=float)
+    if kind.index_variadic is None and array.ndim != len(kind.dims):
+        raise PresetError(f"{where} has {array.ndim} dimensions, {len(kind.dims)} belong there")
+    if not np.all(np.abs(array) <= LARGEST):
+        raise PresetError(f"{where} holds a number out of range: numbers are below {LARGEST:g}, in SI units")
+    return array

@@ -137,6 +137,14 @@ class AbstractTask(eqx.Module):
         return jnp.append(base, jnp.zeros((), base.dtype)) * stiffness
 
 
+def require_task(task: Any, example: str) -> None:
+    """Raise a `ValueError` for what is no task, where one is needed."""
+    require(
+        isinstance(task, AbstractTask),
+        f"task: a {type(task).__name__}; give a task first, as jaxmuscle.Isometric(): {example}",
+    )
+
+
 def _check_task(task: AbstractTask) -> None:
     if task.initial is not None and len(task.initial) != len(task.state_names):
         raise ValueError(f"initial has {len(task.initial)} entries, {type(task).__name__} needs {task.state_names}")
@@ -144,7 +152,7 @@ def _check_task(task: AbstractTask) -> None:
 
 
 def _check_noise(task: AbstractTask) -> None:
-    """Refuse a noise that is rougher than the task can sample or differentiate, where its amplitude is not zero."""
+    """Refuse noise rougher than the task can sample or differentiate, where its amplitude is not zero."""
     what = {1: f"appears directly in the output {task.output_name}, where white noise has no value",
             2: "must be differentiable in time"}  # fmt: skip
     needed = (*task.smoothness_needed, 0)

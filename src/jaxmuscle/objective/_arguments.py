@@ -7,12 +7,13 @@ from typing import Any, Literal, NamedTuple, get_args
 
 import jax
 import numpy as np
-from jaxtyping import PRNGKeyArray
 
-from jaxmuscle._common.arrays import as_numbers
-from jaxmuscle._common.keys import key_of
+from jaxmuscle._common.arguments import count, positive
+from jaxmuscle._common.arrays import as_numbers, with_nulls
+from jaxmuscle._common.keys import check_key, key_of, number_of
 from jaxmuscle._common.progress import Tell, nothing
 from jaxmuscle._common.text import choices
+from jaxmuscle._common.types import Key
 from jaxmuscle.data._target import Target
 from jaxmuscle.model._muscle import Muscle
 from jaxmuscle.model._noise import AbstractNoise
@@ -25,10 +26,12 @@ from jaxmuscle.response._scaling import FORCES, at_force, is_scalable
 from jaxmuscle.spectra._settings import WINDOW, require, samples_in
 
 from ._coordinates import Coordinates
+from ._given import check_data, check_named
 from ._problem import FitProblem, Part, target_variation
 
 RESIDUALS = ("log", "linear", "cumulative")
 METHODS = ("linear", "montecarlo")
+MOST = 10**9  # of starts, seeds and steps: what is more is a slip
 DT = 2.5e-3
 # With an activation stiffness and damping stay nearer to their defaults: no spectrum determines them, and an underdamped
 # muscle, which swings at 8 Hz, would pass for tremor.
@@ -119,7 +122,7 @@ class FitOptions:
     starts: int | None = None
     seeds: int | None = None
     check_seeds: int | None = None
-    key: PRNGKeyArray | int = 0
+    key: Key = 0
     bounds: Mapping[str, tuple[float, float]] | None = None
     priors: Mapping[str, float | None] | None = None
     coefficient_of_variation: bool = True
@@ -136,14 +139,17 @@ class FitOptions:
             if getattr(self, name) not in known:
                 raise ValueError(f"{name} = {getattr(self, name)!r}: {choices(getattr(self, name), known)}")
         for name, least in (("starts", 1), ("seeds", 0), ("check_seeds", 0), ("max_steps", 1), ("rungs", 0)):
-            count = getattr(self, name)
-            if count is not None and count < least:
-                raise ValueError(f"{name} = {count} must be at least {least}")
+            if getattr(self, name) is not None:
+                count(name, getattr(self, name), least, MOST)
+        check_key(self.key)
+        positive("dt", self.dt)
+        check_named(self.free, self.fix, self.bounds, self.priors)
+        check_data(self.coefficient_of_variation, self.mean_force)
 
     @property
     def seed(self) -> int | None:
         """The key, if it was given as a number."""
-        return self.key if isinstance(self.key, int) else None
+        return number_of(self.key)
 
 
 def at_mean(task: AbstractTask, target: Target, options: FitOptions) -> tuple[AbstractTask, FitOptions]:
@@ -198,7 +204,7 @@ def planned(task: AbstractTask, target: Target, options: FitOptions) -> Plan:
     control = has_response(task, required=options.method == "linear")
     many = {"starts": 100, "seeds": 32, "check_seeds": 64} if control else {"starts": 8, "seeds": 48, "check_seeds": 200}
     many |= {} if spectral else {"seeds": 0, "check_seeds": 0}
-    counts = {name: count if getattr(options, name) is None else getattr(options, name) for name, count in many.items()}
+    counts = {name: number if getattr(options, name) is None else getattr(options, name) for name, number in many.items()}
     if options.method == "montecarlo" and counts["seeds"] < 1:
         raise ValueError("seeds = 0: a Monte Carlo fit needs at least one")
     usual = {n: PARAMETERS[n].prior_sd if n in PARAMETERS else 1.0 for n in names}
@@ -208,7 +214,7 @@ def planned(task: AbstractTask, target: Target, options: FitOptions) -> Plan:
     coordinates = Coordinates.of({n: float(task[n]) for n in names}, bounds, {n: sd or 1.0 for n, sd in sds.items()})
     variation = target_variation(target) if options.coefficient_of_variation else None
     part = Part("", task, target, coordinates, tuple(range(len(names))), variation, mean)
-    key = key_of(options.key) if isinstance(options.key, int) else options.key
+    key = key_of(options.key)
     problem = FitProblem((part,), coordinates, np.array([0.0 if sds[n] is None else 1.0 for n in names]), options.residual,
                          options.method, options.dt, key, counts["seeds"], control, options.progress)  # fmt: skip
     settings = {
@@ -242,7 +248,7 @@ def settings_of(problem: FitProblem, bounds: Mapping[str, tuple[float, float]]) 
         "residual": problem.residual,
         "prior_centre": dict(zip(c.names, map(float, c.centre), strict=True)),
         "prior_sd": {n: float(sd) if p else None for n, sd, p in zip(c.names, c.sd, problem.prior, strict=True)},
-        "bounds": {n: list(b) for n, b in bounds.items()},
+        "bounds": {n: with_nulls(np.array(b, dtype=float)) for n, b in bounds.items()},
     }
 
 

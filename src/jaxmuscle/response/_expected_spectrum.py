@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxmuscle._common.arrays import all_concrete, is_concrete
-from jaxmuscle.model._tasks import AbstractTask
+from jaxmuscle.model._tasks import AbstractTask, require_task
 from jaxmuscle.spectra._settings import WINDOW, SpectrumSettings
 from jaxmuscle.spectra._welch import Spectrum
 
@@ -35,7 +35,10 @@ def expected_spectrum(
     harmonic. Warns (`FirstOrderWarning`) where the second order adds more than 10 % to a bin, and of coefficients that
     turn negative. Under a transformation, where values cannot be looked at, the result is not finite instead.
     """
+    require_task(task, "expected_spectrum(task)")
     settings = task.settings if settings is None else settings
+    if not isinstance(settings, SpectrumSettings):
+        raise ValueError(f"settings: this is a {type(settings).__name__}; give a jaxmuscle.SpectrumSettings")
     concrete = all_concrete(task)
     if concrete:
         check_line(task, settings)

@@ -1,16 +1,17 @@
 """Preset files: saved tasks, carried to the mean force that the file states."""
 
-import json
 import math
-import tomllib
+import os
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal, NamedTuple
 
 import tomli_w
+from msgspec import Meta
 
 from jaxmuscle._common.bundled import bundled_text, list_presets
+from jaxmuscle._common.documents import Table, checked, parsed
 from jaxmuscle._common.errors import PresetError
-from jaxmuscle._common.files import write_text
+from jaxmuscle._common.files import expanded, write_text
 from jaxmuscle._common.inputs import read_text
 from jaxmuscle._common.text import choices
 from jaxmuscle._common.units import NEWTONS
@@ -18,6 +19,9 @@ from jaxmuscle.model._task_tables import task_from_table, task_to_table
 from jaxmuscle.model._tasks import AbstractTask
 
 from ._scaling import at_force
+
+FORMAT = 2  # of a preset; 1 may leave out what a task does not have
+FIT_FORMATS = (2, 3)  # of a fit.json; 2 may
 
 
 def load_preset(name_or_path: str | Path) -> AbstractTask:
@@ -35,25 +39,64 @@ def load_preset(name_or_path: str | Path) -> AbstractTask:
     **Raises:** `PresetError` naming the file or the nearest bundled name, and what is wrong: also a unit that is not one of
     the three, a mean of zero or of the other sign, and a task whose output is not a force.
     """
-    name = str(name_or_path)
-    path = Path(name).expanduser()
+    if not isinstance(name_or_path, str | os.PathLike):
+        raise PresetError(f"preset {name_or_path!r}: give the name of a bundled preset or a path")
+    name = os.fspath(name_or_path)
     if name in list_presets():
-        table = tomllib.loads(bundled_text(name, "presets"))
-    elif not path.suffix and not path.exists():
+        return _task_of(_checked(bundled_text(name, "presets"), name, "TOML"), name)
+    path = expanded(name)
+    if not path.suffix and not path.exists():
         raise PresetError(f"unknown preset {name!r}: {choices(name, list_presets())}; or give a path")
-    else:
-        table = _read(path)
+    kind = "JSON" if path.suffix.lower() == ".json" else "TOML"
+    text = read_text(path, PresetError, instead="a preset (.toml) or a fit.json")
+    return _task_of(_checked(text, str(path), kind), str(path))
+
+
+class PresetFile(Table, kw_only=True):
+    """A saved task."""
+
+    format: Annotated[Literal[1, 2], Meta(description="Version of the format; a file without it is of format 1")] = 1
+    description: Annotated[str, Meta(description="What the task is")] = ""
+    mean: Annotated[Any, Meta(description="Mean force to which the task is carried")] = None
+    unit: Annotated[Any, Meta(description="N, mN or kN; with `mean` only")] = None
+    fit: Annotated[Any, Meta(description="The fit that made it, a table for people")] = None
+    task_table: Annotated[dict[str, Any], Meta(description="The task, every number of it")]
+
+
+class _InFit(NamedTuple):
+    """What a `fit.json` says about its task; the rest is read by `load_result`."""
+
+    format: int
+    task_table: dict[str, Any]
+    mean: None = None
+    unit: None = None
+
+
+def _checked(text: str, file: str, kind: str) -> PresetFile | _InFit:
+    """What a preset file or a fit.json says, its keys and types checked, the task table not yet."""
+    table = parsed(text, file, kind, PresetError)
     if not isinstance(table.get("task_table"), dict):
-        raise PresetError(f"{path}: has no [task_table]: is it a preset or a fit.json?")
+        several = " It is the fit of several targets: give that of one." if "parts" in table else ""
+        raise PresetError(f"{file}: has no [task_table]: is it a preset or a fit.json?{several}")
+    if kind == "JSON":  # a fit.json since format 3 leaves nothing out
+        formats = table.get("format")
+        if type(formats) is not int or formats not in FIT_FORMATS:
+            raise PresetError(
+                f"{file}: format = {formats!r}: is not a fit.json of format {' or '.join(map(str, FIT_FORMATS))}"
+            )
+        return _InFit(formats - 1, table["task_table"])
+    return checked(table, PresetFile, file, PresetError)
+
+
+def _task_of(said: PresetFile | _InFit, file: str) -> AbstractTask:
     try:
-        task = task_from_table(table["task_table"])
-        stated = {key: table[key] for key in ("mean", "unit") if key in table}
-        return _carried(task, **stated) if stated else task
+        task = task_from_table(said.task_table, whole=said.format > 1)
+        return task if said.mean is None and said.unit is None else _carried(task, said.mean, said.unit)
     except ValueError as error:
-        raise PresetError(f"{path}: {error}") from None
+        raise PresetError(f"{file}: {error}") from None
 
 
-def _carried(task: AbstractTask, mean: Any = None, unit: Any = None) -> AbstractTask:
+def _carried(task: AbstractTask, mean: Any, unit: Any) -> AbstractTask:
     """The task at the mean force that a file states."""
     if mean is None or unit is None:
         missing = "mean" if mean is None else "unit"
@@ -69,18 +112,7 @@ def _carried(task: AbstractTask, mean: Any = None, unit: Any = None) -> Abstract
         raise PresetError(f"mean = {mean} {unit}: {error}") from None
 
 
-def _read(path: Path) -> dict[str, Any]:
-    text = read_text(path, PresetError, instead="a preset (.toml) or a fit.json")
-    try:
-        table = json.loads(text) if path.suffix == ".json" else tomllib.loads(text)
-    except ValueError as error:
-        raise PresetError(f"{path}: is not valid {'JSON' if path.suffix == '.json' else 'TOML'}: {error}") from None
-    if not isinstance(table, dict):
-        raise PresetError(f"{path}: is not a preset or a fit.json: it holds no table")
-    return table
-
-
 def save_preset(path: str | Path, task: AbstractTask, *, description: str = "", fit: dict[str, Any] | None = None) -> None:
     """Write a task to `path` as a preset: TOML with a description, the fit that made it and the task table."""
-    table: dict[str, Any] = {"description": description} | ({"fit": fit} if fit else {})
+    table: dict[str, Any] = {"format": FORMAT, "description": description} | ({"fit": fit} if fit else {})
     write_text(path, tomli_w.dumps(table | {"task_table": task_to_table(task)}))

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh
 from jax.sharding import PartitionSpec as P
-from jaxtyping import Array, Int, PRNGKeyArray
+from jaxtyping import Array, Integer, PRNGKeyArray
 
 from jaxmuscle._common.programs import kept
 from jaxmuscle.model._noise import AbstractNoise, Realisation
@@ -49,7 +49,7 @@ def local_mesh() -> Mesh | None:
     return Mesh(np.array(devices), ("lanes",)) if len(devices) > 1 else None
 
 
-def draw(noise: AbstractNoise, key: PRNGKeyArray, seeds: Int[Array, " seeds"], steps: int) -> Any:
+def draw(noise: AbstractNoise, key: PRNGKeyArray, seeds: Integer[Array, " seeds"], steps: int) -> Any:
     """Normals of every seed; seed i depends on nothing but the key and i. Few at a time, which stay in the cache."""
     return jax.lax.map(lambda i: noise.draw(jax.random.fold_in(key, i), steps), seeds, batch_size=DRAWN)
 
@@ -130,7 +130,7 @@ def run_points(tasks: Any, linears: Any, key: Any, seeds: Any, recipe: Recipe, m
     return _shared(local, mesh, (P("lanes"), P(), P()))(moving, key, seeds)
 
 
-def _streams(key: PRNGKeyArray, seeds: Int[Array, " seeds"], recipe: Recipe) -> Stream:
+def _streams(key: PRNGKeyArray, seeds: Integer[Array, " seeds"], recipe: Recipe) -> Stream:
     return jax.vmap(lambda i: Stream.of(jax.random.fold_in(key, i), recipe.draws))(seeds)
 
 

@@ -6,14 +6,17 @@ from typing import Any, NamedTuple, get_args
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Int, PRNGKeyArray
+from jaxtyping import Array, PRNGKeyArray
 
+from jaxmuscle._common.arguments import count, positive
 from jaxmuscle._common.arrays import all_concrete, as_arrays, as_numbers
 from jaxmuscle._common.errors import OperatingPointError, SimulationError
+from jaxmuscle._common.keys import key_of, seed_of
 from jaxmuscle._common.programs import kept
 from jaxmuscle._common.text import listed
+from jaxmuscle._common.types import Key, Seed
 from jaxmuscle.model._stream import Draws
-from jaxmuscle.model._tasks import AbstractTask
+from jaxmuscle.model._tasks import AbstractTask, require_task
 from jaxmuscle.response._equilibrium import fastest_rate
 from jaxmuscle.response._linearised import LinearTask, check_equilibrium, check_inputs, linearised
 from jaxmuscle.spectra._settings import WINDOW, Sampling
@@ -24,6 +27,7 @@ from ._trajectory import Trajectory, one
 
 MAX_RATE_STEP = 0.5
 MAX_SUBSTEPS = 256
+MOST_STEPS = 2**31 - 1
 DURATION = 15.0
 DT = 1e-3
 TRANSIENT = 1e-3
@@ -31,9 +35,9 @@ TRANSIENT = 1e-3
 
 def simulate(
     task: AbstractTask,
-    key: PRNGKeyArray,
+    key: Key,
     *,
-    seed: int | Int[Array, ""] = 0,
+    seed: Seed = 0,
     duration: float = DURATION,
     dt: float = DT,
     rate: float | None = None,
@@ -44,9 +48,9 @@ def simulate(
 
     Heun's method at fixed steps in diffrax. Differentiable in both modes with respect to the task's parameters.
 
-    **Arguments:** `task`; `key`, a `jax.random` key, from which seed i takes `fold_in(key, i)`; `seed`; `duration` [s];
-    `dt` [s], the grid on which noise is drawn, which must divide the sampling interval; `rate` [Hz] of the samples
-    returned, the task's spectrum settings by default; `substeps` per dt (by default as many as stability asks for,
+    **Arguments:** `task`; `key`, a `jax.random` key or a seed number, from which seed i takes `fold_in(key, i)`; `seed`;
+    `duration` [s]; `dt` [s], the grid on which noise is drawn, which must divide the sampling interval; `rate` [Hz] of the
+    samples returned, the task's spectrum settings by default; `substeps` per dt (by default as many as stability asks for,
     a power of two, so that max |eigenvalue| dt / substeps <= 0.5); `sampling`, as in `SpectrumSettings` (the task's by
     default): "filtered" needs two steps of dt or more per sample, and the first and last 10 samples feel the ends; at a
     higher rate than that of the settings "instant" takes its place, as the spectrum is then low-passed when it is made.
@@ -54,8 +58,9 @@ def simulate(
     **Returns:** a `Trajectory`. **Raises:** `ValueError` for a grid that does not fit, `SimulationError` if the result is
     not finite (not under a JAX transformation, where it is returned as it is).
     """
-    seeds = jnp.atleast_1d(jnp.asarray(seed))
-    result = one(trajectories(task, None, key, seeds, schedule(task, duration, dt, rate, substeps, sampling)))
+    require_task(task, "simulate(task, key)")
+    seeds = jnp.asarray([seed_of(seed)], jnp.uint32) if all_concrete(seed) else jnp.atleast_1d(jnp.asarray(seed))
+    result = one(trajectories(task, None, key_of(key), seeds, schedule(task, duration, dt, rate, substeps, sampling)))
     require_finite(result)
     return result
 
@@ -112,12 +117,19 @@ def schedule(
     rate = own.rate if rate is None else rate
     if sampling not in get_args(Sampling):
         raise ValueError(f"sampling = {sampling!r} must be one of {', '.join(get_args(Sampling))}")
-    if not (dt > 0 and rate > 0 and duration > 0):
-        raise ValueError(f"dt = {dt} s, rate = {rate} Hz and duration = {duration} s must be positive")
+    for name, value in (("dt", dt), ("rate", rate), ("duration", duration)):
+        positive(name, value)
+    if substeps is not None:
+        count("substeps", substeps, 1, MAX_SUBSTEPS)
     every = steps_per_sample(rate, dt, sampling)
-    samples = whole(duration * rate, f"duration = {duration} s is not a whole number of sampling intervals {1 / rate} s")
+    samples = whole(
+        float(duration) * rate, f"duration = {duration} s is not a whole number of sampling intervals {1 / rate} s"
+    )
     if all_concrete(task):
         task.check_step(dt)
+    if samples * every > MOST_STEPS:
+        raise ValueError(f"duration = {duration} s at dt = {dt} s makes {samples * every} steps, at most {MOST_STEPS} are "
+                         "possible: give a shorter duration or a larger dt")  # fmt: skip
     if substeps is None:
         substeps = stable_substeps(task, dt, duration) if all_concrete(task) else 1
     return Schedule(Grid(dt, samples * every, every, substeps, reverse=not all_concrete(task)), sampling, rate)
@@ -135,7 +147,7 @@ def steps_per_sample(rate: float, dt: float, sampling: str) -> int:
 
 def whole(value: float, message: str) -> int:
     """A number that must be whole (up to rounding) and positive, else a `ValueError` with the message."""
-    if round(value) < 1 or abs(value - round(value)) > 1e-6 * max(1.0, value):
+    if not math.isfinite(value) or round(value) < 1 or abs(value - round(value)) > 1e-6 * max(1.0, value):
         raise ValueError(message)
     return round(value)
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Integer
 
 from jaxmuscle import plot
 from jaxmuscle._common.arrays import as_numbers, is_concrete
@@ -37,7 +37,7 @@ class Trajectory(eqx.Module):
     task: AbstractTask
     states: Float[Array | np.ndarray, "*seeds samples states"]
     output: Float[Array | np.ndarray, "*seeds samples"]
-    seeds: Int[Array | np.ndarray, "*seeds"]
+    seeds: Integer[Array | np.ndarray, "*seeds"]
     rate: float = eqx.field(static=True)
     dt: float = eqx.field(static=True)
     substeps: int = eqx.field(static=True)

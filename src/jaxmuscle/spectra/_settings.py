@@ -5,7 +5,7 @@ import difflib
 import functools
 import math
 import numbers
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any, Literal, get_args
 
 import equinox as eqx
@@ -13,6 +13,7 @@ import numpy as np
 import scipy
 from jaxtyping import Float
 
+from jaxmuscle._common.documents import converted
 from jaxmuscle._common.text import choices
 
 Window = Literal["hann", "hamming", "boxcar", "dpss"]
@@ -30,6 +31,11 @@ NAMED: dict[str, dict[str, Any]] = {
     "multitaper": _SLOW | {"first_bin": 2, "window": "dpss", "tapers": 3},
     "pwelch": {"window": "hamming", "detrend": "none"},
 }
+FASTEST, LENGTH, ORDER = (
+    1e9,
+    2**22,
+    50,
+)  # rate [Hz], samples of a segment, order of the low-pass: what is more is a slip, and fills the memory
 _AROUND = ("filter_order", "filter_cutoff", "filter_direction", "sampling")  # of the signal, not of its spectrum
 
 
@@ -85,16 +91,16 @@ class SpectrumSettings(eqx.Module):
     def __check_init__(self):
         def check(name: str, kind: type, valid: Callable[[Any], bool], remedy: str) -> None:
             value = getattr(self, name)
-            require(isinstance(value, kind) and valid(value), name, value, remedy)
+            require(isinstance(value, kind) and not isinstance(value, bool) and valid(value), name, value, remedy)
 
         half = self.length // 2 if isinstance(self.length, int) else 0
-        check("rate", numbers.Real, lambda f: 0 < f < math.inf, "give a sampling rate above 0 Hz")
-        check("length", int, lambda n: n >= 8, "give a whole number of samples, at least 8")
+        check("rate", numbers.Real, lambda f: 0 < f <= FASTEST, f"give a sampling rate above 0 Hz, at most {FASTEST:g} Hz")
+        check("length", int, lambda n: 8 <= n <= LENGTH, f"give a whole number of samples, 8 to {LENGTH}")
         check("last_bin", int, lambda k: 1 <= k <= half, f"give a bin from 1 to length // 2 = {half}")
         below = f"give a bin from 0 (the mean) to last_bin = {self.last_bin}"
         check("first_bin", int, lambda k: 0 <= k <= self.last_bin, below)
         check("overlap", numbers.Real, lambda x: 0 <= x < 1, "give a fraction of a segment, 0 to below 1")
-        check("filter_order", int, lambda n: n >= 1, "give a whole number of at least 1")
+        check("filter_order", int, lambda n: 1 <= n <= ORDER, f"give a whole number from 1 to {ORDER}")
         if self.filter_cutoff is not None:
             inside = f"give a frequency from 0 to rate / 2 = {self.rate / 2:g} Hz, or None for no filter"
             check("filter_cutoff", numbers.Real, lambda f: 0 < f < self.rate / 2, inside)
@@ -118,7 +124,7 @@ class SpectrumSettings(eqx.Module):
 
         **Raises:** `ValueError` for another name. **Source:** Thomson 1982, doi:10.1109/PROC.1982.12433 (multitaper).
         """
-        require(name in NAMED, "settings", name, choices(str(name), NAMED))
+        require(isinstance(name, str) and name in NAMED, "settings", name, choices(str(name), NAMED))
         return cls(**NAMED[name])
 
     @classmethod
@@ -179,25 +185,40 @@ class SpectrumSettings(eqx.Module):
         squares = [float(np.sum((w[:, : n - j * step] @ w[:, j * step :].T) ** 2)) for j in lags]
         return 2 * segments / (squares[0] + 2 * sum((1 - j / segments) * squares[j] for j in lags[1:]))
 
-    def to_dict(self) -> dict[str, Any]:
-        """The fields as TOML and JSON hold them; no cut-off is `"none"`, as TOML has no null; a single taper is left out."""
-        fields = [field.name for field in dataclasses.fields(self) if field.name != "tapers" or self.tapers > 1]
+    def to_dict(self, *, whole: bool = False) -> dict[str, Any]:
+        """The fields as TOML and JSON hold them; no cut-off is `"none"`, as TOML has no null.
+
+        A single taper is left out, unless the table is to be `whole`.
+        """
+        fields = [field.name for field in dataclasses.fields(self) if field.name != "tapers" or self.tapers > 1 or whole]
         values = {name: getattr(self, name) for name in fields}
         return values | ({"filter_cutoff": "none"} if self.filter_cutoff is None else {})
 
     @classmethod
-    def from_dict(cls, values: Mapping[str, Any]) -> "SpectrumSettings":
-        """Settings from a table as `to_dict` writes it; what it does not name keeps its default.
+    def names(cls, *, whole: bool = True) -> tuple[str, ...]:
+        """Names of all settings; without `whole` those that every table had since the first format."""
+        return tuple(field.name for field in dataclasses.fields(cls) if whole or field.name != "tapers")
 
-        **Raises:** `ValueError` for an unknown name, with the nearest known one, and for an invalid value.
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any], *, needed: Iterable[str] = ()) -> "SpectrumSettings":
+        """Settings from a table as `to_dict` writes it; what it does not name keeps its default, unless it is `needed`.
+
+        **Raises:** `ValueError` for an unknown name, with the nearest known one, for one missing, and for an invalid value.
         """
         known = [field.name for field in dataclasses.fields(cls)]
+        for name in needed:
+            if name not in values:
+                raise ValueError(f"has no key {name!r}: give it; a setting that is not there gets no default")
         for name, value in values.items():
             near = difflib.get_close_matches(name, known, n=1, cutoff=0.0)[0]
             remedy = f"no such spectrum setting, did you mean {near!r}? Known are {', '.join(known)}"
             require(name in known, name, value, remedy)
-        unfiltered = {"filter_cutoff": None} if values.get("filter_cutoff") == "none" else {}
-        return cls(**{**values, **unfiltered})
+        given = {**values, **({"filter_cutoff": None} if values.get("filter_cutoff") == "none" else {})}
+        for field in dataclasses.fields(cls):
+            if field.name in given:  # ranges are checked by the constructor
+                kind: Any = field.type
+                converted(_python(given[field.name]), kind, field.name)
+        return cls(**given)
 
     def replace(self, **changes: Any) -> "SpectrumSettings":
         """A copy with some fields changed; raises as `from_dict` does."""

@@ -7,11 +7,12 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 import scipy
-from jaxtyping import Float, PRNGKeyArray
+from jaxtyping import Float
 
 from jaxmuscle._common.arrays import as_numbers, require
-from jaxmuscle._common.keys import key_of
+from jaxmuscle._common.keys import check_key, key_of
 from jaxmuscle._common.text import choices
+from jaxmuscle._common.types import Key
 from jaxmuscle.data._target import Target
 from jaxmuscle.fits._result import FitResult
 from jaxmuscle.model._tasks import AbstractTask, PrescribedLength
@@ -31,6 +32,7 @@ WIDTH, FEWEST = 0.15, 5  # of a step of the density: relative to its frequency; 
 TRIES = 4  # how often the density follows the crest factors of its motion
 CREST = (1.6, 2.0)  # of position and velocity, to begin with
 ENOUGH = 1e-6
+MOST = 10**8  # samples of a motion
 NOTHING = 1e-4  # of the relative variance, by which a motion must lower it
 
 
@@ -46,7 +48,7 @@ def design_input(
     speed: float | None = None,
     spread: float = 0.1,
     target: str | None = None,
-    key: PRNGKeyArray | int = 0,
+    key: Key = 0,
 ) -> DesignedInput:
     """The motion of the insertion, within limits, whose record makes a quantity best known.
 
@@ -73,13 +75,15 @@ def design_input(
     for name, value, unit in (("rms", rms, "m"), ("peak", peak, "m"), ("speed", speed, "m/s"), ("rate", rate, "Hz")):
         require_positive(name, np.float64(1.0) if value is None else value, unit)
     require(0 <= spread <= 1, f"spread = {spread} must be a share, from 0 to 1")
+    check_key(key)
+    require(seconds * rate <= MOST, f"seconds = {seconds} at rate = {rate} Hz are more than {MOST} samples: make it shorter")
     frequency, samples = lines_in(band, seconds), round(seconds * rate)
     require(abs(samples - seconds * rate) < ENOUGH * samples,
             f"seconds = {seconds}: rate = {rate} Hz makes no whole number of samples of it")  # fmt: skip
     require(2 * frequency[-1] < rate, f"band = {band} Hz reaches beyond half of rate = {rate} Hz: raise the rate")
     quantities = (quantity,) if isinstance(quantity, str) else tuple(quantity)
     limits, crest = np.array([np.inf if limit is None else limit for limit in (peak, speed)]), np.array(CREST)
-    rng = np.random.default_rng(np.asarray(jax.random.key_data(key_of(key) if isinstance(key, int) else key)).tolist())
+    rng = np.random.default_rng(np.asarray(jax.random.key_data(key_of(key))).tolist())
 
     def realised(power: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """A motion of these lines, made smaller where it must be, and the crest factors of position and velocity."""

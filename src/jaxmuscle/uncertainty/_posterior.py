@@ -9,8 +9,10 @@ import numpy as np
 from jaxtyping import Array
 
 from jaxmuscle._common.environment import versions
+from jaxmuscle._common.keys import number_of
 from jaxmuscle._common.programs import kept
 from jaxmuscle._common.progress import told
+from jaxmuscle._common.types import Key
 from jaxmuscle.data._target import Target
 from jaxmuscle.fits._reopened import reopened
 from jaxmuscle.fits._result import FitResult
@@ -32,7 +34,7 @@ def posterior(
     result: FitResult,
     target: Target | None = None,
     *,
-    key: Array | int = 0,
+    key: Key = 0,
     chains: int = 4,
     draws: int = 1000,
     warmup: int = 500,
@@ -75,7 +77,7 @@ def posterior(
 
 
 def _reported(
-    problem: FitProblem, density: PosteriorDensity, found: Chains, result: FitResult, key: Array | int, warmup: int
+    problem: FitProblem, density: PosteriorDensity, found: Chains, result: FitResult, key: Key, warmup: int
 ) -> Posterior:
     shape, names = found.log_density.shape, problem.coordinates.names
     theta, s = _thetas(problem, density, found)
@@ -105,7 +107,7 @@ def _reported(
         shared = {n: names[c] for n, c in zip(part.coordinates.names, part.columns, strict=True)}
         parts[name] = PosteriorPart(part.target, task, drawn, shared)
     return Posterior(success, message, parts, samples, known, diagnostics, determined, modes, found, settings,
-                     key if isinstance(key, int) else None, versions())  # fmt: skip
+                     number_of(key), versions())  # fmt: skip
 
 
 def _thetas(problem: FitProblem, density: PosteriorDensity, found: Chains) -> tuple[np.ndarray, np.ndarray]:

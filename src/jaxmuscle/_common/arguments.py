@@ -1,0 +1,31 @@
+"""Numbers that a caller gives, checked: an error names the argument, its value and what is right."""
+
+import math
+import operator
+from typing import Any
+
+import numpy as np
+
+
+def is_real(value: Any) -> bool:
+    """Whether a value is a number, a finite one: no switch, no text, no array of several."""
+    if isinstance(value, bool | np.bool_ | str | bytes) or np.ndim(value):
+        return False
+    try:
+        return math.isfinite(value)
+    except (TypeError, ValueError, OverflowError):
+        return False
+
+
+def positive(name: str, value: Any, *, zero: bool = False) -> None:
+    """Raise a `ValueError` unless the value is a finite number above 0, or with `zero` 0 itself."""
+    if not (is_real(value) and (value > 0 or (zero and value == 0))):
+        raise ValueError(f"{name} = {value!r}: give a finite number {'of at least' if zero else 'above'} 0")
+
+
+def count(name: str, value: Any, least: int, most: int | None = None) -> None:
+    """Raise a `ValueError` unless the value is a whole number in the range."""
+    whole = isinstance(value, int | np.integer) and not isinstance(value, bool | np.bool_)
+    if not whole or operator.index(value) < least or (most is not None and operator.index(value) > most):
+        upper = "" if most is None else f" to {most}"
+        raise ValueError(f"{name} = {value!r}: give a whole number {'from' if upper else 'of at least'} {least}{upper}")

@@ -1,0 +1,234 @@
+"""What `fit.json` holds: the schema of its keys, and whether they agree with each other."""
+
+from collections.abc import Iterable
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import msgspec
+import numpy as np
+from msgspec import Meta
+
+from jaxmuscle._common.documents import Table, contradiction
+from jaxmuscle._common.keys import SEEDS
+from jaxmuscle.data._target import Target
+from jaxmuscle.objective._arguments import METHODS, RESIDUALS, base_of, target_of
+
+if TYPE_CHECKING:
+    from ._result import FitResult
+
+FORMAT = 3
+FORMATS = (2, 3)  # that can be read; 2 may leave out what task and target do not have
+SAME = 1e-9  # relative
+
+Number = float | None  # null where it is not finite
+Numbers = list[Number]
+Count = Annotated[int, Meta(ge=0)]
+Share = Annotated[float, Meta(ge=0, le=1)]
+
+
+def _told(text: str) -> Meta:
+    return Meta(description=text)
+
+
+class EstimateTable(Table, kw_only=True):
+    """A number with its error: an entry of `parameters` and `derived`."""
+
+    value: Annotated[Number, _told("Its value, null where there is none")]
+    unit: Annotated[str, _told("Its unit, 1 for a ratio")]
+    stderr: Annotated[Annotated[float, Meta(ge=0)] | None, _told("Standard error, null where the data do not determine it")]
+    free: Annotated[bool, _told("Whether it was fitted")]
+    identifiable: Annotated[bool | None, _told("Whether the data determine it, null of what was fixed")]
+    interval: Annotated[tuple[Number, Number] | None, _told("95 % interval, an end null where it is open")]
+
+
+class AdequacyTable(Table, kw_only=True):
+    """Whether the model describes the data: `adequacy`."""
+
+    chi2: Annotated[float, _told("Of all residuals")]
+    expected: Annotated[float, _told("Of the fitted model's own data")]
+    p: Annotated[Share, _told("How often these lie as far from their fit")]
+    misfit: Annotated[str, _told("Where the data lie furthest from the model")]
+
+
+class RungTable(Table, kw_only=True):
+    """A model that was tried: an entry of `ladder`."""
+
+    number: Annotated[Annotated[int, Meta(ge=-1)], _told("-1 noise alone, 0 base, 1 activation, 2 tremor, 3 resonance")]
+    model: Annotated[str, _told("In words")]
+    aic: Annotated[float, _told("-2 ln L + 2 parameters")]
+    parameters: Annotated[float, _told("Their effective number")]
+    chi2_per_bin: Annotated[float, _told("Chi² over bins")]
+    p: Annotated[Share, _told("That of the verdict")]
+    chosen: Annotated[bool, _told("Whether it was taken")]
+
+
+class StartTable(Table, kw_only=True):
+    """A start of the search: an entry of `starts`."""
+
+    cost: Annotated[Number, _told("½ Σ r² at its end")]
+    success: Annotated[bool, _told("Whether it settled")]
+    steps: Annotated[Count, _told("Steps taken")]
+
+
+class CorrelationTable(Table, kw_only=True):
+    """Of the free parameters; empty where the fit failed."""
+
+    parameters: Annotated[list[str], _told("Their names")] = msgspec.field(default_factory=list)
+    matrix: Annotated[list[list[float]], _told("A row for each")] = msgspec.field(default_factory=list)
+
+
+class ProfileTable(Table, kw_only=True):
+    """The harmonic's frequency tried: `profile`."""
+
+    frequency_hz: Annotated[Numbers, _told("Frequencies [Hz]")]
+    chi2_rise: Annotated[Numbers, _told("Rise of chi² there, all else fitted anew")]
+
+
+class SettingsTable(Table, kw_only=True):
+    """How it was fitted: `settings`. Posterior, profile and bootstrap take the fit up with it."""
+
+    free: Annotated[list[str], _told("Names of the fitted parameters")]
+    residual: Annotated[Literal[RESIDUALS], _told("How powers were compared")]  # pyright: ignore[reportInvalidTypeForm]
+    prior_centre: Annotated[dict[str, float], _told("Centre of the prior of every free parameter, in its unit")]
+    prior_sd: Annotated[dict[str, float | None], _told("Standard deviation of the prior, null where it is flat")]
+    bounds: Annotated[dict[str, tuple[Number, Number]], _told("Bounds that were asked for, null where there is none")]
+    starts: Annotated[Count, _told("Starts of the search")]
+    seeds: Annotated[Count, _told("Seeds of the nonlinear correction")]
+    check_seeds: Annotated[Count, _told("Fresh seeds of the reported spectrum")]
+    max_steps: Annotated[Count, _told("Steps of each descent at most")]
+    dt: Annotated[Annotated[float, Meta(gt=0)], _told("Step of the noise [s]")]
+    coefficient_of_variation: Annotated[bool | dict[str, bool], _told("Whether it was data; of several targets by name")]
+    mean_force: Annotated[
+        tuple[float, float] | dict[str, tuple[float, float] | None] | None, _told("Mean and its error [N] as data, or null")
+    ]
+    carried: Annotated[float | None, _told("By which the task was multiplied to come to the mean force")]
+    spectrum: Annotated[dict[str, Any], _told("Spectrum settings; of several targets by name")]
+    steps_per_sample: Annotated[Count, _told("Steps of dt between samples")]
+    separate: Annotated[tuple[str, ...], _told("Of several targets only: parameters with a value for each")] = ()
+    proportional: Annotated[tuple[str, ...], _told("Of several targets only: parameters whose ratio was kept")] = ()
+
+
+class SpectrumTable(Table, kw_only=True):
+    """Spectra on the target's bins: `spectrum`."""
+
+    frequency_hz: Annotated[list[float], _told("Frequencies [Hz]")]
+    target: Annotated[list[float], _told("Proportional power of the target")]
+    fitted: Annotated[Numbers, _told("That of the fit")]
+    harmonic_share: Annotated[Numbers, _told("Share of the harmonic in each bin")]
+    residual: Annotated[Numbers, _told("Target against fit [standard deviations]")]
+    deviation: Annotated[Numbers | None, _told("Standard deviation of the log power, null where it is unknown")]
+    components: Annotated[dict[str, Numbers], _told("Share of each part of the model in each bin")]
+
+
+class StretchTable(Table, kw_only=True):
+    """A few simulated seconds: `stretch`."""
+
+    time: Annotated[Numbers, _told("Time [s]")]
+    output: Annotated[Numbers, _told("Output, in its unit")]
+
+
+class PartTable(Table, kw_only=True):
+    """What belongs to one target: beside the other keys, of several targets under `parts` by name."""
+
+    target: Annotated[str, _told("Name of the target")]
+    provenance: Annotated[str, _told("Where its numbers are from")]
+    task: Annotated[str, _told("Name of the task")]
+    chi2_per_bin: Annotated[float | None, _told("Chi² over bins less one")]
+    rms_log_error: Annotated[float | None, _told("Standard deviation of the log of target over fit")]
+    spectrum: Annotated[SpectrumTable, _told("Spectra")]
+    stretch: Annotated[StretchTable, _told("A few simulated seconds")]
+    check: Annotated[dict[str, float | int], _told("How far linear response and simulation differ")]
+    further: Annotated[dict[str, float], _told("Residuals besides those of bins [standard deviations]")]
+    stiffness: Annotated[
+        tuple[list[float], list[float]] | None, _told("Fitted dynamic stiffness, real and imaginary [N/m], or null")
+    ]
+    target_table: Annotated[dict[str, Any], _told("The target, as in a target file; null for what it does not state")]
+    task_table: Annotated[dict[str, Any], _told("The fitted task, as in a preset")]
+
+
+class FitTable(Table, kw_only=True):
+    """The keys of a fit."""
+
+    format: Annotated[Literal[FORMATS], _told("Version of the format")]  # pyright: ignore[reportInvalidTypeForm]
+    success: Annotated[bool, _told("Whether the search converged")]
+    message: Annotated[str, _told("How it ended")]
+    adequate: Annotated[bool | None, _told("Whether the model describes the data, null where that is unknown")]
+    adequacy_p: Annotated[Share | None, _told("Its p-value")]
+    adequacy: Annotated[AdequacyTable | None, _told("More of it")]
+    verdict: Annotated[str, _told("The same in words")]
+    method: Annotated[Literal[METHODS], _told("How it was fitted")]  # pyright: ignore[reportInvalidTypeForm]
+    parameters: Annotated[dict[str, EstimateTable], _told("Every parameter; of several targets also name@target")]
+    derived: Annotated[dict[str, EstimateTable], _told("What follows from them")]
+    products: Annotated[list[str], _told("Products and ratios that the data determine")]
+    per_newton: Annotated[dict[str, Number], _told("Stiffness [1/m] and damping [s/m] over the mean force")]
+    correlation: Annotated[CorrelationTable, _told("Of the free parameters")]
+    undetermined: Annotated[list[str], _told("What can be scaled together unnoticed, in sentences")]
+    ladder: Annotated[list[RungTable], _told("Models that were tried")]
+    singular_values: Annotated[Numbers, _told("Of the Jacobian")]
+    starts: Annotated[list[StartTable], _told("The search")]
+    profile: Annotated[ProfileTable | None, _told("Of the harmonic's frequency")]
+    harmonic_p_value: Annotated[Share | None, _told("Whether there is a harmonic")]
+    notices: Annotated[list[str], _told("What to know about it")]
+    seed: Annotated[Annotated[int, Meta(ge=0, lt=SEEDS)] | None, _told("Seed, null where a key was given")]
+    settings: Annotated[SettingsTable, _told("How it was fitted")]
+    versions: Annotated[dict[str, str], _told("Of the libraries")]
+
+
+def disagreement(result: "FitResult") -> str | None:
+    """In words, where parts of a result contradict each other that are not made from each other; None if nowhere."""
+    settings, free = result.settings, set(result.free)
+    for key in ("free", "prior_centre", "prior_sd"):
+        if set(settings[key]) != free:
+            return f"settings.{key} names {_names(settings[key])}, but free among the parameters are {_names(free)}"
+    if not set(settings["bounds"]) <= free:
+        return f"settings.bounds names {_names(settings['bounds'])}, but free are {_names(free)}"
+    if len(result.parts) > 1 and not {"separate", "proportional"} <= set(settings):
+        return "settings has no key 'separate' or 'proportional', which the fit of several targets has"
+    spectra = {name: part.target.settings.to_dict() for name, part in result.parts.items()}
+    used = settings["spectrum"] if len(spectra) > 1 else {name: settings["spectrum"] for name in spectra}
+    if differs := contradiction(used, spectra, "settings.spectrum"):
+        return differs
+    of = result.correlation
+    if len(of) == 1 or (
+        of and (len(of["matrix"]), *map(len, of["matrix"])) != (len(of["parameters"]),) * (1 + len(of["parameters"]))
+    ):
+        return "correlation.matrix needs a row and a column for each of correlation.parameters"
+    if result.profile is not None and len(result.profile[0]) != len(result.profile[1]):
+        return "profile.chi2_rise needs a number for each of profile.frequency_hz"
+    return _values(result)
+
+
+def _values(result: "FitResult") -> str | None:
+    """Parameters against the tasks that have them."""
+    for name, estimate in result.parameters.items():
+        base, own = base_of(name), target_of(name)
+        if own and own not in result.tasks:
+            return f"parameters.{name}: there is no target {own!r}"
+        tasks = [result.tasks[own]] if own else [task for task in result.tasks.values() if base in task.parameter_names]
+        if not tasks or base not in tasks[0].parameter_names:
+            return f"parameters.{name}: no task has this parameter"
+        value = float(tasks[0][base])
+        if np.isfinite(estimate.value) and not np.isclose(value, estimate.value, rtol=SAME, atol=0):
+            return f"parameters.{name}.value is {estimate.value!r}, but {value!r} in the task_table"
+    missing = {name for task in result.tasks.values() for name in task.parameter_names} - set(
+        map(base_of, result.parameters)
+    )
+    return f"parameters has no key {sorted(missing)[0]!r}, which the task has" if missing else None
+
+
+def check_lengths(table: PartTable, target: Target) -> None:
+    """Raise a `ValueError` for columns that have not a number for each bin, or for each time."""
+    spectrum, bins = table.spectrum, len(target.bins)
+    columns = {name: getattr(spectrum, name) for name in ("fitted", "harmonic_share", "residual", "deviation")}
+    for name, column in (columns | spectrum.components).items():
+        if column is not None and len(column) != bins:
+            raise ValueError(f"spectrum.{name} has {len(column)} numbers, the target {bins} bins")
+    if len(table.stretch.time) != len(table.stretch.output):
+        raise ValueError("stretch.output needs a number for each of stretch.time")
+    known = 0 if target.stiffness is None else len(target.stiffness.known.frequency)
+    real, imaginary = table.stiffness or ([], [])
+    if not len(real) == len(imaginary) == known:
+        raise ValueError(f"stiffness has {len(real)} real and {len(imaginary)} imaginary parts, the target {known}")
+
+
+def _names(names: Iterable[str]) -> str:
+    return ", ".join(sorted(names)) or "none"
