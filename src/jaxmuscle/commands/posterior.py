@@ -9,7 +9,20 @@ import typer
 import jaxmuscle as jm
 from jaxmuscle._common.progress import told
 
-from .console import CONVERGED, NOT_CONVERGED, aim_of, err, out, plain, record, reporting, save_figure, show, writable
+from .console import (
+    CONVERGED,
+    NOT_CONVERGED,
+    aim_of,
+    err,
+    out,
+    plain,
+    record,
+    reporting,
+    save_figure,
+    show,
+    writable,
+    write_fit,
+)
 from .options import (
     Fix,
     Force,
@@ -67,7 +80,12 @@ def posterior(
         taken_up = Path(target).resolve() == (output / "fit.json").resolve()
         writable(output, *["fit.json"] * (not taken_up), "posterior.nc", "posterior.json", force=force)
         asked = {"task": task, "noise": None if noise is None else str(noise), "free": free, "fix": fix}
-        result = _fitted(target, {"segments": segments, "quantity": quantity}, asked, seed)
+        try:
+            result = _fitted(target, {"segments": segments, "quantity": quantity}, asked, seed)
+        except jm.fits.FitInterrupted as stop:
+            write_fit(stop.result, output, figure=False)
+            err.print(f"what the fit had reached is in {output}")
+            raise
         if not result.success:
             err.print(f"[bold red]failed:[/] the fit did not converge: {plain(result.message)}", highlight=False)
             raise typer.Exit(NOT_CONVERGED)
@@ -77,6 +95,9 @@ def posterior(
                 found = jm.posterior(result, key=seed, chains=chains, draws=draws, warmup=warmup, progress=tell)
         except ImportError as error:
             raise ValueError(str(error)) from None
+        except KeyboardInterrupt:
+            err.print(f"the fit stays: go on with jaxmuscle posterior {output}/fit.json --out {output}", soft_wrap=True)
+            raise
         _write(found, output)
         record(output / "posterior.json")
         _show(found, output)
