@@ -5,6 +5,7 @@ while XLA compiles or a compiled program runs. So a thread beside it ends the pr
 Nothing is half written then: files are renamed into place.
 """
 
+import atexit
 import contextlib
 import io
 import os
@@ -31,6 +32,7 @@ class Ear:
 
     def __init__(self) -> None:
         self.code = 0
+        self.working = True
         self.wakes, self.woken = socket.socketpair()
         self.wakes.setblocking(False)
 
@@ -46,12 +48,15 @@ class Ear:
         if hasattr(os, "register_at_fork"):
             os.register_at_fork(after_in_child=deaf)
         threading.Thread(target=self.watch, daemon=True).start()
+        atexit.register(ignore)  # called last, since it is registered first: then Python takes its handlers down
 
     def __call__(self, number: int, frame: FrameType | None) -> None:
         if number != LATER:
             if self.code:
                 return  # it is ending; `watch` sees to a second signal
             self.code = 128 + number
+        if not self.working:
+            leave(self.code)  # all is written: Python's own end can take long
         if importing(frame) and LATER is not None:
             signal.setitimer(signal.ITIMER_REAL, SOON)  # a module that is loaded in part is an error somewhere else
         else:
@@ -89,6 +94,12 @@ def deaf() -> None:
     for number in (*ENDING, LATER):
         if isinstance(signal.getsignal(number), Ear):
             signal.signal(number, signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL)
+
+
+def ignore() -> None:
+    """Hear nothing any more: the command has ended, and its exit code is known."""
+    for number in ENDING:
+        signal.signal(number, signal.SIG_IGN)
 
 
 def importing(frame: FrameType | None) -> bool:
@@ -166,7 +177,9 @@ def heard() -> Iterator[None]:
     try:
         yield
     except KeyboardInterrupt:
+        ear.code = ear.code or 128 + signal.SIGINT
         print("interrupted", file=sys.stderr)
     finally:
+        ear.working = False
         if ear.code:
             leave(ear.code)
