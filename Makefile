@@ -84,8 +84,8 @@ clean:
 	@echo "Installing the oldest versions into .venv-minimum"
 	@$(PYTHON) -m venv --clear .venv-minimum
 	@.venv-minimum/bin/python -m pip --quiet --disable-pip-version-check install uv
-	@.venv-minimum/bin/uv pip compile --quiet --resolution lowest-direct --python .venv-minimum/bin/python --all-extras \
-	  --group test --output-file .venv-minimum/versions.txt pyproject.toml >/dev/null
+	@.venv-minimum/bin/uv pip compile --quiet --resolution lowest-direct --python .venv-minimum/bin/python \
+	  --extra posterior --extra url --extra c3d --group test --output-file .venv-minimum/versions.txt pyproject.toml >/dev/null
 	@.venv-minimum/bin/uv pip install --quiet --python .venv-minimum/bin/python --requirement .venv-minimum/versions.txt \
 	  --editable .
 	@touch $@

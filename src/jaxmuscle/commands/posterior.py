@@ -21,7 +21,6 @@ from .console import (
     save_figure,
     show,
     writable,
-    write_fit,
 )
 from .options import (
     Fix,
@@ -83,8 +82,8 @@ def posterior(
         try:
             result = _fitted(target, {"segments": segments, "quantity": quantity}, asked, seed)
         except jm.fits.FitInterrupted as stop:
-            write_fit(stop.result, output, figure=False)
-            err.print(f"what the fit had reached is in {output}")
+            stop.result.save(output / "fit.json")
+            err.print(f"what the fit had reached is in {output}/fit.json")
             raise
         if not result.success:
             err.print(f"[bold red]failed:[/] the fit did not converge: {plain(result.message)}", highlight=False)

@@ -18,11 +18,12 @@ from collections.abc import Iterator
 from types import FrameType
 from typing import Any, NoReturn, TextIO
 
-LIMIT = 8.0  # seconds from the first signal to the end
+LIMIT = 7.0  # seconds from the first signal to the end
 PATIENCE = 1.0  # a second signal so many seconds later ends the process at once
 SOON = 0.05
 ENDING = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
 LATER = getattr(signal, "SIGALRM", None)
+OURS = [number for number in (*ENDING, LATER) if number is not None]
 IMPORTS = "<frozen importlib"
 SHOW_CURSOR = "\x1b[?25h"  # a bar of rich has hidden it
 
@@ -91,7 +92,7 @@ class Ear:
 def deaf() -> None:
     """Take signals as Python does: in a fork, which would wake its parent."""
     signal.set_wakeup_fd(-1)
-    for number in (*ENDING, LATER):
+    for number in OURS:
         if isinstance(signal.getsignal(number), Ear):
             signal.signal(number, signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL)
 
@@ -121,9 +122,9 @@ def leave(code: int) -> NoReturn:
     """End this process and its children now: Python's own end waits for threads and for programs that run on a device."""
     flushing = threading.Thread(target=flush, daemon=True)
     flushing.start()
-    flushing.join(1.0)  # for ever if nobody reads
-    processes = sys.modules.get("multiprocessing")
-    for child in processes.active_children() if processes else ():
+    flushing.join(0.5)  # for ever if nobody reads
+    children = getattr(sys.modules.get("multiprocessing"), "active_children", list)  # it may be imported in part
+    for child in children():
         child.kill()
     os._exit(code)
 
