@@ -611,7 +611,8 @@ def test_ctrl_c(tmp_path):
 import contextlib, signal, time
 signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs ignore it
 from jaxmuscle.__main__ import main
-from jaxmuscle.commands import fit as _cli_fit
+from jaxmuscle.commands import fit as _cli_fit, signals
+signals.LIMIT = 200  # what reports a fit may have to be compiled
 
 @contextlib.contextmanager
 def loud(progress, title):
