@@ -5,17 +5,18 @@ BIN = .venv/bin
 PYTEST = $(BIN)/python -m pytest -q -n 2 --dist loadfile --no-loadscope-reorder
 PIP = $(BIN)/python -m pip --quiet --disable-pip-version-check install
 
-.PHONY: help fit test test-fast mutants bench docs clean
+.PHONY: help fit test test-fast test-minimum mutants bench docs clean
 
 help:
 	@echo "make fit        fit a bundled measured target; writes report and figure to out/fit"
 	@echo "make test       ruff, basedpyright and the whole test suite"
 	@echo "make test WING=spectra  the tests of one folder of the package and of those above it"
 	@echo "make test-fast  the tests that are not marked slow"
+	@echo "make test-minimum  some tests with the oldest versions that pyproject.toml allows, in .venv-minimum"
 	@echo "make mutants    random faults in the package: which of them a test notices; out/mutants.json"
 	@echo "make bench      measure speed; writes out/bench.json"
 	@echo "make docs       write the documentation; open site/index.html"
-	@echo "make clean      remove outputs and caches, but not .venv"
+	@echo "make clean      remove outputs and caches, but not .venv and .venv-minimum"
 	@echo "Another interpreter: make PYTHON=python3.12 fit"
 
 fit: .venv/.stamp-run
@@ -32,6 +33,12 @@ test: .venv/.stamp-test
 test-fast: .venv/.stamp-test
 	$(PYTEST) -m "not slow"
 
+# What calls most of the libraries, and takes a few minutes.
+MINIMUM = tests/_common tests/spectra/test_spectrum.py tests/data tests/commands tests/model/test_task.py tests/ensembles \
+          tests/fits/test_result.py tests/plot
+test-minimum: .venv-minimum/.stamp
+	.venv-minimum/bin/python -m pytest -q -m "not slow" $(MINIMUM)
+
 mutants: .venv/.stamp-test
 	$(BIN)/python tests/mutants.py
 
@@ -44,7 +51,7 @@ docs: .venv/.stamp-docs
 
 clean:
 	rm -rf out site dist build .test-out .pytest_cache .ruff_cache .hypothesis
-	find . -path ./.venv -prune -o -type d -name __pycache__ -prune -exec rm -rf {} +
+	find . -path './.venv*' -prune -o -type d -name __pycache__ -prune -exec rm -rf {} +
 
 .venv/.stamp-run: pyproject.toml
 	@command -v $(PYTHON) >/dev/null || \
@@ -71,4 +78,14 @@ clean:
 .venv/.stamp-docs: .venv/.stamp-run
 	@echo "Installing the documentation tools into .venv"
 	@$(PIP) --group docs
+	@touch $@
+
+.venv-minimum/.stamp: pyproject.toml
+	@echo "Installing the oldest versions into .venv-minimum"
+	@$(PYTHON) -m venv --clear .venv-minimum
+	@.venv-minimum/bin/python -m pip --quiet --disable-pip-version-check install uv
+	@.venv-minimum/bin/uv pip compile --quiet --resolution lowest-direct --python .venv-minimum/bin/python \
+	  --extra posterior --extra url --extra c3d --group test --output-file .venv-minimum/versions.txt pyproject.toml >/dev/null
+	@.venv-minimum/bin/uv pip install --quiet --python .venv-minimum/bin/python --requirement .venv-minimum/versions.txt \
+	  --editable .
 	@touch $@

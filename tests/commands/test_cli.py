@@ -609,21 +609,21 @@ def test_ctrl_c(tmp_path):
     """A real signal, once the first steps have been taken."""
     code = """
 import contextlib, signal, time
-from jaxmuscle.commands import main as _cli
-from jaxmuscle.commands import fit as _cli_fit
-
 signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs ignore it
+from jaxmuscle.__main__ import main
+from jaxmuscle.commands import fit as _cli_fit, signals
+signals.LIMIT = 200  # what reports a fit may have to be compiled
 
 @contextlib.contextmanager
 def loud(progress, title):
     def tell(text, share):
         print(text, flush=True)
         if text.startswith("trying starts"):
-            time.sleep(60)  # until the signal: Python would swallow it while it collects garbage
+            time.sleep(60)  # until the signal
     yield tell
 
 _cli_fit.told = loud
-_cli.main()
+main()
 """
     arguments = ["fit", str(csv_file(tmp_path)), "--free", "c_w,noise_K_w", "--starts", "4", "--seeds", "24"]
     command = [sys.executable, "-c", code, *arguments, "--out", str(tmp_path / "out")]

@@ -527,7 +527,6 @@ join(f"127.0.0.1:{port}", 2, rank)
 jax.devices()  # JAX itself waits for all here
 if rank == 0:
     print(jm.ensemble(jm.Isometric(), jax.random.key(5), seeds=12, duration=1.0).output.shape, flush=True)
-jax.distributed.shutdown()
 """
 
 

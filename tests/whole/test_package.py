@@ -79,7 +79,7 @@ def test_metadata_of_the_wheel(built):
     assert set(data.get_all("Provides-Extra", [])) == {"all", "c3d", "labs", "notebooks", "posterior", "url"}
     assert f"{folder}/licenses/LICENSE" in archive.namelist()
     assert archive.read(f"{folder}/entry_points.txt").decode().split() == [
-        "[console_scripts]", "jaxmuscle", "=", "jaxmuscle.commands.main:main",
+        "[console_scripts]", "jaxmuscle", "=", "jaxmuscle.__main__:main",
     ]  # fmt: skip
 
 

@@ -17,12 +17,13 @@ from rich.console import Console
 import jaxmuscle as jm
 
 from .options import SAME_NAME, Observed, TaskName
+from .signals import interrupted
 
 if TYPE_CHECKING:
     from jaxmuscle.fits import FitResult
 
 
-CONVERGED, NOT_CONVERGED, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
+CONVERGED, NOT_CONVERGED, BAD_INPUT = 0, 1, 2
 
 out = Console(soft_wrap=False)
 err = Console(stderr=True, soft_wrap=not sys.stderr.isatty())  # a message is one line of a log
@@ -57,7 +58,7 @@ def aimed(target: Any, task: TaskName | None) -> tuple[Any, Any]:
 
 @contextlib.contextmanager
 def reporting(as_json: bool = False) -> Iterator[None]:
-    """Turn a user's mistake into one line and exit code 2, a numerical failure into 1, an interruption into 130.
+    """Turn a user's mistake into one line and exit code 2, a numerical failure into 1, an interruption into 130 (or 143).
 
     With `as_json` the text for people stays away from stdout, which is for `record` alone.
     """
@@ -75,7 +76,7 @@ def reporting(as_json: bool = False) -> Iterator[None]:
         raise typer.Exit(NOT_CONVERGED) from None
     except KeyboardInterrupt:
         err.print("interrupted")
-        raise typer.Exit(INTERRUPTED) from None
+        raise typer.Exit(interrupted()) from None
     finally:
         out.quiet = False
 

@@ -116,8 +116,13 @@ def run(model: "AbstractTask", sweep: Any, seeds: int, seed: int, output: str, s
     begun = time.monotonic()
     with watching(f"{seeds} seeds", first=first) as tell:
         kept: Any = {"reduce": True} if reduce else {}
-        found: Any = jm.ensemble(model if sweep is None else sweep, jax.random.key(seed), seeds=seeds, store=output,
-                                  progress=jm.ensembles.Watch(tell), **kept, **settings)  # fmt: skip
+        try:
+            found: Any = jm.ensemble(model if sweep is None else sweep, jax.random.key(seed), seeds=seeds, store=output,
+                                      progress=jm.ensembles.Watch(tell), **kept, **settings)  # fmt: skip
+        except KeyboardInterrupt:
+            again = "the same command again" if part is not None else "the same command with --resume"
+            err.print(f"what is complete stays in {output}: {again} goes on", highlight=False, soft_wrap=True)
+            raise
     elapsed = time.monotonic() - begun
     about = {"event": "done", "out": output, "seeds": seeds, "elapsed_s": round(elapsed, 3)}
     if part is not None:

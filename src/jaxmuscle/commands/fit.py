@@ -10,7 +10,6 @@ from jaxmuscle._common.progress import told
 
 from .console import (
     CONVERGED,
-    INTERRUPTED,
     NOT_CONVERGED,
     aim_of,
     aimed,
@@ -42,6 +41,7 @@ from .options import (
     names_in,
 )
 from .recordings import read_recordings, reads_perturbed, unused
+from .signals import interrupted
 
 
 @reads_perturbed
@@ -188,12 +188,13 @@ def fit(
 
 
 def _fit_one(target: Any, model: Any, folder: Path, options: dict[str, Any], *, quick: bool) -> bool:
-    """The table as soon as the search has ended, then what the checks add; Ctrl-C in these keeps the fit."""
+    """The table as soon as the search has ended, then what the checks add; the fit is written before these."""
     printed = []
 
     def answer(result: Any) -> None:
         show(result, success=result.success and result.adequate is not False)
         printed.append(result)
+        write_fit(result, folder, figure=False)  # a program of the checks may run longer than a signal can wait
 
     try:
         with told(True, f"fitting {target[0].name if isinstance(target, list) else target.name}") as tell:
@@ -204,7 +205,7 @@ def _fit_one(target: Any, model: Any, folder: Path, options: dict[str, Any], *, 
         write_fit(stop.result, folder, figure=False)
         record(folder / "fit.json")
         err.print(f"interrupted: what had been reached is in {folder}")
-        raise typer.Exit(INTERRUPTED) from None
+        raise typer.Exit(interrupted()) from None
     record(folder / "fit.json")
     if not printed:
         answer(result)

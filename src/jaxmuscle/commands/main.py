@@ -3,7 +3,6 @@
 import gc
 import logging
 import os
-import signal
 import sys
 from typing import Annotated
 
@@ -94,15 +93,9 @@ def presets(as_json: Json = False) -> None:
 
 
 def main() -> None:
-    """Entry point of the console script."""
+    """The command; `jaxmuscle.__main__` calls it and hears signals."""
     os.environ.setdefault("MPLBACKEND", "Agg")
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # XLA's remarks on slow compilation are not for users
     # Tracing makes many objects that stay: a tenth of a command would go into looking for cycles among them.
     gc.set_threshold(200_000, 10, 10)
-    if sys.platform != "win32":
-        signal.signal(signal.SIGPIPE, signal.SIG_DFL)  # `jaxmuscle targets | head` ends like any command of the shell
     app(prog_name="jaxmuscle")
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -8,7 +8,19 @@ import typer
 import jaxmuscle as jm
 from jaxmuscle._common.progress import told
 
-from .console import CONVERGED, NOT_CONVERGED, aim_of, err, out, plain, record, reporting, save_figure, show, writable
+from .console import (
+    CONVERGED,
+    NOT_CONVERGED,
+    aim_of,
+    err,
+    out,
+    plain,
+    record,
+    reporting,
+    save_figure,
+    show,
+    writable,
+)
 from .options import (
     Fix,
     Force,
@@ -66,7 +78,12 @@ def posterior(
         taken_up = Path(target).resolve() == (output / "fit.json").resolve()
         writable(output, *["fit.json"] * (not taken_up), "posterior.nc", "posterior.json", force=force)
         asked = {"task": task, "noise": None if noise is None else str(noise), "free": free, "fix": fix}
-        result = _fitted(target, {"segments": segments, "quantity": quantity}, asked, seed)
+        try:
+            result = _fitted(target, {"segments": segments, "quantity": quantity}, asked, seed)
+        except jm.fits.FitInterrupted as stop:
+            stop.result.save(output / "fit.json")
+            err.print(f"what the fit had reached is in {output}/fit.json")
+            raise
         if not result.success:
             err.print(f"[bold red]failed:[/] the fit did not converge: {plain(result.message)}", highlight=False)
             raise typer.Exit(NOT_CONVERGED)
@@ -76,6 +93,9 @@ def posterior(
                 found = jm.posterior(result, key=seed, chains=chains, draws=draws, warmup=warmup, progress=tell)
         except ImportError as error:
             raise ValueError(str(error)) from None
+        except KeyboardInterrupt:
+            err.print(f"the fit stays: go on with jaxmuscle posterior {output}/fit.json --out {output}", soft_wrap=True)
+            raise
         _write(found, output)
         record(output / "posterior.json")
         _show(found, output)

@@ -1,7 +1,12 @@
 """Several processes, on one machine or many, that share the work on one store: JAX's distributed runtime."""
 
+import atexit
+import contextlib
 import os
+import signal
+import socket
 import sys
+import threading
 import time
 from typing import NoReturn
 
@@ -12,6 +17,7 @@ from jaxmuscle._common.errors import ProcessLostError
 
 TEXT = 4096
 LAST_WORDS = 2.0  # seconds
+PATIENCE = 10.0
 
 
 def join(coordinator: str | None, processes: int | None, process_id: int | None) -> None:
@@ -31,6 +37,34 @@ def join(coordinator: str | None, processes: int | None, process_id: int | None)
         jax.distributed.initialize(coordinator, processes, process_id)
     except (RuntimeError, ValueError) as error:
         raise ValueError(f"the processes did not find each other at {coordinator}: {error}") from None
+    if (handler := signal.getsignal(signal.SIGTERM)) is not None:
+        signal.signal(signal.SIGTERM, handler)  # JAX has put one of its own there, which only takes a note
+    if coordinator is not None and process_id:
+        _follow(coordinator)
+
+
+def _follow(coordinator: str) -> None:
+    """End this process in one sentence once process 0 has died: XLA would end it with a stack of C++."""
+    host, _, port = coordinator.rpartition(":")
+    ended = threading.Event()
+    atexit.register(ended.set)  # before JAX says goodbye to process 0
+
+    def follow() -> None:
+        while True:
+            try:
+                with socket.create_connection((host.strip("[]"), int(port)), PATIENCE) as line:
+                    line.settimeout(None)
+                    with contextlib.suppress(ConnectionError):
+                        while line.recv(TEXT):
+                            pass
+            except OSError:
+                break
+        if not ended.is_set():
+            os.write(2, b"failed: process 0 of this run died or stopped. What is complete stays: start all processes again "
+                        b"with --resume\n")  # fmt: skip
+            os._exit(1)
+
+    threading.Thread(target=follow, daemon=True).start()
 
 
 def launched() -> bool:

@@ -17,7 +17,7 @@ from ._opening import opened
 from ._parts import Part, PartReport, failed_in, finish
 from ._places import AbstractPlace
 from ._processes import meet, rank_and_count
-from ._running_moments import CELLS, add, count_cells, empty, set_cells
+from ._running_moments import CELLS, RunningMoments, add, count_cells, empty, set_cells
 from ._settings import about, identity
 from ._store import PARTS, Begin, Variable, chunk_log, ensemble_at, logged, write_region
 from ._summary import EnsembleSummary, summarised
@@ -103,7 +103,9 @@ def _share_tallies(
     if rank == 0 and old:
         write_tally(place, key, base)
         place.remove(*old)
-    found = _reduce(layout, levels, base if rank == 0 else nothing(), todo, tell, _keeper(place, key))
+    found = _reduce(
+        layout, levels, base if rank == 0 else nothing(), todo, tell, lambda found: write_tally(place, key, found)
+    )
     write_tally(place, key, found)
     meet()
 
@@ -116,32 +118,47 @@ def _reduce_part(
     base = read_tally(place, key) or nothing()
     todo = [n for n in part.chunks(layout.chunks) if n not in base.chunks]
     if todo:
-        base = _reduce(layout, levels, base, todo, tell, _keeper(place, key))
+        base = _reduce(layout, levels, base, todo, tell, lambda found: write_tally(place, key, found))
         write_tally(place, key, base)
     return base.failed
 
 
 def _reduce(
-    layout: Layout, levels: tuple[float, ...], found: Reduced, numbers: Any, tell: Tell, keep: Callable[[Reduced], None]
+    layout: Layout, levels: tuple[float, ...], found: Reduced, numbers: Any, tell: Tell, save: Callable[[Reduced], None]
 ) -> Reduced:
-    """Chunks into a tally, which starts as `found`."""
+    """Chunks into a tally, which starts as `found`; saved from time to time, and when interrupted."""
     tally, chunks, failed = found.tally, set(found.chunks), list(found.failed)
-    for chunk, result in run_chunks(layout, numbers, tell):
-        for row, point in enumerate(chunk.points):
-            finite = result["finite"][row]
-            output = result["output"][row][finite]
-            add(tally, point, _rows(layout, result, row)[finite])
-            if layout.whole:
-                if len(output):
-                    tally.exact[point] = np.quantile(output, levels, axis=0)
-                continue
-            if np.isnan(tally.low[point]).any():
-                set_cells(tally, point, _cell_sample(layout, chunk, point, output))
-            count_cells(tally, point, output)
-        chunks.add(chunk.number)
-        failed += _failed(layout, chunk, result)
-        keep(Reduced(tally, frozenset(chunks), failed))
+    keep, adding = _keeper(save), False
+    try:
+        for chunk, result in run_chunks(layout, numbers, tell):
+            adding = True
+            failed += _add_chunk(layout, levels, tally, chunk, result)
+            chunks.add(chunk.number)
+            adding = False
+            keep(Reduced(tally, frozenset(chunks), failed))
+    except KeyboardInterrupt:
+        if not adding:  # else the tally holds a part of a chunk: what was saved last stays
+            save(Reduced(tally, frozenset(chunks), failed))
+        raise
     return Reduced(tally, frozenset(chunks), failed)
+
+
+def _add_chunk(
+    layout: Layout, levels: tuple[float, ...], tally: RunningMoments, chunk: Chunk, result: dict[str, np.ndarray]
+) -> list[list[int]]:
+    """One chunk into the tally; what of it failed."""
+    for row, point in enumerate(chunk.points):
+        finite = result["finite"][row]
+        output = result["output"][row][finite]
+        add(tally, point, _rows(layout, result, row)[finite])
+        if layout.whole:
+            if len(output):
+                tally.exact[point] = np.quantile(output, levels, axis=0)
+            continue
+        if np.isnan(tally.low[point]).any():
+            set_cells(tally, point, _cell_sample(layout, chunk, point, output))
+        count_cells(tally, point, output)
+    return _failed(layout, chunk, result)
 
 
 def _failed(layout: Layout, chunk: Chunk, found: dict[str, np.ndarray]) -> list[list[int]]:
@@ -170,15 +187,15 @@ def _rows(layout: Layout, found: dict[str, np.ndarray], row: int) -> np.ndarray:
     return np.concatenate([output, power, left, found["variation"][row][:, None]], axis=1, dtype=float)
 
 
-def _keeper(place: AbstractPlace, key: str) -> Callable[[Reduced], None]:
-    """Writes what it is given, not too often."""
+def _keeper(save: Callable[[Reduced], None]) -> Callable[[Reduced], None]:
+    """Saves what it is given, not too often."""
     due = time.monotonic() + KEEP_EVERY
 
     def keep(found: Reduced) -> None:
         nonlocal due
         begun = time.monotonic()
         if begun >= due:
-            write_tally(place, key, found)
+            save(found)
             now = time.monotonic()
             due = now + max(KEEP_EVERY, KEEP_SHARE * (now - begun))
 

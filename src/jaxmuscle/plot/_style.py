@@ -1,6 +1,7 @@
 """The style of all figures: colours that colour-blind readers can tell apart, sizes for print, axes with their units."""
 
 import functools
+import threading
 from collections.abc import Callable
 from typing import Any, Literal, ParamSpec, TypeVar, cast
 
@@ -36,6 +37,7 @@ STYLE: dict[str, Any] = {
     "figure.dpi": 160.0,
 }
 SIZE = (4.5, 3.0)
+LOCK = threading.RLock()  # pyplot and rcParams are those of all threads
 PROPORTIONAL = "Proportional power (fraction per bin)"
 
 P = ParamSpec("P")
@@ -43,18 +45,19 @@ R = TypeVar("R")
 
 
 def styled(draw: Callable[P, R]) -> Callable[P, R]:
-    """Runs a drawing function in this module's style; the caller's rcParams are the same before and after."""
+    """Runs a drawing function in this module's style, one thread at a time; the caller's rcParams stay the same."""
 
     @functools.wraps(draw)
     def inside(*args: P.args, **kwargs: P.kwargs) -> R:
-        # Not rc_context: it also restores what a notebook's backend sets about itself while the first figure is made.
-        params = cast(Any, matplotlib.rcParams)
-        before = {name: params[name] for name in STYLE}
-        params.update(STYLE)
-        try:
-            return draw(*args, **kwargs)
-        finally:
-            params.update(before)
+        with LOCK:
+            # Not rc_context: it also restores what a notebook's backend sets about itself while the first figure is made.
+            params = cast(Any, matplotlib.rcParams)
+            before = {name: params[name] for name in STYLE}
+            params.update(STYLE)
+            try:
+                return draw(*args, **kwargs)
+            finally:
+                params.update(before)
 
     return inside
 

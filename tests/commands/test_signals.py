@@ -1,0 +1,170 @@
+"""Signals end a command soon, with their exit code and no traceback, and what was reached is kept."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import jax
+import pytest
+
+import jaxmuscle as jm
+from jaxmuscle.ensembles._places import place_of
+from jaxmuscle.ensembles._store import read_tallies
+
+SRC = Path(__file__).parents[2] / "src"
+BEGIN = """
+import os, signal, socket, sys, time
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs ignore it
+from jaxmuscle.commands import signals
+from jaxmuscle.__main__ import main
+def send(number):
+    os.kill(os.getpid(), number)
+"""
+pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="has no such signals")
+
+
+def begun(code, *arguments, cwd=None):
+    """A process of that program, which can say when it wants a signal."""
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    environment = os.environ | {"PYTHONPATH": str(SRC)}
+    return subprocess.Popen([sys.executable, "-c", BEGIN + code, *arguments], env=environment, cwd=cwd, **pipes)
+
+
+def ended(process, code):
+    """What a process said, which ended with that exit code and in order."""
+    out, errors = process.communicate(timeout=120)
+    assert process.returncode == code, errors
+    assert "Traceback" not in errors and "Exception ignored" not in errors
+    return out + errors
+
+
+ALONE = {
+    "between two instructions": ("send(signal.SIGTERM); time.sleep(60)", 143),
+    "the terminal is gone": ("send(signal.SIGHUP); time.sleep(60)", 129),
+    "where Python drops exceptions": ("""
+class Dropped:
+    def __del__(self):
+        send(signal.SIGINT)
+        time.sleep(1)
+Dropped()
+time.sleep(60)""", 130),
+    "a signal that was dropped, and a second one": ("""
+signals.PATIENCE = 0.1
+for _ in range(2):
+    try:
+        send(signal.SIGINT)
+        time.sleep(1)
+    except KeyboardInterrupt:
+        time.sleep(0.5)
+time.sleep(60)""", 130),
+    "at the end": ("send(signal.SIGTERM); raise ValueError", 143),
+    "a child's, which is not its parent's": ("""
+child = os.fork()
+if child == 0:
+    send(signal.SIGTERM)
+assert os.waitpid(child, 0)[1] == signal.SIGTERM
+time.sleep(0.3)
+send(signal.SIGINT)
+time.sleep(60)""", 130),
+    "somebody else's pipe is closed": ("""
+ours, theirs = socket.socketpair()
+theirs.close()
+try:
+    ours.send(b"x")
+except BrokenPipeError:
+    send(signal.SIGTERM)
+time.sleep(60)""", 143),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", ALONE)
+def test_without_a_command(case):
+    text, code = ALONE[case]
+    process = begun("with signals.heard():\n" + "\n".join("    " + line for line in text.splitlines()))
+    assert "interrupted" in ended(process, code) or case == "at the end"
+
+
+def test_what_is_ignored_on_purpose_stays_so():
+    """As with nohup."""
+    code = "signal.signal(signal.SIGHUP, signal.SIG_IGN)\nwith signals.heard(): send(signal.SIGHUP); print('goes on')"
+    assert "goes on" in ended(begun(code), 0)
+
+
+@pytest.mark.parametrize("module", ["typer", pytest.param("jax", marks=pytest.mark.slow)])
+def test_while_a_module_is_imported(module, tmp_path):
+    """Of the command, and of what a fit needs."""
+    code = f"""
+class Now:
+    def find_spec(self, name, path=None, target=None):
+        if name == {module!r}:
+            sys.meta_path.remove(self)
+            send(signal.SIGINT)
+sys.meta_path.insert(0, Now())
+main()"""
+    process = begun(code, "fit", "vastus-lateralis-26mvc", "--out", "out", cwd=tmp_path)
+    assert ended(process, 130).strip().startswith("interrupted")
+    assert not list(tmp_path.rglob("*.*"))
+
+
+@pytest.mark.slow
+def test_while_a_compiled_program_runs():
+    """It never ends, and Python gets no turn."""
+    code = """
+import jax
+signals.LIMIT = 0.5
+with signals.heard():
+    program = jax.jit(lambda x: jax.lax.while_loop(lambda x: x < 2, jax.numpy.cos, x)).lower(0.0).compile()
+    print("begun", flush=True)
+    program(0.0).block_until_ready()"""
+    process = begun(code)
+    assert process.stdout is not None and process.stdout.readline() == "begun\n"
+    time.sleep(0.5)
+    process.send_signal(signal.SIGTERM)
+    ended(process, 143)
+
+
+@pytest.mark.slow
+def test_in_the_middle_of_an_ensemble(tmp_path):
+    arguments = [
+        "ensemble",
+        "zagrodny-slifkin",
+        "--seeds",
+        "400000",
+        "--duration",
+        "1",
+        "--chunk",
+        "64",
+        "--out",
+        "runs.zarr",
+    ]
+    process = begun("main()", *arguments, cwd=tmp_path)
+    progress = tmp_path / "runs.zarr" / "progress"
+    while process.poll() is None and not (progress.exists() and any(progress.iterdir())):
+        time.sleep(0.05)
+    process.send_signal(signal.SIGTERM)
+    assert "--resume" in ended(process, 143)
+    attributes = jm.ensembles.attributes_of(tmp_path / "runs.zarr")
+    assert attributes is not None and not attributes["complete"]
+
+
+def test_an_interrupted_reduction_keeps_every_chunk(tmp_path):
+    """And not what the last copy on disk had, ten seconds before."""
+    chunks = []
+
+    def stop(pace):
+        chunks.append(pace)
+        if len(chunks) == 3:
+            raise KeyboardInterrupt
+
+    task, key, options = jm.Isometric(), jax.random.key(5), {"seeds": 40, "duration": 0.2, "chunk": 8}
+    path = tmp_path / "moments.zarr"
+    with pytest.raises(KeyboardInterrupt):
+        jm.ensemble(task, key, store=path, reduce=True, progress=jm.ensembles.Watch(stop), **options)
+    kept = read_tallies(place_of(path))
+    assert kept is not None and kept.chunks == {0, 1, 2}
+    resumed = jm.ensemble(task, key, store=path, reduce=True, resume=True, **options)
+    whole = jm.ensemble(task, key, reduce=True, **options)
+    assert abs(resumed.mean - whole.mean).max() <= 1e-12 * abs(whole.mean).max()

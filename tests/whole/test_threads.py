@@ -1,0 +1,98 @@
+"""Two threads that simulate, compute and fit at the same time get what each gets alone."""
+
+import os
+import threading
+from concurrent.futures import ThreadPoolExecutor
+
+import jax
+import matplotlib
+import matplotlib.pyplot as plt
+import numpy as np
+import pytest
+
+import jaxmuscle as jm
+from jaxmuscle._common import programs
+from jaxmuscle._common.files import write_text
+
+TASK, KEY = jm.Isometric(), jax.random.key(5)
+
+
+def expected(number):
+    return np.asarray(jm.expected_spectrum(TASK.replace(k_w=4e5 + 1e4 * number)).power)
+
+
+def simulated(number):
+    return np.asarray(jm.simulate(TASK, KEY, seed=number, duration=0.2).output)
+
+
+def reduced(number):
+    return jm.ensemble(TASK.replace(k_w=4e5 + 1e4 * number), KEY, seeds=16, duration=0.2, chunk=8, reduce=True).mean
+
+
+def in_double(number):
+    with jax.enable_x64(True):
+        return reduced(number)
+
+
+def pairs(run, jobs):
+    """What two threads make of jobs, which they begin together."""
+    together = threading.Barrier(2)
+
+    def one(part):
+        together.wait()
+        return [run(job) for job in part]
+
+    with ThreadPoolExecutor(2) as pool:
+        each = list(pool.map(one, (jobs[::2], jobs[1::2])))
+    found = [None] * len(jobs)
+    found[::2], found[1::2] = each
+    return found
+
+
+@pytest.mark.slow
+def test_two_threads_100_times():
+    """In mixed order, with programs that are in memory and with ones that both threads miss; in both precisions."""
+    kinds = [expected, simulated, reduced, in_double]
+    rng = np.random.default_rng(3)
+    jobs = [
+        (kinds[kind], int(number)) for kind, number in zip(rng.integers(0, 4, 200), rng.integers(0, 5, 200), strict=True)
+    ]
+    alone = {job: job[0](job[1]) for job in sorted(set(jobs), key=str)}
+    for start in range(0, 200, 40):
+        programs.forget()
+        part = jobs[start : start + 40]
+        for job, found in zip(part, pairs(lambda job: job[0](job[1]), part), strict=True):
+            np.testing.assert_array_equal(found, alone[job], str(job))
+            assert found.dtype == alone[job].dtype
+
+
+@pytest.mark.slow
+def test_two_threads_fit():
+    target = jm.load_target("vastus-lateralis-26mvc")
+
+    def fitted(key):
+        options = {"free": ("c_w", "noise_K_w"), "starts": 2, "seeds": 8, "check_seeds": 0, "rungs": 0, "max_steps": 8}
+        return jm.fit(jm.Isometric(), target, key=key, **options).parameters
+
+    alone = [fitted(key) for key in range(2)]
+    assert pairs(fitted, [0, 1, 1, 0]) == [alone[0], alone[1], alone[1], alone[0]]
+
+
+def test_files_written_by_threads_leave_the_umask(tmp_path):
+    before = os.umask(0o027)
+    try:
+        pairs(lambda number: write_text(tmp_path / f"{number}.txt", "text"), list(range(200)))
+        assert os.umask(0o027) == 0o027
+    finally:
+        os.umask(before)
+    assert {path.stat().st_mode & 0o777 for path in tmp_path.iterdir()} == {0o640}
+
+
+def test_figures_of_threads_leave_the_style():
+    before = dict(matplotlib.rcParams)
+    spectrum = jm.load_target("vastus-lateralis-26mvc")
+    figures = pairs(lambda number: spectrum.plot().figure, list(range(6)))
+    assert len({id(figure) for figure in figures}) == 6
+    assert dict(matplotlib.rcParams) == before
+    for figure in figures:
+        plt.close(figure)
