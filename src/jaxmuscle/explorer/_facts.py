@@ -1,4 +1,4 @@
-"""What the page has to know of the package: parameters and their ranges, tasks, noises, settings. Nothing of it is in JavaScript."""
+"""What the page knows of the package, so that JavaScript repeats none of it: parameters, ranges, tasks, noises, settings."""
 
 import math
 from typing import Any, get_args
@@ -22,7 +22,9 @@ def facts() -> dict[str, Any]:
     tasks = {name: kind() for name, kind in TASKS.items()}
     kinds = {name: kind().per_channel() for name, kind in NOISES.items()}
     needed = {name: list(task.smoothness_needed) for name, task in tasks.items() if name != "prescribed-force"}
-    needed |= {f"prescribed-force {seen}": list(PrescribedForce(observe=seen).smoothness_needed) for seen in get_args(Observed)}
+    needed |= {
+        f"prescribed-force {seen}": list(PrescribedForce(observe=seen).smoothness_needed) for seen in get_args(Observed)
+    }
     richest = on_rung(Isometric(), 3)
     return {
         "parameters": {name: parameter(row) for name, row in PARAMETERS.items()},

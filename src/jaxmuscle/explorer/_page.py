@@ -35,7 +35,12 @@ def page(task: AbstractTask | None = None, target: Target | None = None) -> str:
     and for a target without a spectrum.
     """
     script = "\n".join(_EXPORT.sub("", _IMPORT.sub("", part_of(f"{name}.mjs"))) for name in MODULES)
-    pieces = {"STYLE": part_of("style.css"), "FACTS": _json(facts()), "CONTENT": _json(content(task, target)), "SCRIPT": script}
+    pieces = {
+        "STYLE": part_of("style.css"),
+        "FACTS": _json(facts()),
+        "CONTENT": _json(content(task, target)),
+        "SCRIPT": script,
+    }
     return re.sub(r"/\*(STYLE|FACTS|CONTENT|SCRIPT)\*/", lambda found: pieces[found[1]], part_of("page.html"))
 
 
@@ -70,8 +75,8 @@ def _check(task: AbstractTask) -> None:
         (muscle.damping_w, QuadraticDamping), (muscle.damping_z, QuadraticDamping),
     ]  # fmt: skip
     if not laws or any(type(law) is not kind for law, kind in laws):
-        raise ValueError("the explorer knows the paper's muscle with its quadratic laws alone: this task has a muscle or a law "
-                         "of its own; use expected_spectrum in Python")  # fmt: skip
+        raise ValueError("the explorer knows only the paper's muscle with its quadratic laws; this task has a muscle or law "
+                         "of its own: use expected_spectrum in Python")  # fmt: skip
     for name in ("P_w", "F_ext", "x_z"):
         signal = getattr(task, name, None)
         if isinstance(signal, AbstractSignal) and not isinstance(signal, Constant | SmoothStep | RampHold):

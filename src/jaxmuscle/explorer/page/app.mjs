@@ -32,6 +32,7 @@ function redraw(moving) {
   let seen;
   try { seen = seenNow(); } catch (error) { say(error.message, true); $("figure").classList.add("stale"); window.explorer.spectrum = null; return; }
   say(said);
+  $("figure").classList.remove("stale");
   const sum = seen.power.reduce((a, b) => a + b, 0), match = target ? compared(target, settings, seen) : null;
   const density = $("power").value !== "", fittedSum = target ? target.bins.reduce((all, k) => all + seen.power[k - settings.first_bin], 0) : sum;
   const scale = density ? 1 : 1 / fittedSum, [name, unit] = outputOf(table);
@@ -106,7 +107,7 @@ function findDirections() {
     $("direction-hint").textContent = target ? "A slider along several parameters at once, here and for your spectrum. Directions that the data see least come first."
       : "A slider along several parameters at once, here and for a recording of 10 s. Directions that such data see least come first.";
   } catch (error) { found = []; $("direction-hint").textContent = error.message; }
-  $("direction").replaceChildren(...found.map(({ strength }, i) => new Option(`${i + 1}: a step of 1 changes the data by ${digits(strength, 2)} sd`, i)));
+  $("direction").replaceChildren(...found.map(({ strength }, i) => new Option(`${i + 1}: ${strength < 0.005 ? "these data do not see it" : `a step of 1 is ${digits(strength, 2)} sd of the data`}`, i)));
   $("direction").selectedIndex = Math.min(chosen, found.length - 1);
   anchor = structuredClone(table);
   $("along").disabled = !found.length;
@@ -116,7 +117,7 @@ function findDirections() {
 function showShares() {
   const { shares } = found[$("direction").selectedIndex] ?? { shares: {} };
   const largest = Object.entries(shares).sort((a, b) => Math.abs(b[1]) - Math.abs(a[1])).filter(([, x]) => Math.abs(x) > 0.1).slice(0, 6);
-  $("direction-shares").textContent = largest.map(([name, x]) => `${name} ${x > 0 ? "up ↑" : "down ↓"} ${Math.abs(x).toFixed(2)}`).join("   ");
+  $("direction-shares").textContent = largest.map(([name, x]) => `${name} ${x > 0 ? "up" : "down"} ${Math.abs(x).toFixed(2)}`).join(", ");
 }
 
 // --- What changes
@@ -191,7 +192,8 @@ function begin() {
   try { next = fromFragment(location.hash.slice(1)) ?? next; } catch (error) { wrong = error.message; }
   load(structuredClone(next));
   history = new History(state);
-  window.explorer = { get state() { return state; }, spectrum: null, findDirections };
+  // For the console of the browser, and for tests.
+  window.explorer = { get state() { return state; }, spectrum: null, findDirections, expectedSpectrum, simulate, lowpass };
   lookAround();
   showAll();
   $("undo").disabled = $("redo").disabled = true;

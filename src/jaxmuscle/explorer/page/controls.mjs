@@ -12,7 +12,7 @@ const GROUPS = [
 ];
 const POSITIONS = 1000;
 
-export const unitOf = (unit) => (unit === "1" ? "" : unit.replace("^3", "³").replace("^2", "²"));
+export const unitOf = (unit) => (unit === "1" ? "" : unit.replaceAll("^3", "³").replaceAll("^2", "²"));
 
 // Between a value and the place of its slider. A logarithmic one that may be 0 has 0 at its left end.
 export function scaleOf(row, value) {
@@ -44,13 +44,13 @@ function makeRow(name, row, change) {
   const line = document.createElement("div");
   line.className = "row";
   line.dataset.name = name;
-  line.innerHTML = `<label for="slider-${name}"><span class="meaning"></span><span class="symbol"></span></label>
+  line.innerHTML = `<label for="slider-${name}"><span class="meaning"></span><span class="symbol"><i></i> <span class="unit"></span></span></label>
     <input type="range" id="slider-${name}" min="0" max="${POSITIONS}" step="1">
-    <input type="number" id="${name}" step="any" inputmode="decimal"><span class="unit"></span>`;
+    <input type="number" id="${name}" step="any" inputmode="decimal">`;
   const [slider, number] = line.querySelectorAll("input");
   line.querySelector(".meaning").textContent = row.meaning;
-  line.querySelector(".symbol").textContent = name;
-  line.querySelector(".unit").textContent = unitOf(row.unit);
+  line.querySelector(".symbol i").textContent = name;
+  line.querySelector(".unit").textContent = row.unit === "1" ? "" : `[${unitOf(row.unit)}]`;
   number.setAttribute("aria-label", `${row.meaning}, ${name}${row.unit === "1" ? "" : `, in ${row.unit}`}`);
   const moved = () => Number(slider.scale.value(Number(slider.value)).toPrecision(4));
   slider.addEventListener("input", () => change(name, moved(), false));

@@ -14,12 +14,12 @@ function ticks(low, high, about) {
 // {frequency, power, line, target: {frequency, power, sd, residuals} | null, run: powers | null, label, logFrequency}
 export function drawSpectrum(svg, { frequency, power, line, target, run, label, logFrequency }) {
   const width = Math.max(svg.parentElement.clientWidth, 240), small = width < 500, left = 52, right = width - 12, lower = target ? 66 : 0;
-  const height = (small ? 216 : 330) + lower * (small ? 0.75 : 1), top = 20, foot = height - 34, bottom = target ? foot - lower * (small ? 0.75 : 1) : foot;
+  const height = (small ? 216 : 330) + lower * (small ? 0.75 : 1), top = small ? 34 : 20, legend = small ? 28 : 13, foot = height - 34, bottom = target ? foot - lower * (small ? 0.75 : 1) : foot;
   const all = [...power, ...(target ? target.power : [])].filter((p) => p > 0), largest = Math.max(...all);
-  const ceiling = Math.log10(largest) + 0.15, floor = Math.max(Math.log10(Math.min(...all)) - 0.15, ceiling - 7);
+  const ceiling = Math.log10(largest) + 0.15, floor = Math.max(Math.min(Math.log10(Math.min(...all)) - 0.15, ceiling - 1.7), ceiling - 7);
   const across = logFrequency ? Math.log : (f) => f, f0 = logFrequency ? frequency.find((f) => f > 0) * 0.9 : 0, f1 = frequency[frequency.length - 1] * (logFrequency ? 1.05 : 1.02);
   const x = (f) => left + ((across(f) - across(f0)) / (across(f1) - across(f0))) * (right - left);
-  const y = (p) => top + ((ceiling - Math.max(Math.log10(Math.max(p, 1e-300)), floor)) / (ceiling - floor)) * (bottom - top);
+  const y = (p) => top + ((ceiling - Math.max(Math.log10(Math.max(p, 1e-300)), floor - 0.5)) / (ceiling - floor)) * (bottom - top);
   const parts = [`<title id="figure-title">Power spectrum, ${label}, over frequency in Hz</title>`];
   for (let k = Math.ceil(floor); k <= ceiling; k++) {
     parts.push(`<path class="grid" d="M${left},${rounded(y(10 ** k))}H${right}"/><text x="${left - 6}" y="${rounded(y(10 ** k) + 4)}" text-anchor="end">${power10(k)}</text>`);
@@ -28,17 +28,19 @@ export function drawSpectrum(svg, { frequency, power, line, target, run, label, 
   for (const f of marks) parts.push(`<path class="grid" d="M${rounded(x(f))},${top}V${foot}"/><text x="${rounded(x(f))}" y="${foot + 15}" text-anchor="middle">${f}</text>`);
   parts.push(`<path class="axis" d="M${left},${top}V${bottom}H${right}"/>`);
   parts.push(`<text x="${(left + right) / 2}" y="${height - 4}" text-anchor="middle">frequency [Hz]</text><text x="${left}" y="13">${label}</text>`);
-  const curve = (values) => path(frequency.flatMap((f, k) => (f > 0 || !logFrequency ? [[x(f), y(values[k])]] : [])));
-  if (run) parts.push(`<path class="run" d="${curve(run)}"/>`);
-  if (line.some((p) => p > 0)) parts.push(`<path class="harmonic" d="${curve(line)}"/>`);
-  parts.push(`<path class="model" d="${curve(power)}"/>`);
+  const curve = (values) => path(frequency.flatMap((f, k) => (f > 0 || !logFrequency ? [[x(f), Math.min(y(values[k]), bottom + 9)]] : [])));
+  const inside = `<clipPath id="inside"><rect x="${left}" y="${top}" width="${right - left}" height="${rounded(bottom - top - 1)}"/></clipPath>`;
+  parts.push(inside);
+  if (run) parts.push(`<path clip-path="url(#inside)" class="run" d="${curve(run)}"/>`);
+  if (line.some((p) => p > 0)) parts.push(`<path clip-path="url(#inside)" class="harmonic" d="${curve(line)}"/>`);
+  parts.push(`<path clip-path="url(#inside)" class="model" d="${curve(power)}"/>`);
   const names = [["model", "model"], ...(line.some((p) => p > 0) ? [["harmonic", "harmonic"]] : []), ...(run ? [["run", "one trace"]] : []), ...(target ? [["datum", "data"]] : [])];
   let at = right;
   for (const [kind, name] of names.reverse()) {
     at -= 7 * name.length + 8;
-    parts.push(`<text x="${at}" y="13">${name}</text>`);
+    parts.push(`<text x="${at}" y="${legend}">${name}</text>`);
     at -= 22;
-    parts.push(kind === "datum" ? `<circle class="datum" cx="${at + 14}" cy="9" r="3"/>` : `<path class="${kind}" d="M${at},9h18"/>`);
+    parts.push(kind === "datum" ? `<circle class="datum" cx="${at + 14}" cy="${legend - 4}" r="3"/>` : `<path class="${kind}" d="M${at},${legend - 4}h18"/>`);
     at -= 6;
   }
   if (target) {

@@ -16,10 +16,16 @@ function noisePath(part, dt, draw) {
   const states = Array.from({ length: channels }, () => apply(begin, begin.map(() => draw())));
   const path = { values: [], slopes: [] };
   const read = () => {
-    path.values = states.map((q) => (n ? dot(H, q) : L[0] / Math.sqrt(dt)) * (n ? 1 : draw()));
+    path.values = states.map((q) => (n ? dot(H, q) : (L[0] / Math.sqrt(dt)) * draw()));
     path.slopes = states.map((q) => (n ? dot(slope, q) : 0));
   };
-  path.next = () => { states.forEach((q, c) => (states[c] = apply(Phi, q).map((x, i) => x + dot(kick[i], kick.map(() => draw()))))); read(); };
+  path.next = () => {
+    states.forEach((q, c) => {
+      const z = kick.map(() => draw());
+      states[c] = apply(Phi, q).map((x, i) => x + dot(kick[i], z));
+    });
+    read();
+  };
   path.white = !n;
   read();
   return path;
