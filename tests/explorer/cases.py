@@ -93,7 +93,11 @@ def rows_of(task: Any, name: str) -> list[dict[str, Any]]:
 def expected(task: Any) -> dict[str, Any]:
     """Power, mean and variance by Python, by the program that `expected_spectrum` calls."""
     moments, _ = expected_moments(task, task.settings, WINDOW)
-    return {"power": np.asarray(moments.power).tolist(), "mean": float(moments.mean), "variance": float(moments.variance)}
+    return {
+        "power": [float(f"{p:.11g}") for p in np.asarray(moments.power)],
+        "mean": float(moments.mean),
+        "variance": float(moments.variance),
+    }
 
 
 def by_javascript(cases: dict[str, Any]) -> dict[str, float]:

@@ -11,7 +11,8 @@ from typing import Any
 NAMES = ("chromium", "chromium-browser", "google-chrome")
 FLAGS = (
     "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-component-update",
-    "--disable-background-networking", "--disable-sync", "--remote-debugging-pipe", "--hide-scrollbars", "--disable-dev-shm-usage",
+    "--disable-background-networking", "--disable-sync", "--remote-debugging-pipe", "--hide-scrollbars",
+    "--disable-dev-shm-usage",
 )  # fmt: skip
 FOUND = next((path for path in map(shutil.which, NAMES) if path), None)
 

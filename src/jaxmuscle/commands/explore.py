@@ -46,7 +46,7 @@ def explore(
         text = jm.explorer.page(model, target)
         path = _place(output, force=force)
         write_text(path, text)
-        record(path)
+        record({"page": str(path)})
         out.print(f"Written: {plain(path)}", highlight=False, soft_wrap=True)
         if browser and not webbrowser.open(path.resolve().as_uri()):
             out.print("No browser was found. Open the file yourself.", highlight=False)

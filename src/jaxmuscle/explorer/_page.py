@@ -15,9 +15,9 @@ from jaxmuscle.response._linearised import has_response
 from ._facts import facts
 
 # In an order in which each follows those that it imports.
-MODULES = ("numbers", "settings", "task", "noise", "spectrum", "statistics", "simulate", "target", "model", "figure",
-           "controls", "state", "app")  # fmt: skip
-_IMPORT = re.compile(r"^import .*$\n", re.MULTILINE)
+MODULES = ("numbers", "settings", "task", "noise", "covariance", "harmonic", "spectrum", "statistics", "simulate", "target",
+           "model", "figure", "view", "controls", "state", "app")  # fmt: skip
+_IMPORT = re.compile(r"^import [^;]*;\n", re.MULTILINE)
 _EXPORT = re.compile(r"^export ", re.MULTILINE)
 _SHOWN = ("name", "bins", "frequency", "proportional_power", "sigma", "segments", "dispersion")
 

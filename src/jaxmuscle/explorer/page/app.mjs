@@ -1,22 +1,36 @@
 // The page: its state, what a change of a control does, what is drawn.
-import { get, linearise, signalAt, withValues, baseOf } from "./task.mjs";
+import { get, linearise, withValues } from "./task.mjs";
 import { expectedSpectrum } from "./spectrum.mjs";
-import { WINDOW, frequencies, lowpass, samplesIn, segmentsIn, welch } from "./settings.mjs";
-import { compared, directions, movedAlong, statisticsOf } from "./statistics.mjs";
+import { frequencies, lowpass, samplesIn, segmentsIn } from "./settings.mjs";
+import { directions, movedAlong, statisticsOf } from "./statistics.mjs";
 import { simulate } from "./simulate.mjs";
 import { readTarget } from "./target.mjs";
-import { allowed, asTask, hasDrive, noiseOf, outOfBounds, refusal, resonancesOf, usuallyFree, withActivation, withDrive, withNoise, withResonances } from "./model.mjs";
-import { drawSpectrum, drawTrace } from "./figure.mjs";
-import { makeRows, showRows, unitOf } from "./controls.mjs";
+import {
+  allowed,
+  asTask,
+  hasDrive,
+  noiseOf,
+  outOfBounds,
+  refusal,
+  resonancesOf,
+  usuallyFree,
+  withActivation,
+  withDrive,
+  withNoise,
+  withResonances,
+} from "./model.mjs";
+import { $, digits, showSpectrum } from "./view.mjs";
+import { makeRows, showRows } from "./controls.mjs";
 import { History, fromFragment, toFragment } from "./state.mjs";
 
-const $ = (id) => document.getElementById(id);
-const facts = JSON.parse($("facts").textContent), content = JSON.parse($("content").textContent);
-const digits = (x, n = 4) => (x !== 0 && (Math.abs(x) >= 1e5 || Math.abs(x) < 1e-3) ? x.toExponential(n - 2) : String(Number(x.toPrecision(n))));
-const OUTPUTS = { "prescribed-motion": ["force P_w", "N"], "prescribed-force": ["displacement x_z", "m"], acceleration: ["acceleration of the insertion", "m/s²"] };
-const outputOf = (table) => OUTPUTS[table.observe === "acceleration" ? "acceleration" : table.task] ?? ["force F_ext", "N"];
-
-let state, history, said = "", anchor = null, found = [], waiting = 0;
+const facts = JSON.parse($("facts").textContent),
+  content = JSON.parse($("content").textContent);
+let state,
+  history,
+  said = "",
+  anchor = null,
+  found = [],
+  waiting = 0;
 
 // --- What is seen
 
@@ -27,61 +41,26 @@ function seenNow() {
 }
 
 function redraw(moving) {
-  const { table, target } = state, settings = table.settings;
+  const { table } = state;
   showRows($("parameters"), table, facts.parameters, moving);
   let seen;
-  try { seen = seenNow(); } catch (error) { say(error.message, true); $("figure").classList.add("stale"); window.explorer.spectrum = null; return; }
+  try {
+    seen = seenNow();
+  } catch (error) {
+    say(error.message, true);
+    $("figure").classList.add("stale");
+    window.explorer.spectrum = null;
+    return;
+  }
   say(said);
   $("figure").classList.remove("stale");
-  const sum = seen.power.reduce((a, b) => a + b, 0), match = target ? compared(target, settings, seen) : null;
-  const density = $("power").value !== "", fittedSum = target ? target.bins.reduce((all, k) => all + seen.power[k - settings.first_bin], 0) : sum;
-  const scale = density ? 1 : 1 / fittedSum, [name, unit] = outputOf(table);
-  const run = traceNow();
-  drawSpectrum($("figure"), {
-    frequency: frequencies(settings), power: seen.power.map((p) => p * scale), line: seen.line.map((p) => p * scale),
-    target: match && { frequency: target.frequency, sd: match.sd, residuals: match.residuals, known: match.chi2 !== null,
-                       power: target.proportional_power.map((p, k) => (p * fittedSum * scale) / (match.chi2 === null ? 1 : Math.exp(match.bias[k]))) },
-    run: run && run.power.map((p) => p * (density ? 1 : 1 / run.power.reduce((a, b) => a + b, 0))),
-    label: density ? `power [(${unit})²/Hz]` : "share of the power", logFrequency: $("log-frequency").checked,
-  });
-  const base = baseOf(table), top = seen.power.indexOf(Math.max(...seen.power)), sd = Math.sqrt(seen.variance);
-  const numbers = [
-    ["chi² per bin", match ? (match.chi2 === null ? "unknown: give segments" : digits(match.chi2, 3)) : "no data"],
-    ["bins", target ? `${target.bins.length} of ${seen.power.length}` : `${seen.power.length}`],
-    [`mean ${name}`, `${digits(seen.mean)} ${unit}`], ["standard deviation", `${digits(sd, 3)} ${unit}`],
-    ["coefficient of variation", Math.abs(seen.mean) > 1e-9 * sd ? `${digits((100 * sd) / Math.abs(seen.mean), 3)} %` : "mean is 0"],
-    ["maximum at", `${digits(frequencies(settings)[top], 3)} Hz`],
-    ["stiffness at rest K_w0, K_z0", `${digits(base[0], 3)}, ${digits(base[1], 3)} N/m`],
-    ["damping at rest C_w0, C_z0", `${digits(base[2], 3)}, ${digits(base[3], 3)} N s/m`],
-  ];
-  $("numbers").replaceChildren(...numbers.map(([key, value]) => {
-    const pair = document.createElement("div"), dt = document.createElement("dt"), dd = document.createElement("dd");
-    dt.textContent = key; dd.textContent = value; pair.append(dt, dd);
-    return pair;
-  }));
-  window.explorer.spectrum = { frequency: frequencies(settings), power: seen.power, chi2: match?.chi2 ?? null };
+  const chi2 = showSpectrum(state, seen);
+  window.explorer.spectrum = { frequency: frequencies(table.settings), power: seen.power, chi2 };
 }
 
 function say(text, bad = false) {
   if ($("message").textContent !== text) $("message").textContent = text;
   $("message").classList.toggle("bad", bad);
-}
-
-function traceNow() {
-  $("trace-figure").toggleAttribute("hidden", !state.trace);
-  $("trace-hint").textContent = state.trace ? "" : "One recording of 15 s from the model, by Heun's method. Its last 10 s and their spectrum are drawn.";
-  if (!state.trace) return null;
-  try {
-    const s = state.table.settings, { output } = simulate(state.table, { seed: state.seed, linear: state.linear });
-    const from = Math.round(WINDOW[0] * s.rate), seen = lowpass(s, output).slice(from, from + samplesIn(s)), [name, unit] = outputOf(state.table);
-    drawTrace($("trace-figure"), seen, 1 / s.rate, WINDOW[0], `${name} [${unit}]`);
-    const mean = seen.reduce((a, b) => a + b, 0) / seen.length, variance = seen.reduce((a, v) => a + (v - mean) ** 2, 0) / seen.length;
-    $("trace-hint").textContent = `Mean ${digits(mean)} ${unit}, standard deviation ${digits(Math.sqrt(variance), 3)} ${unit}. Seed ${state.seed} gives other numbers here than in Python.`;
-    return segmentsIn(s, seen.length) ? { power: welch(s, seen) } : null;
-  } catch (error) {
-    $("trace-hint").textContent = error.message;
-    return null;
-  }
 }
 
 // --- What the data do not determine
@@ -96,18 +75,34 @@ function lookAround() {
 
 function findDirections() {
   clearTimeout(waiting);
-  const { table, target } = state, s = table.settings;
-  const bins = target ? target.bins : frequencies(s).map((_, k) => s.first_bin + k), at = bins.map((k) => k - s.first_bin);
+  const { table, target } = state,
+    s = table.settings;
+  const bins = target ? target.bins : frequencies(s).map((_, k) => s.first_bin + k),
+    at = bins.map((k) => k - s.first_bin);
   const chosen = Math.min($("direction").selectedIndex === -1 ? 0 : $("direction").selectedIndex, 99);
   try {
-    const seen = seenNow(), names = usuallyFree(table, facts, get), share = at.map((k) => seen.line[k] / seen.power[k]);
+    const seen = seenNow(),
+      names = usuallyFree(table, facts, get),
+      share = at.map((k) => seen.line[k] / seen.power[k]);
     const data = target ?? { bins, segments: [Math.max(segmentsIn(s, samplesIn(s)), 1)] };
     const { sd, correlation } = statisticsOf(data, s, share);
     found = directions(table, names, facts.parameters, (moved) => expectedSpectrum(moved), sd, correlation, at);
-    $("direction-hint").textContent = target ? "A slider along several parameters at once, here and for your spectrum. Directions that the data see least come first."
+    $("direction-hint").textContent = target
+      ? "A slider along several parameters at once, here and for your spectrum. Directions that the data see least come first."
       : "A slider along several parameters at once, here and for a recording of 10 s. Directions that such data see least come first.";
-  } catch (error) { found = []; $("direction-hint").textContent = error.message; }
-  $("direction").replaceChildren(...found.map(({ strength }, i) => new Option(`${i + 1}: ${strength < 0.005 ? "these data do not see it" : `a step of 1 is ${digits(strength, 2)} sd of the data`}`, i)));
+  } catch (error) {
+    found = [];
+    $("direction-hint").textContent = error.message;
+  }
+  $("direction").replaceChildren(
+    ...found.map(
+      ({ strength }, i) =>
+        new Option(
+          `${i + 1}: ${strength < 0.005 ? "these data do not see it" : `a step of 1 is ${digits(strength, 2)} sd of the data`}`,
+          i,
+        ),
+    ),
+  );
   $("direction").selectedIndex = Math.min(chosen, found.length - 1);
   anchor = structuredClone(table);
   $("along").disabled = !found.length;
@@ -116,8 +111,13 @@ function findDirections() {
 
 function showShares() {
   const { shares } = found[$("direction").selectedIndex] ?? { shares: {} };
-  const largest = Object.entries(shares).sort((a, b) => Math.abs(b[1]) - Math.abs(a[1])).filter(([, x]) => Math.abs(x) > 0.1).slice(0, 6);
-  $("direction-shares").textContent = largest.map(([name, x]) => `${name} ${x > 0 ? "up" : "down"} ${Math.abs(x).toFixed(2)}`).join(", ");
+  const largest = Object.entries(shares)
+    .sort((a, b) => Math.abs(b[1]) - Math.abs(a[1]))
+    .filter(([, x]) => Math.abs(x) > 0.1)
+    .slice(0, 6);
+  $("direction-shares").textContent = largest
+    .map(([name, x]) => `${name} ${x > 0 ? "up" : "down"} ${Math.abs(x).toFixed(2)}`)
+    .join(", ");
 }
 
 // --- What changes
@@ -137,13 +137,16 @@ function set(changes, { moving = null, done = true, around = true } = {}) {
 // Another structure: rows are made anew, and channels that the task refuses are switched off.
 function rebuild(table, changes = {}) {
   const { table: good, off } = allowed(table, facts);
-  said = off.length ? `Switched off, since this noise is too rough for this task there: ${off.map((name) => `noise_${name}`).join(", ")}.` : "";
+  said = off.length
+    ? `Switched off, since this noise is too rough for this task there: ${off.map((name) => `noise_${name}`).join(", ")}.`
+    : "";
   set({ ...changes, table: good });
   showAll();
 }
 
 function showAll() {
-  const { table, target } = state, s = table.settings;
+  const { table, target } = state,
+    s = table.settings;
   makeRows($("parameters"), table, facts.parameters, changeParameter);
   $("task").value = table.task;
   $("observe-row").hidden = table.task !== "prescribed-force";
@@ -156,7 +159,8 @@ function showAll() {
   $("with-tremor").checked = resonancesOf(table).length > 0;
   $("with-second").checked = resonancesOf(table).length > 1;
   $("with-second").disabled = resonancesOf(table).length === 0;
-  const shape = ({ sampling, filter_order, filter_cutoff, filter_direction, ...rest }) => JSON.stringify(Object.entries(rest).sort());
+  const shape = ({ sampling, filter_order, filter_cutoff, filter_direction, ...rest }) =>
+    JSON.stringify(Object.entries(rest).sort());
   $("settings").value = Object.keys(facts.settings).find((name) => shape(facts.settings[name]) === shape(s)) ?? "own";
   $("sampling").value = s.sampling;
   $("settings").disabled = $("sampling").disabled = Boolean(target);
@@ -168,14 +172,21 @@ function showAll() {
     $("target-name").textContent = target.name;
     $("segments").value = target.segments?.length === 1 ? target.segments[0] : "";
     $("segments").placeholder = target.segments ? target.segments.join(" + ") : "";
-    $("target-hint").textContent = [...(target.notices ?? []), "How its spectrum was estimated is fixed while it is here."].join(" ");
+    $("target-hint").textContent = [
+      ...(target.notices ?? []),
+      "How its spectrum was estimated is fixed while it is here.",
+    ].join(" ");
   }
   redraw();
 }
 
 function changeParameter(name, value, done) {
   const wrong = outOfBounds(name, value, facts);
-  if (wrong) { redraw(); say(wrong, true); return; }
+  if (wrong) {
+    redraw();
+    say(wrong, true);
+    return;
+  }
   said = "";
   set({ table: withValues(state.table, { [name]: value }) }, { moving: done ? null : name, done });
 }
@@ -187,17 +198,29 @@ function load(next) {
 
 function begin() {
   let next = content.state ?? { table: facts.tasks.isometric };
-  said = "";
-  let wrong = null;
-  try { next = fromFragment(location.hash.slice(1)) ?? next; } catch (error) { wrong = error.message; }
+  let wrong = "";
+  try {
+    next = fromFragment(location.hash.slice(1)) ?? next;
+  } catch (error) {
+    wrong = error.message;
+  }
   load(structuredClone(next));
+  said = wrong;
   history = new History(state);
   // For the console of the browser, and for tests.
-  window.explorer = { get state() { return state; }, spectrum: null, findDirections, expectedSpectrum, simulate, lowpass };
+  window.explorer = {
+    get state() {
+      return state;
+    },
+    spectrum: null,
+    findDirections,
+    expectedSpectrum,
+    simulate,
+    lowpass,
+  };
   lookAround();
   showAll();
   $("undo").disabled = $("redo").disabled = true;
-  if (wrong) say(wrong, true);
 }
 
 // --- Files
@@ -218,7 +241,9 @@ async function open(file) {
     said = target.sigma || target.segments ? "" : "Say how many Welch segments were averaged, and chi² is known.";
     set({ target });
     showAll();
-  } catch (error) { say(error.message, true); }
+  } catch (error) {
+    say(error.message, true);
+  }
 }
 
 function save() {
@@ -236,34 +261,63 @@ async function copyLink() {
   try {
     await navigator.clipboard.writeText(location.href);
     say("The link is copied. It holds the parameters and your spectrum.");
-  } catch { say("The link is in the address bar: copy it there. It holds the parameters and your spectrum."); }
+  } catch {
+    say("The link is in the address bar: copy it there. It holds the parameters and your spectrum.");
+  }
 }
 
 // --- Controls
 
 const options = (select, pairs) => select.replaceChildren(...pairs.map(([value, text]) => new Option(text, value)));
-const TASK_WORDS = { isometric: "isometric: held insertion, force", "prescribed-length": "prescribed length: force at a motor (held here)",
-                     "prescribed-motion": "prescribed motion: internal force (the paper's task 1)", "prescribed-force": "prescribed force: motion (the paper's task 2)" };
-const SETTINGS_WORDS = { standard: "standard: 0.39 Hz bins to 11.7 Hz", slow: "slow: 0.1 Hz bins", multitaper: "multitaper: three Slepian tapers", pwelch: "pwelch: MATLAB's defaults" };
+const TASK_WORDS = {
+  isometric: "isometric: held insertion, force",
+  "prescribed-length": "prescribed length: force at a motor (held here)",
+  "prescribed-motion": "prescribed motion: internal force (the paper's task 1)",
+  "prescribed-force": "prescribed force: motion (the paper's task 2)",
+};
+const SETTINGS_WORDS = {
+  standard: "standard: 0.39 Hz bins to 11.7 Hz",
+  slow: "slow: 0.1 Hz bins",
+  multitaper: "multitaper: three Slepian tapers",
+  pwelch: "pwelch: MATLAB's defaults",
+};
 
 function wire() {
-  options($("task"), Object.keys(facts.tasks).map((name) => [name, TASK_WORDS[name] ?? name]));
-  options($("observe"), facts.observed.map((name) => [name, name]));
+  options(
+    $("task"),
+    Object.keys(facts.tasks).map((name) => [name, TASK_WORDS[name] ?? name]),
+  );
+  options(
+    $("observe"),
+    facts.observed.map((name) => [name, name]),
+  );
   options($("noise"), [...Object.keys(facts.noises).map((name) => [name, name]), ["", "only a resonance"]]);
   $("noise").lastElementChild.disabled = true;
-  options($("settings"), [...Object.keys(facts.settings).map((name) => [name, SETTINGS_WORDS[name] ?? name]), ["own", "settings of its own"]]);
+  options($("settings"), [
+    ...Object.keys(facts.settings).map((name) => [name, SETTINGS_WORDS[name] ?? name]),
+    ["own", "settings of its own"],
+  ]);
   $("settings").lastElementChild.disabled = true;
   const on = (id, event, action) => $(id).addEventListener(event, action);
   on("task", "change", () => rebuild(asTask(state.table, $("task").value, facts)));
   on("observe", "change", () => rebuild({ ...state.table, observe: $("observe").value }));
-  on("argument", "change", () => rebuild({ ...state.table, muscle: { ...state.table.muscle, argument: $("argument").value } }));
+  on("argument", "change", () =>
+    rebuild({ ...state.table, muscle: { ...state.table.muscle, argument: $("argument").value } }),
+  );
   on("noise", "change", () => rebuild(withNoise(state.table, $("noise").value, facts)));
   on("with-activation", "change", () => rebuild(withActivation(state.table, $("with-activation").checked, facts)));
   on("with-drive", "change", () => rebuild(withDrive(state.table, $("with-drive").checked, facts)));
   on("with-tremor", "change", () => rebuild(withResonances(state.table, $("with-tremor").checked ? 1 : 0, facts)));
   on("with-second", "change", () => rebuild(withResonances(state.table, $("with-second").checked ? 2 : 1, facts)));
-  on("settings", "change", () => rebuild({ ...state.table, settings: { ...facts.settings[$("settings").value], sampling: state.table.settings.sampling } }));
-  on("sampling", "change", () => rebuild({ ...state.table, settings: { ...state.table.settings, sampling: $("sampling").value } }));
+  on("settings", "change", () =>
+    rebuild({
+      ...state.table,
+      settings: { ...facts.settings[$("settings").value], sampling: state.table.settings.sampling },
+    }),
+  );
+  on("sampling", "change", () =>
+    rebuild({ ...state.table, settings: { ...state.table.settings, sampling: $("sampling").value } }),
+  );
   for (const id of ["power", "log-frequency"]) on(id, "change", () => redraw());
   on("trace", "change", () => set({ trace: $("trace").checked }, { around: false }));
   on("linear", "change", () => set({ linear: $("linear").value !== "" }, { around: false }));
@@ -273,28 +327,62 @@ function wire() {
     said = "";
     set({ target: { ...state.target, segments: count >= 1 ? [count] : null } });
   });
-  on("remove", "click", () => { set({ target: null }); showAll(); $("open").focus(); });
-  on("direction", "change", () => { $("along").value = 0; anchor = structuredClone(state.table); showShares(); });
+  on("remove", "click", () => {
+    set({ target: null });
+    showAll();
+    $("open").focus();
+  });
+  on("direction", "change", () => {
+    $("along").value = 0;
+    anchor = structuredClone(state.table);
+    showShares();
+  });
   const along = (done) => {
     if (!anchor || !found.length) return;
     const { shares } = found[$("direction").selectedIndex];
-    set({ table: withValues(anchor, movedAlong(anchor, shares, facts.parameters, Number($("along").value))) }, { done, around: false });
+    set(
+      { table: withValues(anchor, movedAlong(anchor, shares, facts.parameters, Number($("along").value))) },
+      { done, around: false },
+    );
   };
   on("along", "input", () => along(false));
   on("along", "change", () => along(true));
   on("undo", "click", () => step(history.undo()));
   on("redo", "click", () => step(history.redo()));
-  on("reset", "click", () => { said = ""; const first = history.first; set(first); showAll(); });
+  on("reset", "click", () => {
+    said = "";
+    const first = history.first;
+    set(first);
+    showAll();
+  });
   on("link", "click", copyLink);
   on("save", "click", save);
   on("open", "click", () => $("file").click());
-  on("file", "change", () => { if ($("file").files.length) open($("file").files[0]); $("file").value = ""; });
-  for (const event of ["dragenter", "dragover"]) document.addEventListener(event, (e) => { e.preventDefault(); document.body.classList.add("dropping"); });
-  document.addEventListener("dragleave", (e) => { if (!e.relatedTarget) document.body.classList.remove("dropping"); });
-  document.addEventListener("drop", (e) => { e.preventDefault(); document.body.classList.remove("dropping"); if (e.dataTransfer.files.length) open(e.dataTransfer.files[0]); });
+  on("file", "change", () => {
+    if ($("file").files.length) open($("file").files[0]);
+    $("file").value = "";
+  });
+  for (const event of ["dragenter", "dragover"])
+    document.addEventListener(event, (e) => {
+      e.preventDefault();
+      document.body.classList.add("dropping");
+    });
+  document.addEventListener("dragleave", (e) => {
+    if (!e.relatedTarget) document.body.classList.remove("dropping");
+  });
+  document.addEventListener("drop", (e) => {
+    e.preventDefault();
+    document.body.classList.remove("dropping");
+    if (e.dataTransfer.files.length) open(e.dataTransfer.files[0]);
+  });
   window.addEventListener("hashchange", begin);
   let width = 0;
-  new ResizeObserver(() => { if ($("figure-box").clientWidth !== width) { width = $("figure-box").clientWidth; if (state) redraw(); } }).observe($("figure-box"));
+  new ResizeObserver(() => {
+    if ($("figure-box").clientWidth !== width) {
+      width = $("figure-box").clientWidth;
+      if (state) redraw();
+    }
+  }).observe($("figure-box"));
 }
 
 function step(next) {

@@ -4,7 +4,10 @@ const VERSION = 1;
 
 export function toFragment(state) {
   const bytes = new TextEncoder().encode(JSON.stringify({ v: VERSION, ...state }));
-  return btoa(String.fromCharCode(...bytes)).replaceAll("+", "-").replaceAll("/", "_").replaceAll("=", "");
+  return btoa(String.fromCharCode(...bytes))
+    .replaceAll("+", "-")
+    .replaceAll("/", "_")
+    .replaceAll("=", "");
 }
 
 // The state of a link, or null where there is none; an Error for a link that is damaged or of another version.
@@ -23,14 +26,25 @@ export function fromFragment(fragment) {
 }
 
 export class History {
-  constructor(state) { this.past = [JSON.stringify(state)]; this.future = []; }
-  get first() { return JSON.parse(this.past[0]); }
+  constructor(state) {
+    this.past = [JSON.stringify(state)];
+    this.future = [];
+  }
+  get first() {
+    return JSON.parse(this.past[0]);
+  }
   keep(state) {
     const text = JSON.stringify(state);
     if (text === this.past[this.past.length - 1]) return;
     this.past.push(text);
     this.future = [];
   }
-  undo() { if (this.past.length > 1) this.future.push(this.past.pop()); return JSON.parse(this.past[this.past.length - 1]); }
-  redo() { if (this.future.length) this.past.push(this.future.pop()); return JSON.parse(this.past[this.past.length - 1]); }
+  undo() {
+    if (this.past.length > 1) this.future.push(this.past.pop());
+    return JSON.parse(this.past[this.past.length - 1]);
+  }
+  redo() {
+    if (this.future.length) this.past.push(this.future.pop());
+    return JSON.parse(this.past[this.past.length - 1]);
+  }
 }
