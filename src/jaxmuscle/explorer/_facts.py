@@ -20,7 +20,8 @@ REACH = 3.0  # prior standard deviations to either side of the default
 def facts() -> dict[str, Any]:
     """All of it, as JSON holds it."""
     tasks = {name: kind() for name, kind in TASKS.items()}
-    kinds = {name: kind().per_channel() for name, kind in NOISES.items()}
+    made: dict[str, Any] = dict(NOISES)
+    kinds = {name: kind().per_channel() for name, kind in made.items()}
     needed = {name: list(task.smoothness_needed) for name, task in tasks.items() if name != "prescribed-force"}
     needed |= {
         f"prescribed-force {seen}": list(PrescribedForce(observe=seen).smoothness_needed) for seen in get_args(Observed)

@@ -1,5 +1,5 @@
 // The page: its state, what a change of a control does, what is drawn.
-import { get, linearise, withValues } from "./task.mjs";
+import { get, withValues } from "./task.mjs";
 import { expectedSpectrum } from "./spectrum.mjs";
 import { frequencies, lowpass, samplesIn, segmentsIn } from "./settings.mjs";
 import { directions, movedAlong, statisticsOf } from "./statistics.mjs";
@@ -13,6 +13,7 @@ import {
   outOfBounds,
   refusal,
   resonancesOf,
+  taskIn,
   usuallyFree,
   withActivation,
   withDrive,
@@ -229,10 +230,7 @@ async function open(file) {
   const text = await file.text();
   try {
     if (file.name.endsWith(".json")) {
-      const { task_table } = JSON.parse(text);
-      if (!task_table) throw new Error(`${file.name} has no task_table: it is neither a preset nor a fit.json.`);
-      if (!facts.tasks[task_table.task]) throw new Error(`${file.name}: there is no task "${task_table.task}".`);
-      linearise(task_table);
+      const task_table = taskIn(JSON.parse(text).task_table, file.name, facts);
       rebuild(task_table, { target: null });
       say(`Opened ${file.name}.`);
       return;
@@ -242,7 +240,7 @@ async function open(file) {
     set({ target });
     showAll();
   } catch (error) {
-    say(error.message, true);
+    say(error instanceof SyntaxError ? `${file.name} is not valid JSON.` : error.message, true);
   }
 }
 

@@ -53,6 +53,19 @@ export function withActivation(table, on, facts) {
     : rest;
 }
 
+// The task of a preset file or of a fit.json; an Error says what of it is not known here.
+export function taskIn(table, file, facts) {
+  if (!table) throw new Error(`${file} has no task_table: it is neither a preset nor a fit.json.`);
+  if (!facts.tasks[table.task]) throw new Error(`${file}: there is no task "${table.task}".`);
+  const known = facts.tasks.isometric.muscle,
+    kindsOf = (muscle) =>
+      [muscle, muscle?.stiffness_w, muscle?.stiffness_z, muscle?.damping_w, muscle?.damping_z].map((x) => x?.type);
+  if (kindsOf(table.muscle).join() !== kindsOf(known).join()) {
+    throw new Error(`${file}: its muscle or one of its laws is not that of the paper, which alone is known here.`);
+  }
+  return table;
+}
+
 // Channels of a noise that is rougher than the task allows, as {part, j, name, needs}.
 function refused(table, facts) {
   const need = needed(table, facts);
