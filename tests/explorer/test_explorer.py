@@ -60,7 +60,7 @@ def test_javascript_computes_the_table():
 
 @pytest.mark.skipif(shutil.which("node") is None, reason="needs node")
 def test_a_fault_is_noticed():
-    """What the comparison is worth: a density of noise that is one millionth off in a row."""
+    """What the comparison is worth: powers that are two millionths off."""
     case = STORED["cases"]["isometric"]
     off = case | {"rows": [row | {"power": [p * (1 + 2 * SAME) for p in row["power"]]} for row in case["rows"]]}
     assert cases.by_javascript({"isometric": off})["isometric"] > SAME
