@@ -18,6 +18,7 @@ HOLDS = {
     "commands": "the command line", "paper": "the paper reproduced", "uncertainty": "profile, posterior, what is known",
     "checks": "goodness of fit, bootstrap", "comparison": "which colour of noise", "fits": "one target, several, cohorts",
     "objective": "residuals, likelihood, descent", "ensembles": "many seeds, stores, sweeps",
+    "explorer": "a page with sliders",
     "simulation": "solutions of the SDE", "response": "equilibrium, linear response", "data": "targets and recordings",
     "model": "muscle, noises, tasks", "spectra": "Welch, its law, measures", "plot": "all figures",
     "_common": "errors, files, text, progress",

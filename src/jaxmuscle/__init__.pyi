@@ -4,6 +4,7 @@ from . import checks as checks
 from . import comparison as comparison
 from . import data as data
 from . import ensembles as ensembles
+from . import explorer as explorer
 from . import fits as fits
 from . import model as model
 from . import plot as plot

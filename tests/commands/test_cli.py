@@ -334,6 +334,19 @@ def test_a_fit_prints_what_it_found(fitted):
 
 
 @pytest.mark.slow
+def test_what_was_fitted_can_be_explored(fitted, tmp_path):
+    _, folder = fitted
+    assert run("explore", folder / "fit.json", "--out", tmp_path / "page.html", "--no-open").exit_code == 0
+    (text,) = re.findall(r'id="content">(.*)</script>', (tmp_path / "page.html").read_text(encoding="utf-8"))
+    state, result = json.loads(text)["state"], jm.load_result(folder / "fit.json")
+    assert state["table"]["muscle"]["damping_w"]["c"] == result.parameters["c_w"].value
+    assert (
+        state["target"]["segments"] == [12]
+        and state["target"]["proportional_power"] == result.target.proportional_power.tolist()
+    )
+
+
+@pytest.mark.slow
 def test_what_was_fitted_can_be_simulated(fitted, tmp_path):
     import xarray
 

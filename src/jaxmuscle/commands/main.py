@@ -17,6 +17,7 @@ from .compare import compare
 from .console import out, plain, record, reporting
 from .design import design
 from .ensemble import ensemble, merge
+from .explore import explore
 from .fit import fit
 from .options import Json
 from .posterior import posterior
@@ -41,6 +42,7 @@ app.command()(compare)
 app.command()(reproduce)
 app.command()(speed)
 app.command()(study)
+app.command()(explore)
 
 
 def show_version(wanted: bool) -> bool:

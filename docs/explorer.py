@@ -1,0 +1,13 @@
+"""For mkdocs: the explorer as a page of the site, made of the package's own files."""
+
+from typing import Any
+
+from mkdocs.structure.files import File, Files
+
+import jaxmuscle as jm
+
+
+def on_files(files: Files, config: Any) -> Files:
+    """Adds the page."""
+    files.append(File.generated(config, "explorer-page.html", content=jm.explorer.page()))
+    return files

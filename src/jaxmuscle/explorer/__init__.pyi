@@ -1,0 +1,3 @@
+"""Public names of this wing."""
+
+from ._page import page as page
