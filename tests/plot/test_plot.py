@@ -13,7 +13,9 @@ from matplotlib.colors import to_rgba
 
 from jaxmuscle import plot
 from jaxmuscle.data._target import Target, load_target
-from jaxmuscle.model._tasks import Isometric, PrescribedForce
+from jaxmuscle.model._resonant_noise import ResonantNoise
+from jaxmuscle.model._tasks import Isometric, PrescribedForce, PrescribedLength, PrescribedMotion
+from jaxmuscle.model._white_noise import BandLimitedNoise
 from jaxmuscle.plot import _fit as _plot_fit
 from jaxmuscle.plot import _steadiness as _plot_steadiness
 from jaxmuscle.simulation._trajectory import Trajectory
@@ -465,3 +467,91 @@ def test_steadiness_shows_every_trial_and_the_value_of_all(count, unit, label):
     np.testing.assert_allclose(variation.containers[0].lines[0].get_ydata(), [31, 41, 51])
     np.testing.assert_allclose(regularity.containers[0].lines[0].get_ydata(), [0.61, 0.71, 0.81])
     assert f"{count} trials" in figure.get_suptitle() or count == 1
+
+
+# --- the drawing of the model
+
+
+def written(ax):
+    """The words in the axes by colour."""
+    found = {}
+    for text in ax.texts:
+        found.setdefault(text.get_color(), []).append(text.get_text())
+    return found
+
+
+@pytest.mark.parametrize(
+    ("task", "given", "output"),
+    [
+        (Isometric(), {"P_w", "x_z"}, "F_ext"),
+        (PrescribedLength(), {"P_w", "x_z"}, "F_ext"),
+        (PrescribedForce(), {"P_w", "F_ext"}, "x_z"),
+        (PrescribedForce(observe="acceleration"), {"P_w", "F_ext"}, "x_z"),
+        (PrescribedMotion(), {"x_z", "F_ext"}, "P_w"),
+    ],
+    ids=lambda x: "" if isinstance(x, set) else x if isinstance(x, str) else type(x).__name__,
+)
+def test_the_drawing_tells_what_a_task_prescribes_and_what_comes_out(task, given, output):
+    symbols = {"P_w": r"$P_\mathrm{w}$", "F_ext": r"$F_\mathrm{ext}$", "x_z": r"$x_\mathrm{z}$"}
+    words = written(plot.schematic(task, values=False))
+    assert {name for name, symbol in symbols.items() if symbol in words[plot.BLUE]} == given
+    assert [name for name, symbol in symbols.items() if symbol in words[plot.VERMILLION]] == [output]
+    held = isinstance(task, Isometric)
+    assert ("M" in words[plot.BLUE]) == ("x_z" in given and not held)  # a motor, where the insertion moves
+
+
+def test_the_drawing_has_the_numbers_of_the_task():
+    task = PrescribedForce(
+        P_w=7.0, F_ext=2.5, noise=BandLimitedNoise() + ResonantNoise(0.01, frequency=9.0)
+    ).replace(m_w=0.25, k_w=1e6, c_z=8.0, noise_C_w=0.0, activation_time=0.08)  # fmt: skip
+    said = [text.get_text() for text in plot.schematic(task).texts]
+    for words in (
+        ("K_", "400 N/m"),
+        ("C_", "8 N s/m"),
+        ("P_", "7 N"),
+        ("noise 15 %",),
+        ("tremor 1 % at 9 Hz",),
+        ("twitch of 0.08 s",),
+    ):
+        assert any(all(word in text for word in words) for text in said), words
+    assert {"0.25 kg", "0.5 kg", "2.5 N"} <= set(said) and said.count("noise 0.01 %") == 1
+    assert any("sine 0.3 % at 4.25 Hz" in text for text in said)
+    assert not any("sine" in text.get_text() for text in plot.schematic(task.replace(harmonic_amplitude=0.0)).texts)
+
+
+def drawn_fit(**changes):
+    """A fit as far as its drawing reads it."""
+    derived = {
+        "K_w0": estimate(184.2, "N/m", 13.0), "K_z0": estimate(314.0, "N/m", identifiable=False),
+        "C_w0": estimate(114.3, "N s/m", 8.0), "C_z0": estimate(1.79, "N s/m", 0.12), "mean": estimate(2.92, "N", 0.2),
+    } | changes  # fmt: skip
+    parameters = {"noise_K_w": estimate(0.269, "1", 0.019), "harmonic_amplitude": estimate(0.00325, "1", 0.00023)}
+    return types.SimpleNamespace(tasks={"a": Isometric()}, parameters=parameters, derived=derived, as_shown=dict)
+
+
+def test_the_drawing_of_a_fit_has_errors_and_marks_what_is_not_determined():
+    ax = plot.schematic(drawn_fit())
+    said = [text.get_text() for text in ax.texts]
+    assert any("184 ± 13 N/m" in text for text in said) and "noise 26.9 ± 1.9 %" in said
+    assert [text for text in said if "†" in text] == [r"$K_\mathrm{z0}$  314 N/m †", "† not determined by the data"]
+    assert {"2.92", "± 0.20 N"} <= set(said)
+    known = plot.schematic(drawn_fit(K_z0=estimate(314.0, "N/m", 22.0)))
+    assert not any("†" in text.get_text() for text in known.texts)
+
+
+def test_the_drawing_of_a_joint_fit_asks_for_one_of_its_tasks():
+    with pytest.raises(ValueError, match=r"result.tasks\['a'\]"):
+        plot.schematic(types.SimpleNamespace(tasks={"a": Isometric(), "b": Isometric()}))
+
+
+@pytest.mark.parametrize("values", [True, False])
+def test_words_of_the_drawing_lie_in_a_column_of_a_journal_and_do_not_touch(values):
+    ax = plot.schematic(drawn_fit(K_z0=estimate(314.0, "N/m", 22.0)), values=values)
+    figure = ax.figure
+    assert figure.get_figwidth() * 25.4 == pytest.approx(85)
+    figure.canvas.draw()
+    width, height = figure.canvas.get_width_height()
+    boxes = [text.get_window_extent() for text in ax.texts if text.get_text()]
+    assert all(box.x0 >= 0 and box.x1 <= width and box.y0 >= 0 and box.y1 <= height for box in boxes)
+    assert not any(a.shrunk(0.98, 0.6).overlaps(b) for i, a in enumerate(boxes) for b in boxes[:i])
+    assert min(text.get_fontsize() for text in ax.texts if text.get_text()) > 6

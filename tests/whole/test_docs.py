@@ -8,6 +8,7 @@ import re
 import types
 from collections import Counter
 
+import matplotlib.pyplot as plt
 import pytest
 from pages import PAGES, ROOT, blocks, module, name_of
 
@@ -143,6 +144,14 @@ def test_the_picture_of_the_layers_is_current():
     architecture = module(ROOT / "docs" / "architecture.py")
     assert architecture.PICTURE.read_text(encoding="utf-8") == architecture.picture(), "run `python docs/architecture.py`"
     assert set(architecture.HOLDS) == {wing for row in architecture.layers() for wing in row}
+
+
+def test_the_pictures_of_the_model_are_current():
+    pictures = module(ROOT / "docs" / "pictures.py")
+    for name, draw in pictures.PICTURES.items():
+        assert pictures.digest(draw()) == pictures.stored(name), "run `python docs/pictures.py`"
+        assert (pictures.HERE / name).stat().st_size < 100_000
+    plt.close("all")
 
 
 def test_files_named_on_the_page_of_the_layers_exist():

@@ -17,6 +17,7 @@ from ._posterior import predictive as predictive
 from ._profile import profile as profile
 from ._recording import recording as recording
 from ._recording import trials as trials
+from ._schematic import schematic as schematic
 from ._sensitivity import sensitivity as sensitivity
 from ._simulation import simulation as simulation
 from ._simulation import trajectory as trajectory

@@ -1,7 +1,6 @@
 """The figure of a fit, for `jaxmuscle.plot.fit`: is the fit good, and what does it say?"""
 
 import math
-import re
 import textwrap
 from collections.abc import Callable, Mapping
 from functools import partial
@@ -11,8 +10,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure, SubFigure
 
-from jaxmuscle._common.text import rounded
-
+from ._numbers import quantity
 from ._spectra import target
 from ._stiffness import gain, phase, stiffness_residuals
 from ._style import BLACK, BLUE, GREEN, GREY, ORANGE, PURPLE, SKY, VERMILLION, canvas, legend, output_label, styled
@@ -318,27 +316,3 @@ def _table(ax: Axes, title: str, estimates: Mapping[str, Any], rows: int) -> Non
 def _row(ax: Axes, y: float, cells: tuple[str, str, str], **style: Any) -> None:
     for x, text, side in zip(TABLE, cells, ("right", "left", "left"), strict=True):
         _text(ax, x, y, text, ha=side, **style)
-
-
-def quantity(estimate: Any) -> tuple[str, str, str]:
-    """Value, standard error and unit of an estimate in print: the error to two digits, the value to as many places."""
-    value, stderr = float(estimate.value), estimate.stderr
-    if not math.isfinite(value):
-        return "not finite", "", _unit(estimate.unit)
-    stderr = float(stderr) if stderr is not None and 0 < stderr < math.inf else 0.0
-    largest = max(abs(value), stderr)
-    power = math.floor(math.log10(largest)) if largest > 0 else 0
-    power = 0 if -2 <= power <= 3 else power
-    value, stderr = value / 10.0**power, stderr / 10.0**power
-    if estimate.identifiable and stderr > 0:
-        shown, error = rounded(value, stderr)
-        return shown, f"± {error}", _unit(estimate.unit, power)
-    error = "–" if estimate.identifiable else "not determined"
-    return f"{value:#.3g}".rstrip("."), error, _unit(estimate.unit, power)
-
-
-def _unit(unit: str, power: int = 0) -> str:
-    digits = str.maketrans("0123456789-", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻")
-    raised = re.sub(r"\^(-?\d+)", lambda match: match[1].translate(digits), unit)
-    ten = f"10{str(power).translate(digits)}" if power else ""
-    return " ".join(part for part in (ten, raised if raised != "1" or not ten else "") if part)
