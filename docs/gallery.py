@@ -123,7 +123,8 @@ study = jm.run_study(rows, rate=100.0, units="N m", window=(5.0, 25.0), rung=0)
 """
 SECTIONS = (
     Section("A fit", FIT, (
-        Shown("fit.png", "result.plot()", "A fit; grey rows are not determined", "tutorial.md#4-read-it"),
+        Shown("fit.png", "result.plot()", "A fit: spectra, residuals, output", "tutorial.md#4-read-it"),
+        Shown("gallery/schematic.png", "jm.plot.schematic(result)", "The model with its numbers", "model.md#muscle"),
         Shown("gallery/target.png", "target.plot(log=True)", "A target, the sampling error of its bins", "digitise.md"),
     )),
     Section("Simulations", SIMULATED, (

@@ -129,6 +129,19 @@ def test_every_page_is_in_the_navigation():
     assert set(re.findall(r"[\w/-]+\.md", navigation)) == pages | notebooks
 
 
+def test_every_formula_of_a_page_can_be_typeset():
+    """As the site does without the network, in `docs/notebooks.py`; GitHub does it by itself."""
+    formulas = module(ROOT / "docs" / "formulas.py")
+    rows = [row for page in PAGES for found in formulas.BLOCK.finditer(page.read_text(encoding="utf-8"))
+            for row in formulas.lines(found[2])]  # fmt: skip
+    assert len(rows) > 25
+    for row in rows:
+        assert formulas.picture(row).startswith('<img class="math"')
+    assert sum(page.read_text(encoding="utf-8").count("```math") for page in PAGES) == sum(
+        len(formulas.BLOCK.findall(page.read_text(encoding="utf-8"))) for page in PAGES
+    )
+
+
 def test_the_citation_names_the_current_version():
     about = (PACKAGE / "__about__.py").read_text(encoding="utf-8")
     (version,) = re.findall(r'^__version__ = "(.+)"$', about, re.MULTILINE)

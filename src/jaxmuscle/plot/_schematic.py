@@ -2,6 +2,7 @@
 
 import collections
 import dataclasses
+import re
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
@@ -145,8 +146,8 @@ def _components(model: Any) -> list[tuple[str, Any]]:
 
 
 def _rhythms(model: Any, numbers: Mapping[str, Any]) -> list[str]:
-    """Lines about what belongs to no single element: the sine on both stiffnesses, and all that the drive has."""
-    found = []
+    """Lines about what belongs to no single element: the unit, the sine on both stiffnesses, all that the drive has."""
+    found = ["per newton of mean force"] if "K_w0" in numbers and numbers["K_w0"].unit == "1/m" else []
     if numbers["harmonic_amplitude"].value != 0:
         sine = f"sine {_share('harmonic_amplitude', numbers)} at {_in_words('harmonic_frequency', numbers)}"
         found.append(f"{_symbol('K_w')} and {_symbol('K_z')}: {sine}")
@@ -255,7 +256,8 @@ def _names(
                 _write(ax, (middle, side * TALL), side * (i + 0.7), line, color, size=SIZE if first else SMALL)
         mass = _in_words(f"m_{index}", numbers)
         _write(ax, (x, 0.0), 0.55 * bool(mass), _symbol(f"m_{index}"), ink)
-        _write(ax, (x, 0.0), -0.55, mass, GREY if OPEN in mass else ink, size=SMALL)
+        for i, line in enumerate(mass.split(" ", 1) if len(mass) > 7 else [mass]):
+            _write(ax, (x, 0.0), -0.55 - i, line, GREY if OPEN in mass else ink, size=SMALL)
         _write(ax, (x - 9.5, down), 0.0, _symbol(f"x_{index}"), roles.get(f"x_{index}", ink), "right")
         if numbers:
             _write(ax, (middle, TALL), 2.8, {"w": "active tissue", "z": "passive tissue"}[index], GREY, size=SMALL)
@@ -263,7 +265,7 @@ def _names(
 
 def _forces(ax: Axes, ink: Any, roles: Mapping[str, Any], numbers: Mapping[str, Any]) -> None:
     """P_w and F_ext beside their arrows; the mean of F_ext where a fit knows it."""
-    drive = _in_words("P_w", numbers)
+    drive = re.sub(r"(?<= )1\b", "× mean", _in_words("P_w", numbers))  # per newton of mean force
     _write(ax, (MIDDLE_W, 0.0), 0.6, f"{_symbol('P_w')}  {drive}".rstrip(), roles.get("P_w", ink))
     outside = _in_words("F_ext", numbers) or _in_words("mean", numbers) * (roles.get("F_ext") == VERMILLION)
     where, color = ((Z + HALF + END - 2.6) / 2, 0.0), roles.get("F_ext", ink)
