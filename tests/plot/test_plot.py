@@ -474,6 +474,34 @@ def test_steadiness_shows_every_trial_and_the_value_of_all(count, unit, label):
     assert f"{count} trials" in figure.get_suptitle() or count == 1
 
 
+def test_starts_are_drawn_in_the_order_of_where_they_ended():
+    ended = [(9.0, True), (4.0, True), (None, False), (4.5, False), (4.0, True)]
+    ax = plot.starts(types.SimpleNamespace(starts=tuple(types.SimpleNamespace(cost=c, success=s) for c, s in ended)))
+    settled, other = ax.lines
+    np.testing.assert_allclose(settled.get_xydata(), [[1, 0], [2, 0], [4, 10]])
+    np.testing.assert_allclose(other.get_xydata(), [[3, 1]])
+    assert [t.get_text() for t in ax.get_legend().get_texts()] == ["3 settled", "1 did not settle"]
+    assert not plot.starts(types.SimpleNamespace(starts=())).lines
+
+
+def test_several_profiles_share_a_figure_and_a_legend():
+    values = np.linspace(0.5, 1.5, 21)
+    common = {"threshold": 3.84, "level": 0.95, "intervals": [(0.8, 1.2)], "value": 1.0, "stderr": 0.1, "unit": "Hz",
+              "target": "mine", "low": 0.8, "high": 1.2}  # fmt: skip
+    each = [
+        types.SimpleNamespace(values=values, rise=k * (values - 1) ** 2, name=f"n{k}", **common) for k in (100, 50, 25, 12)
+    ]
+    figure = plot.profiles(each)
+    figure.canvas.draw()
+    assert [ax.get_xlabel() for ax in figure.axes] == ["n100 (Hz)", "n50 (Hz)", "n25 (Hz)", "n12 (Hz)"]
+    assert [bool(ax.get_ylabel()) for ax in figure.axes] == [True, False, False, True]
+    assert key(figure) == ["profile", "95 %", "by curvature"] and figure.get_suptitle() == "mine"
+    for ax, found in zip(figure.axes, each, strict=True):
+        np.testing.assert_array_equal(named(ax, "profile").get_ydata(), found.rise)
+    with pytest.raises(ValueError, match="profiles: is empty"):
+        plot.profiles([])
+
+
 # --- figures as files
 
 

@@ -17,6 +17,7 @@ from ._stiffness import gain, phase, stiffness_residuals
 from ._style import BLACK, BLUE, GREEN, GREY, ORANGE, PURPLE, SKY, VERMILLION, canvas, output_label, styled
 
 WIDTH = 4.5  # inches: in a column of 85 mm its letters are those of 6 points
+LINE = 0.17  # inches
 ALLOWED = 3.84  # 95 % quantile of χ² with one degree of freedom
 DARK_GREEN = "#00664A"  # the palette's green is too light for small letters
 
@@ -33,18 +34,19 @@ def fit(result: Any, ax: Axes | None = None) -> Figure | SubFigure:
     """
     panels = _panels(result)
     heights = [height for height, _ in panels]
-    fig = canvas(ax, (WIDTH, sum(heights) + 0.9), w_pad=0.05, h_pad=0.04)
+    fig = canvas(ax, (WIDTH, sum(heights)), w_pad=0.05, h_pad=0.04)
     grid = fig.add_gridspec(len(heights), 2, height_ratios=heights)
     for row, (_, draw) in enumerate(panels):
         for column, panel in enumerate(draw):
             panel(fig.add_subplot(grid[row, column] if len(draw) > 1 else grid[row, :]))
-    _title(fig, result)
-    _key(fig)
+    rows = _title(fig, result) + _key(fig)
+    if isinstance(fig, Figure):  # panels keep their heights, however much the title and the legend say
+        fig.set_size_inches(WIDTH, sum(heights) + 0.3 + LINE * rows)
     return fig
 
 
-def _title(fig: Figure | SubFigure, result: Any) -> None:
-    """The target's name, and in red whatever forbids to believe the fit."""
+def _title(fig: Figure | SubFigure, result: Any) -> int:
+    """The target's name, and in red whatever forbids to believe the fit; how many lines."""
     name = ", ".join(result.parts) if len(result.parts) > 1 else result.target.name
     lines = [name if len(name) <= 50 else f"{name[:49]}…"]
     if any(part.target.provenance == "reconstructed" for part in result.parts.values()):
@@ -55,14 +57,16 @@ def _title(fig: Figure | SubFigure, result: Any) -> None:
         lines.append("Does not describe the data")
     color = rcParams["text.color"] if len(lines) == 1 else VERMILLION
     fig.suptitle("\n".join(lines), x=0.02, ha="left", size=9, weight="bold", color=color, parse_math=False)
+    return len(lines)
 
 
-def _key(fig: Figure | SubFigure) -> None:
-    """One legend below all panels of spectra, in which each name stands once."""
+def _key(fig: Figure | SubFigure) -> int:
+    """One legend below all panels of spectra, in which each name stands once; how many lines."""
     named = {label: handle for ax in fig.axes if ax.get_legend() is None
              for handle, label in zip(*ax.get_legend_handles_labels(), strict=True)}  # fmt: skip
     if named:
         fig.legend(named.values(), named, loc="outside lower center", ncols=2, frameon=False, columnspacing=1.2)
+    return -(-len(named) // 2)
 
 
 Panel = Callable[[Axes], None]
