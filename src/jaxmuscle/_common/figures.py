@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from .files import replacing
+from .text import choices
 
 FORMATS = ("png", "pdf", "svg")
 DPI = 300  # of a PNG: what journals ask for
@@ -19,6 +20,9 @@ def write_figure(figure: Any, folder: Path, name: str, formats: Iterable[str] = 
     import matplotlib.pyplot as plt
 
     wanted = list(dict.fromkeys(formats))
+    unknown = [kind for kind in wanted if kind not in FORMATS]
+    if unknown:
+        raise ValueError(f"formats: {unknown[0]!r} is no format of a figure. {choices(unknown[0], FORMATS)}")
     for kind in wanted:
         with replacing(folder / f"{name}.{kind}") as temporary, matplotlib.rc_context(SETTINGS):
             figure.savefig(temporary, dpi=DPI, metadata=UNDATED[kind])

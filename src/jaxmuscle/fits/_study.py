@@ -165,7 +165,7 @@ class StudyResult(eqx.Module):
 
         They are made beside it first and then moved: a save that is interrupted changes nothing. Without a comparison there
         is no differences.csv, and where the fits determine too little no quantities.png. `formats` of the figures: "png",
-        "pdf", "svg".
+        "pdf", "svg"; raises `ValueError` for another.
         """
         folder = Path(folder)
         folder.mkdir(parents=True, exist_ok=True)
