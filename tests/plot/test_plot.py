@@ -516,7 +516,7 @@ def test_a_figure_is_written_in_the_formats_asked_for_the_same_each_time(tmp_pat
     assert {file.name for file in tmp_path.iterdir()} == {"figure.pdf", "figure.svg"}  # that of before is gone
     once = [(tmp_path / name).read_bytes() for name in ("figure.pdf", "figure.svg")]
     assert once[0].startswith(b"%PDF") and b"<svg" in once[1]
-    with pytest.raises(ValueError, match="'jpg' is no format of a figure.*Known: png, pdf, svg"):
+    with pytest.raises(ValueError, match=r"'jpg' is no format of a figure.*Known: png, pdf, svg"):
         write(["jpg"])
     write(["svg", "pdf"])
     assert [(tmp_path / name).read_bytes() for name in ("figure.pdf", "figure.svg")] == once
