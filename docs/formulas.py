@@ -32,14 +32,15 @@ def _block(found: re.Match[str]) -> str:
 
 
 def lines(latex: str) -> list[str]:
-    """The lines of a formula, each by itself."""
-    latex = re.sub(r"\\(?:begin|end)\{aligned\}|&", "", latex)
+    """The lines of a displayed formula, each by itself, with fractions in full size."""
+    latex = re.sub(r"\\(?:begin|end)\{aligned\}|&", "", latex).replace(r"\frac", r"\dfrac")
     return [" ".join(row.split()) for row in latex.split(r"\\") if row.strip()]
 
 
 def _formula(found: re.Match[str]) -> str:
-    tag = picture((found[1] or found[2]).strip())
-    return tag if found[1] is None else f'\n\n<div class="formula">{tag}</div>\n\n'
+    if found[1] is None:
+        return picture(found[2].strip())
+    return f'\n\n<div class="formula">{"<br>".join(map(picture, lines(found[1])))}</div>\n\n'
 
 
 def picture(latex: str) -> str:
