@@ -60,7 +60,9 @@ def profiles(profiles: Sequence[Any], ax: Axes | None = None) -> Figure | SubFig
         panel.set_title("")
         panel.set_ylabel("Rise of -2 ln L" if (number - 1) % columns == 0 else "")
         handles, labels = panel.get_legend_handles_labels()
-        panel.get_legend().remove()
+        legend = panel.get_legend()
+        if legend is not None:
+            legend.remove()
         if number == 1:
             fig.legend(handles, labels, loc="outside lower center", ncols=3, frameon=False)
     fig.suptitle(profiles[0].target, x=0.02, ha="left", size=9, weight="bold", parse_math=False)

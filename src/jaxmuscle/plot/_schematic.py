@@ -10,6 +10,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib import rcParams
 from matplotlib.axes import Axes
+from matplotlib.patches import Rectangle
 
 from ._numbers import quantity, unit_in_print
 from ._style import BLUE, GREY, ORANGE, VERMILLION, styled
@@ -71,7 +72,7 @@ def schematic(task: Any, ax: Axes | None = None, *, values: bool = True) -> Axes
     return ax
 
 
-def _task_of(task: Any) -> tuple[Any, Mapping[str, Any]]:
+def _task_of(task: Any) -> tuple[Any, dict[str, Any]]:
     """The task, and its numbers by name: of a fit with their errors."""
     tasks = getattr(task, "tasks", None)
     if tasks is None:
@@ -193,9 +194,9 @@ def _elements(ax: Axes, ink: Any, noise: Mapping[str, Any]) -> None:
 
 def _masses(ax: Axes, ink: Any, roles: Mapping[str, Any], down: float) -> None:
     for x, name in ((W, "x_w"), (Z, "x_z")):
-        box = plt.Rectangle((x - HALF, -TALL), 2 * HALF, 2 * TALL, facecolor=ink, alpha=0.08, lw=0)
+        box = Rectangle((x - HALF, -TALL), 2 * HALF, 2 * TALL, facecolor=ink, alpha=0.08, lw=0)
         ax.add_patch(box)
-        ax.add_patch(plt.Rectangle((x - HALF, -TALL), 2 * HALF, 2 * TALL, fill=False, edgecolor=ink, lw=1.0))
+        ax.add_patch(Rectangle((x - HALF, -TALL), 2 * HALF, 2 * TALL, fill=False, edgecolor=ink, lw=1.0))
         color = roles.get(name, ink)
         ax.plot([x, x], [-TALL, down - 2.0], color=color, lw=0.7)
         _arrow(ax, (x, down), (x - 9.0, down), color, 0.9)
@@ -211,7 +212,7 @@ def _insertion(ax: Axes, ink: Any, model: Any, roles: Mapping[str, Any]) -> None
     if not callable(model.x_z):
         _wall(ax, END - 2.6, 1, ink)
     else:
-        ax.add_patch(plt.Rectangle((END - 6.0, 5.0), 6.0, 9.5, fill=False, edgecolor=roles["x_z"], lw=1.0))
+        ax.add_patch(Rectangle((END - 6.0, 5.0), 6.0, 9.5, fill=False, edgecolor=roles["x_z"], lw=1.0))
         ax.text(END - 3.0, 9.6, "M", color=roles["x_z"], ha="center", va="center", size=SMALL)
         ax.plot([x, END - 6.0], [9.6, 9.6], color=roles["x_z"], lw=0.9)
     far = END - 2.6 if not callable(model.x_z) else END
