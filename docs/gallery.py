@@ -110,7 +110,7 @@ time, lines = np.arange(7200) / 100, np.arange(8, 361) / 72  # a muscle, moved b
 phases = np.random.default_rng(1).uniform(0, 2 * np.pi, lines.size)
 length = 1e-3 * np.sqrt(2 / lines.size) * np.cos(2 * np.pi * np.outer(time, lines) + phases).sum(axis=1)
 muscle = jm.PrescribedLength(x_z=jm.model.Sampled.through(time, -length)).replace(harmonic_amplitude=0.0)
-pulled = np.asarray(jm.simulate(muscle, key, duration=71.9, rate=100).output)
+pulled = np.asarray(jm.simulate(muscle, key, duration=71.9, rate=100.0).output)
 minute = jm.PerturbedRecording.from_array(pulled, length[: pulled.size], 100, name="a minute", window=(6.0, 66.0))
 """
 STUDY = """

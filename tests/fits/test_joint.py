@@ -116,8 +116,8 @@ def test_force_and_displacement_tell_every_stiffness_and_damping():
         truth["mean@force"] = true_derived(TRUTH)["mean"]
     assert_near_the_truth(joint.derived, truth, list(truth))
     assert joint.parameters["F_ext"].value == load  # only one task has it
-    # About a displacement near zero the coefficient of variation says nothing.
-    assert joint.derived["coefficient_of_variation@displacement"].stderr is None
+    variation = joint.derived["coefficient_of_variation@displacement"]  # little is known of it about a mean near zero
+    assert variation.stderr is None or variation.stderr > 0.25 * variation.value
 
 
 @functools.cache
