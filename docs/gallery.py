@@ -74,6 +74,7 @@ for task, run in zip(sweep, jm.ensemble(sweep, key, seeds=100), strict=True):
 """
 SURE = """
 found = jm.posterior(result, target, key=jax.random.key(2))
+corner = jm.profile(result, "corner_frequency")
 """
 PEOPLE = """
 import numpy as np
@@ -123,7 +124,9 @@ study = jm.run_study(rows, rate=100.0, units="N m", window=(5.0, 25.0), rung=0)
 """
 SECTIONS = (
     Section("A fit", FIT, (
-        Shown("fit.png", "result.plot()", "A fit; grey rows are not determined", "tutorial.md#4-read-it"),
+        Shown("fit.png", "result.plot()", "A fit: spectra, residuals, output", "tutorial.md#4-read-it"),
+        Shown("gallery/schematic.png", "jm.plot.schematic(result)", "The model with its numbers", "model.md#muscle"),
+        Shown("gallery/starts.png", "jm.plot.starts(result)", "Whether its starts agree", "fitting.md"),
         Shown("gallery/target.png", "target.plot(log=True)", "A target, the sampling error of its bins", "digitise.md"),
     )),
     Section("Simulations", SIMULATED, (
@@ -139,7 +142,9 @@ SECTIONS = (
               "Stiffness, damping, force at rest", "scaling.md"),
     )),
     Section("How sure is it, and is it right", SURE, (
-        Shown("gallery/profile.png", 'jm.profile(result, "corner_frequency").plot()', "A profile", "uncertainty.md"),
+        Shown("gallery/profile.png", "corner.plot()", "A profile", "uncertainty.md"),
+        Shown("gallery/profiles.png", 'jm.plot.profiles([corner, jm.profile(result, "high_frequency_floor")])',
+              "Several profiles", "uncertainty.md"),
         Shown("gallery/posterior.png", "found.plot()", "The posterior of what the data determine", "uncertainty.md"),
         Shown("gallery/chains.png", "found.plot_chains()", "Its chains", "uncertainty.md"),
         Shown("gallery/predictive.png", "found.plot_predictive()", "The spectra that it predicts", "uncertainty.md"),

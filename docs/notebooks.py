@@ -1,19 +1,18 @@
-"""For mkdocs: every notebook of ../notebooks, with its stored outputs, as a page of the site."""
+"""For mkdocs: every notebook of ../notebooks, with its stored outputs, as a page; formulas of all pages typeset."""
 
 import base64
-import io
 import json
 import re
+import sys
 from pathlib import Path
 from typing import Any
 
-from matplotlib.font_manager import FontProperties
-from matplotlib.mathtext import math_to_image
 from mkdocs.structure.files import File, Files
 
+sys.path.append(str(Path(__file__).parent))
+from formulas import typeset, typeset_prose
+
 NOTEBOOKS = Path(__file__).resolve().parents[1] / "notebooks"
-MATH = re.compile(r"\$\$(.+?)\$\$|\$([^$\n]+)\$", re.DOTALL)
-CODE = re.compile(r"(`[^`]*`)")
 
 
 def on_files(files: Files, config: Any) -> Files:
@@ -27,8 +26,9 @@ def on_files(files: Files, config: Any) -> Files:
 
 
 def on_page_markdown(markdown: str, page: Any, config: Any, files: Files) -> str:
-    """Links to notebooks, which lead to files in the repository, lead to those pages."""
-    return re.sub(r"\]\((?:\.\./)+notebooks/([\w-]+)\.ipynb\)", rf"]({_up(page)}notebooks/\1.md)", markdown)
+    """Links to notebooks, which lead to files in the repository, lead to those pages; formulas are typeset."""
+    markdown = re.sub(r"\]\((?:\.\./)+notebooks/([\w-]+)\.ipynb\)", rf"]({_up(page)}notebooks/\1.md)", markdown)
+    return typeset(markdown)
 
 
 def _up(page: Any) -> str:
@@ -63,17 +63,4 @@ def page(notebook: dict[str, Any], stem: str) -> tuple[str, dict[str, bytes]]:
 
 def prose(text: str) -> str:
     """Formulas as pictures, code left alone; links as they are from a page of the site."""
-    pieces = [piece if piece.startswith("`") else MATH.sub(formula, piece) for piece in CODE.split(text)]
-    return re.sub(r"\]\(\.\./docs/", "](../", "".join(pieces)).replace(".ipynb)", ".md)")
-
-
-def formula(found: re.Match[str]) -> str:
-    """An image in the text, as high as its letters; a displayed one in a line of its own."""
-    shown, latex = found[1] is not None, (found[1] or found[2]).strip()
-    image = io.BytesIO()
-    depth = math_to_image(f"${latex}$", image, prop=FontProperties(size=12), dpi=72, format="svg")
-    paper = b"fill: #ffffff"
-    data = base64.b64encode(image.getvalue().replace(paper, b"fill: none")).decode()
-    alt = latex.replace('"', "&quot;")
-    tag = f'<img class="math" alt="{alt}" src="data:image/svg+xml;base64,{data}" style="vertical-align: -{depth:.1f}pt">'
-    return f"\n\n{tag}\n\n" if shown else tag
+    return re.sub(r"\]\(\.\./docs/", "](../", typeset_prose(text)).replace(".ipynb)", ".md)")

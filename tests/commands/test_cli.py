@@ -757,6 +757,13 @@ def test_a_designed_motion(tmp_path):
 
 
 COMMANDS = sorted(typer.main.get_group(app).commands)
+DRAWING = {"analyse", "compare", "design", "fit", "posterior", "simulate", "steadiness", "study"}
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_every_command_that_draws_has_formats(name):
+    options = {text for option in typer.main.get_group(app).commands[name].params for text in option.opts}
+    assert ("--format" in options) == (name in DRAWING)
 
 
 @pytest.mark.parametrize(

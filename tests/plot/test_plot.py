@@ -12,9 +12,13 @@ import scipy.special
 from matplotlib.colors import to_rgba
 
 from jaxmuscle import plot
+from jaxmuscle._common.figures import write_figure
 from jaxmuscle.data._target import Target, load_target
-from jaxmuscle.model._tasks import Isometric, PrescribedForce
+from jaxmuscle.model._resonant_noise import ResonantNoise
+from jaxmuscle.model._tasks import Isometric, PrescribedForce, PrescribedLength, PrescribedMotion
+from jaxmuscle.model._white_noise import BandLimitedNoise
 from jaxmuscle.plot import _fit as _plot_fit
+from jaxmuscle.plot import _numbers as _plot_numbers
 from jaxmuscle.plot import _steadiness as _plot_steadiness
 from jaxmuscle.simulation._trajectory import Trajectory
 from jaxmuscle.spectra._bin_law import welch_law
@@ -248,6 +252,7 @@ def result(**changes):
         "success": True,
         "message": "converged: 28 of 100 starts agree",
         "adequate": True,
+        "adequacy_p": 0.2,
         "verdict": "describes the data: chi2 per bin 1.2, p = 0.2",
         "advice": (),
         "task": Isometric().replace(harmonic_frequency=3.9),
@@ -290,15 +295,21 @@ def failed():
     nothing = np.full(30, np.nan)
     return result(
         success=False, message="no start has a finite spectrum: lower the noise", derived={}, chi2_per_bin=None,
-        adequate=None, verdict="not fitted: no start has a finite spectrum: lower the noise",
+        adequate=None, adequacy_p=None, verdict="not fitted: no start has a finite spectrum: lower the noise",
         rms_log_error=None, fitted=nothing, harmonic_share=nothing, residual=nothing, deviation=None,
         undetermined=(), stretch=(np.zeros(0), np.zeros(0)), seed=None, remarks=(), profile=None, harmonic_p_value=None,
     )  # fmt: skip
 
 
 def panels(figure):
-    """Linear and logarithmic spectrum, residuals, output: the axes between header and tables."""
-    return figure.axes[1:5]
+    """Linear and logarithmic spectrum, residuals, output."""
+    return figure.axes[:4]
+
+
+def key(figure):
+    """What the legend of a fit's figure says."""
+    (legend,) = figure.legends
+    return [text.get_text() for text in legend.get_texts()]
 
 
 def test_the_parts_of_a_model_with_tremor_are_areas_that_add_up_to_the_fit():
@@ -306,10 +317,11 @@ def test_the_parts_of_a_model_with_tremor_are_areas_that_add_up_to_the_fit():
     tremor = np.where(np.abs(f - 9) < 1, 0.8, 0.0)
     parts = {"relaxation": 0.7 * (1 - tremor), "floor": 0.3 * (1 - tremor), "harmonic": 0 * f, "tremor": tremor}
     found = result(components=parts, model="Isometric, BandLimitedNoise + ResonantNoise, activation")
-    linear, logarithmic, _, _ = panels(plot.fit(found))
-    labels = [text.get_text() for text in linear.get_legend().get_texts()]
-    assert [label.partition(",")[0] for label in labels[-3:]] == ["floor", "relaxation", "tremor"]
-    assert sum(int(label.split(", ")[1].split()[0]) for label in labels[-3:]) == pytest.approx(100, abs=2)
+    figure = plot.fit(found)
+    linear, logarithmic, _, _ = panels(figure)
+    labels = [label for label in key(figure) if label.endswith("% of power")]
+    assert [label.partition(",")[0] for label in labels] == ["floor", "relaxation", "tremor"]
+    assert sum(int(label.split(", ")[1].split()[0]) for label in labels) == pytest.approx(100, abs=2)
     top = max(path.vertices[:, 1].max() for area in linear.collections[-3:] for path in area.get_paths())
     assert top == pytest.approx(found.fitted.max())
     assert len(logarithmic.lines) == len(linear.lines) + 3  # a line for each instead
@@ -324,7 +336,7 @@ def test_fit_draws_the_fitted_spectrum_twice_with_target_and_harmonic():
         np.testing.assert_array_equal(named(ax, "fit").get_ydata(), found.fitted)
         held = 100 * np.sum(found.fitted * found.harmonic_share)
         assert named(ax, f"harmonic: 3.90 Hz, {held:.2g} % of power").get_xdata() == [3.9]
-        assert (ax.get_xlabel(), ax.get_ylabel()) == ("Frequency (Hz)", "Proportional power (fraction per bin)")
+        assert (ax.get_xlabel(), ax.get_ylabel()) == ("Frequency (Hz)", "Power (fraction per bin)")
 
 
 def test_fit_draws_residuals_in_standard_deviations_and_marks_the_large_ones():
@@ -347,57 +359,53 @@ def test_fit_draws_the_simulated_stretch():
     assert (ax.get_xlabel(), ax.get_ylabel()) == ("Time (s)", r"Force $F_\mathrm{ext}$ (N)")
 
 
-def test_fit_tells_verdict_parameters_and_what_is_not_determined():
-    said = texts(plot.fit(result()))
-    for text in (
-        "vastus-lateralis-26mvc", "Describes the data: chi2 per bin 1.2, p = 0.2",
-        "Isometric, BandLimitedNoise  ·  linear  ·  χ² per bin 1.18  ·  rms log error 0.31  ·  28 of 100 starts agree",
-        "k_w", "4.20", "± 0.13", "10⁵ N/m³", "c_w", "57.0", "not determined", "N s³/m³", "3.900", "± 0.047", "Hz",
-        "corner_frequency", "1.23", "± 0.16", "•  stiffness and damping can be scaled together",
-    ):  # fmt: skip
-        assert text in said
-    assert any(text.startswith("Measured force: Isometric knee-extension") for text in said)
-    assert "m_w" not in said
+@pytest.mark.parametrize(
+    ("changes", "title", "closeness", "colour"),
+    [
+        ({}, "vastus-lateralis-26mvc", "χ² per bin 1.18, p = 0.2", _plot_fit.DARK_GREEN),
+        ({"adequate": False, "adequacy_p": 1e-9, "chi2_per_bin": 5.5},
+         "vastus-lateralis-26mvc\nDoes not describe the data", "χ² per bin 5.50, p <= 0.001", plot.VERMILLION),
+        ({"adequate": None, "adequacy_p": None}, "vastus-lateralis-26mvc", "χ² per bin 1.18", "black"),
+    ],
+)  # fmt: skip
+def test_fit_shows_its_verdict_by_a_label_and_a_colour_and_no_prose(changes, title, closeness, colour):
+    figure = plot.fit(result(**changes))
+    assert figure.get_suptitle() == title
+    ax = panels(figure)[2]
+    assert ax.get_title("left") == closeness and ax.title.get_text() == ""
+    assert ax._left_title.get_color() == colour
+    assert not texts(figure)  # numbers and sentences are the report's
 
 
 def test_fit_draws_the_profile_over_the_frequency():
     found = result()
-    ax = plot.fit(found).axes[5]
+    ax = plot.fit(found).axes[4]
     np.testing.assert_array_equal(ax.lines[0].get_xdata(), found.profile[0])
     np.testing.assert_array_equal(ax.lines[0].get_ydata(), found.profile[1])
-    assert "harmonic p = 0.08" in ax.get_title("left") and ax.get_ylabel() == "Δχ²"
-
-
-def test_fit_shows_the_notices():
-    told = "harmonic_frequency is ambiguous: 6.62 Hz fits almost as well"
-    assert any(told in text.get_text() for text in plot.fit(result(notices=(told,))).axes[0].texts)
+    assert ax.get_title("right") == "harmonic p = 0.08" and ax.get_ylabel() == "Δχ²"
 
 
 def test_fit_of_a_reconstruction_says_so():
     aim = load_target("slifkin-newell-1999-35mvc")
     figure = plot.fit(result(target=aim))
-    assert any(text.startswith("RECONSTRUCTED, not measured: the text gives only") for text in texts(figure))
-    assert "target, reconstructed" in [line.get_label() for line in panels(figure)[0].lines]
+    assert figure.get_suptitle() == "slifkin-newell-1999-35mvc (reconstructed)" and "target, reconstructed" in key(figure)
 
 
 def test_a_failed_fit_still_shows_the_target_and_the_reason():
     figure = plot.fit(failed())
     figure.canvas.draw()
-    said = texts(figure)
-    assert "Not fitted: no start has a finite spectrum: lower the noise" in said
-    assert {"no finite fit", "no finite simulation", "none"} <= set(said)
-    assert "Isometric, BandLimitedNoise  ·  linear" in said
+    assert figure.get_suptitle() == "vastus-lateralis-26mvc\nNot fitted"
+    assert {"no finite fit", "no finite simulation"} == set(texts(figure))
     assert not any(line.get_label() == "fit" for line in panels(figure)[0].lines)
 
 
 def test_a_fit_without_known_spread_draws_logarithms_without_bands():
     aim = Target("few bins", [0.5, 0.3, 0.2], bins=[2, 3, 4])
-    figure = plot.fit(result(target=aim, chi2_per_bin=None, deviation=None, undetermined=()))
+    figure = plot.fit(result(target=aim, chi2_per_bin=None, adequate=None, adequacy_p=None, deviation=None))
     figure.canvas.draw()
     ax = panels(figure)[2]
     assert ax.get_ylabel() == "Residual (ln units)" and len(ax.patches) == 3
-    assert any("no χ² (spread unknown)" in text for text in texts(figure))
-    assert "What the data do not notice" not in texts(figure)
+    assert ax.get_title("left") == "no χ² (spread unknown)"
 
 
 @pytest.mark.parametrize(("frequency", "share"), [(25.0, 1e-5), (3.9, 0.0)])
@@ -410,18 +418,17 @@ def test_a_harmonic_outside_the_bins_or_without_power_is_not_marked_there(freque
     assert ax.get_xlim()[1] < 13
 
 
-def test_everything_written_lies_in_the_figure_and_cells_do_not_touch():
-    long = {f"a_rather_long_name_of_{i}_parameter": estimate(-1.234e-5, "N s^3/m^3") for i in range(15)}
-    long[r"$\no math$"] = estimate(1.0, "1")
-    aim = Target("a name " * 20, np.ones(30), source="a sentence about the source, " * 12, segments=12)
-    said = "a sentence that names a direction with many parameters, " * 5
-    figure = plot.fit(result(target=aim, parameters=long, derived=long, message=said, undetermined=(said, said)))
+def test_letters_of_a_fit_are_legible_in_a_column_of_a_journal_and_titles_do_not_touch():
+    figure = plot.fit(result(target=Target("a name " * 20, np.ones(30), segments=12)))
     figure.canvas.draw()
-    width, height = figure.canvas.get_width_height()
-    for ax in (figure.axes[0], *figure.axes[5:]):
-        boxes = [text.get_window_extent() for text in ax.texts]
-        assert all(box.x0 >= 0 and box.x1 <= width and box.y0 >= -1 and box.y1 <= height + 1 for box in boxes)
-        assert not any(a.overlaps(b) for i, a in enumerate(boxes) for b in boxes[:i] if abs(a.y0 - b.y0) < 3)
+    width, _ = figure.canvas.get_width_height()
+    titles = [[t.get_window_extent() for t in (ax._left_title, ax._right_title) if t.get_text()] for ax in figure.axes]
+    assert all(box.x1 <= width for boxes in titles for box in boxes)
+    assert not any(a.overlaps(b) for boxes in titles for i, a in enumerate(boxes) for b in boxes[:i])
+    ends = sorted(box.x1 for box in (boxes[0] for boxes in titles[:3:2]))  # left of the panels beside them
+    assert ends[-1] < figure.axes[1].get_window_extent().x0
+    sizes = [tick.label1.get_fontsize() for ax in figure.axes for tick in ax.xaxis.get_major_ticks()]
+    assert min(sizes) * 85 / 25.4 / figure.get_figwidth() > 5.5  # points
 
 
 @pytest.mark.parametrize(
@@ -439,7 +446,7 @@ def test_everything_written_lies_in_the_figure_and_cells_do_not_touch():
     ],
 )
 def test_numbers_are_printed_to_two_digits_of_their_error(shown, expected):
-    assert _plot_fit.quantity(shown) == expected
+    assert _plot_numbers.quantity(shown) == expected
 
 
 def steady(count, unit="N"):
@@ -465,3 +472,139 @@ def test_steadiness_shows_every_trial_and_the_value_of_all(count, unit, label):
     np.testing.assert_allclose(variation.containers[0].lines[0].get_ydata(), [31, 41, 51])
     np.testing.assert_allclose(regularity.containers[0].lines[0].get_ydata(), [0.61, 0.71, 0.81])
     assert f"{count} trials" in figure.get_suptitle() or count == 1
+
+
+def test_starts_are_drawn_in_the_order_of_where_they_ended():
+    ended = [(9.0, True), (4.0, True), (None, False), (4.5, False), (4.0, True)]
+    ax = plot.starts(types.SimpleNamespace(starts=tuple(types.SimpleNamespace(cost=c, success=s) for c, s in ended)))
+    settled, other = ax.lines
+    np.testing.assert_allclose(settled.get_xydata(), [[1, 0], [2, 0], [4, 10]])
+    np.testing.assert_allclose(other.get_xydata(), [[3, 1]])
+    assert [t.get_text() for t in ax.get_legend().get_texts()] == ["3 settled", "1 did not settle"]
+    assert not plot.starts(types.SimpleNamespace(starts=())).lines
+
+
+def test_several_profiles_share_a_figure_and_a_legend():
+    values = np.linspace(0.5, 1.5, 21)
+    common = {"threshold": 3.84, "level": 0.95, "intervals": [(0.8, 1.2)], "value": 1.0, "stderr": 0.1, "unit": "Hz",
+              "target": "mine", "low": 0.8, "high": 1.2}  # fmt: skip
+    each = [
+        types.SimpleNamespace(values=values, rise=k * (values - 1) ** 2, name=f"n{k}", **common) for k in (100, 50, 25, 12)
+    ]
+    figure = plot.profiles(each)
+    figure.canvas.draw()
+    assert [ax.get_xlabel() for ax in figure.axes] == ["n100 (Hz)", "n50 (Hz)", "n25 (Hz)", "n12 (Hz)"]
+    assert [bool(ax.get_ylabel()) for ax in figure.axes] == [True, False, False, True]
+    assert key(figure) == ["profile", "95 %", "by curvature"] and figure.get_suptitle() == "mine"
+    for ax, found in zip(figure.axes, each, strict=True):
+        np.testing.assert_array_equal(named(ax, "profile").get_ydata(), found.rise)
+    with pytest.raises(ValueError, match="profiles: is empty"):
+        plot.profiles([])
+
+
+# --- figures as files
+
+
+def test_a_figure_is_written_in_the_formats_asked_for_the_same_each_time(tmp_path):
+    def write(*formats):
+        figure, ax = plt.subplots(figsize=(2, 1))
+        ax.set_title("title")
+        return write_figure(figure, tmp_path, "figure", *formats)
+
+    assert write() == ["figure.png"] and matplotlib.image.imread(tmp_path / "figure.png").shape[:2] == (300, 600)
+    assert write(["pdf", "svg", "pdf"]) == ["figure.pdf", "figure.svg"]
+    assert {file.name for file in tmp_path.iterdir()} == {"figure.pdf", "figure.svg"}  # that of before is gone
+    once = [(tmp_path / name).read_bytes() for name in ("figure.pdf", "figure.svg")]
+    assert once[0].startswith(b"%PDF") and b"<svg" in once[1]
+    with pytest.raises(ValueError, match=r"'jpg' is no format of a figure.*Known: png, pdf, svg"):
+        write(["jpg"])
+    write(["svg", "pdf"])
+    assert [(tmp_path / name).read_bytes() for name in ("figure.pdf", "figure.svg")] == once
+
+
+# --- the drawing of the model
+
+
+def written(ax):
+    """The words in the axes by colour."""
+    found = {}
+    for text in ax.texts:
+        found.setdefault(text.get_color(), []).append(text.get_text())
+    return found
+
+
+@pytest.mark.parametrize(
+    ("task", "given", "output"),
+    [
+        (Isometric(), {"P_w", "x_z"}, "F_ext"),
+        (PrescribedLength(), {"P_w", "x_z"}, "F_ext"),
+        (PrescribedForce(), {"P_w", "F_ext"}, "x_z"),
+        (PrescribedForce(observe="acceleration"), {"P_w", "F_ext"}, "x_z"),
+        (PrescribedMotion(), {"x_z", "F_ext"}, "P_w"),
+    ],
+    ids=lambda x: "" if isinstance(x, set) else x if isinstance(x, str) else type(x).__name__,
+)
+def test_the_drawing_tells_what_a_task_prescribes_and_what_comes_out(task, given, output):
+    symbols = {"P_w": r"$P_\mathrm{w}$", "F_ext": r"$F_\mathrm{ext}$", "x_z": r"$x_\mathrm{z}$"}
+    words = written(plot.schematic(task, values=False))
+    assert {name for name, symbol in symbols.items() if symbol in words[plot.BLUE]} == given
+    assert [name for name, symbol in symbols.items() if symbol in words[plot.VERMILLION]] == [output]
+    held = isinstance(task, Isometric)
+    assert ("M" in words[plot.BLUE]) == ("x_z" in given and not held)  # a motor, where the insertion moves
+
+
+def test_the_drawing_has_the_numbers_of_the_task():
+    task = PrescribedForce(
+        P_w=7.0, F_ext=2.5, noise=BandLimitedNoise() + ResonantNoise(0.01, frequency=9.0)
+    ).replace(m_w=0.25, k_w=1e6, c_z=8.0, noise_C_w=0.0, activation_time=0.08)  # fmt: skip
+    said = [text.get_text() for text in plot.schematic(task).texts]
+    for words in (
+        ("K_", "400 N/m"),
+        ("C_", "8 N s/m"),
+        ("P_", "7 N"),
+        ("noise 15 %",),
+        ("tremor 1 % at 9 Hz",),
+        ("twitch of 0.08 s",),
+    ):
+        assert any(all(word in text for word in words) for text in said), words
+    assert {"0.25 kg", "0.5 kg", "2.5 N"} <= set(said) and said.count("noise 0.01 %") == 1
+    assert any("sine 0.3 % at 4.25 Hz" in text for text in said)
+    assert not any("sine" in text.get_text() for text in plot.schematic(task.replace(harmonic_amplitude=0.0)).texts)
+
+
+def drawn_fit(**changes):
+    """A fit as far as its drawing reads it."""
+    derived = {
+        "K_w0": estimate(184.2, "N/m", 13.0), "K_z0": estimate(314.0, "N/m", identifiable=False),
+        "C_w0": estimate(114.3, "N s/m", 8.0), "C_z0": estimate(1.79, "N s/m", 0.12), "mean": estimate(2.92, "N", 0.2),
+    } | changes  # fmt: skip
+    parameters = {"noise_K_w": estimate(0.269, "1", 0.019), "harmonic_amplitude": estimate(0.00325, "1", 0.00023)}
+    return types.SimpleNamespace(tasks={"a": Isometric()}, parameters=parameters, derived=derived, as_shown=dict)
+
+
+def test_the_drawing_of_a_fit_has_errors_and_marks_what_is_not_determined():
+    ax = plot.schematic(drawn_fit())
+    said = [text.get_text() for text in ax.texts]
+    assert any("184 ± 13 N/m" in text for text in said) and "noise 26.9 ± 1.9 %" in said
+    assert [text for text in said if "†" in text] == [r"$K_\mathrm{z0}$  314 N/m †", "† not determined by the data"]
+    assert {"2.92", "± 0.20 N"} <= set(said)
+    known = plot.schematic(drawn_fit(K_z0=estimate(314.0, "N/m", 22.0)))
+    assert not any("†" in text.get_text() for text in known.texts)
+
+
+def test_the_drawing_of_a_joint_fit_asks_for_one_of_its_tasks():
+    with pytest.raises(ValueError, match=r"result.tasks\['a'\]"):
+        plot.schematic(types.SimpleNamespace(tasks={"a": Isometric(), "b": Isometric()}))
+
+
+@pytest.mark.parametrize("values", [True, False])
+def test_words_of_the_drawing_lie_in_a_column_of_a_journal_and_do_not_touch(values):
+    ax = plot.schematic(drawn_fit(K_z0=estimate(314.0, "N/m", 22.0)), values=values)
+    figure = ax.figure
+    assert figure.get_figwidth() * 25.4 == pytest.approx(85)
+    figure.canvas.draw()
+    width, height = figure.canvas.get_width_height()
+    boxes = [text.get_window_extent() for text in ax.texts if text.get_text()]
+    assert all(box.x0 >= 0 and box.x1 <= width and box.y0 >= 0 and box.y1 <= height for box in boxes)
+    assert not any(a.shrunk(0.98, 0.6).overlaps(b) for i, a in enumerate(boxes) for b in boxes[:i])
+    assert min(text.get_fontsize() for text in ax.texts if text.get_text()) > 6

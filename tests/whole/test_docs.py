@@ -8,6 +8,7 @@ import re
 import types
 from collections import Counter
 
+import matplotlib.pyplot as plt
 import pytest
 from pages import PAGES, ROOT, blocks, module, name_of
 
@@ -128,6 +129,19 @@ def test_every_page_is_in_the_navigation():
     assert set(re.findall(r"[\w/-]+\.md", navigation)) == pages | notebooks
 
 
+def test_every_formula_of_a_page_can_be_typeset():
+    """As the site does without the network, in `docs/notebooks.py`; GitHub does it by itself."""
+    formulas = module(ROOT / "docs" / "formulas.py")
+    rows = [row for page in PAGES for found in formulas.BLOCK.finditer(page.read_text(encoding="utf-8"))
+            for row in formulas.lines(found[2])]  # fmt: skip
+    assert len(rows) > 25
+    for row in rows:
+        assert formulas.picture(row).startswith('<img class="math"')
+    assert sum(page.read_text(encoding="utf-8").count("```math") for page in PAGES) == sum(
+        len(formulas.BLOCK.findall(page.read_text(encoding="utf-8"))) for page in PAGES
+    )
+
+
 def test_the_citation_names_the_current_version():
     about = (PACKAGE / "__about__.py").read_text(encoding="utf-8")
     (version,) = re.findall(r'^__version__ = "(.+)"$', about, re.MULTILINE)
@@ -144,6 +158,14 @@ def test_the_picture_of_the_layers_is_current():
     architecture = module(ROOT / "docs" / "architecture.py")
     assert architecture.PICTURE.read_text(encoding="utf-8") == architecture.picture(), "run `python docs/architecture.py`"
     assert set(architecture.HOLDS) == {wing for row in architecture.layers() for wing in row}
+
+
+def test_the_pictures_of_the_model_are_current():
+    pictures = module(ROOT / "docs" / "pictures.py")
+    for name, draw in pictures.PICTURES.items():
+        assert pictures.digest(draw()) == pictures.stored(name), "run `python docs/pictures.py`"
+        assert (pictures.HERE / name).stat().st_size < 100_000
+    plt.close("all")
 
 
 def test_files_named_on_the_page_of_the_layers_exist():

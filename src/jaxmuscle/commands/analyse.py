@@ -7,8 +7,8 @@ import typer
 
 from jaxmuscle._common.arguments import positive
 
-from .console import absent, csv_text, err, out, plain, record, reporting, save_figure, writable
-from .options import READING, Force, Json, Output, Recordings, SpectrumName, Window
+from .console import absent, csv_text, err, out, plain, record, reporting, writable
+from .options import READING, Force, Formats, Json, Output, Recordings, SpectrumName, Window, formats_of
 from .recordings import perturbed, read_perturbed, read_trials, reads_perturbed, unused
 
 if TYPE_CHECKING:
@@ -32,6 +32,7 @@ def analyse(
         typer.Option(metavar="FORCE", help="Maximal voluntary contraction in the recording's unit, for the level."),
     ] = None,
     output: Output = Path("out"),
+    formats: Formats = None,
     save_target: Annotated[Path | None, typer.Option(metavar="FILE", help="Save the target for `jaxmuscle fit`.")] = None,
     force: Force = False,
     as_json: Json = False,
@@ -70,14 +71,17 @@ def analyse(
                 raise ValueError("--save-target and --mvc belong to spectra; this is a perturbation experiment")
             if len(paths) > 1:
                 raise ValueError(f"{len(paths)} files with force and displacement: give one at a time")
-            return _write_perturbed(read_perturbed(paths, reading, window)[0], str(spectrum), output)
+            return _write_perturbed(read_perturbed(paths, reading, window)[0], str(spectrum), output, formats_of(formats))
         unused(reading, *READING, what="a perturbation experiment; name its columns with --force-column and --displacement")
-        _write(read_trials(paths, reading, window), str(spectrum), mvc, output, save_target)
+        _write(read_trials(paths, reading, window), str(spectrum), mvc, output, formats_of(formats), save_target)
 
 
-def _write(trials: "Trials", settings: str, mvc: float | None, folder: Path, save_target: Path | None) -> None:
+def _write(
+    trials: "Trials", settings: str, mvc: float | None, folder: Path, formats: list[str], save_target: Path | None
+) -> None:
     from rich.table import Table
 
+    from jaxmuscle._common.figures import write_figure
     from jaxmuscle._common.files import write_json, write_text
 
     spectrum, summaries = trials.spectrum(settings), [recording.summary(settings) for recording in trials]
@@ -95,7 +99,7 @@ def _write(trials: "Trials", settings: str, mvc: float | None, folder: Path, sav
         target = trials.target(None if save_target is None else save_target.stem, settings=settings, mvc=mvc)
     if several and target is not None:
         found["dispersion"] = target.dispersion
-    save_figure(trials.plot(settings), folder / "analysis.png")
+    figures = write_figure(trials.plot(settings), folder, "analysis", formats)
     write_text(folder / "spectrum.csv", csv_text(columns))
     write_json(folder / "analysis.json", found)
     notices = target.notices if target is not None else [notice for recording in trials for notice in recording.notices]
@@ -109,7 +113,7 @@ def _write(trials: "Trials", settings: str, mvc: float | None, folder: Path, sav
     out.print(table)
     if target is not None and (several or target.mvc_fraction is not None):
         out.print(plain(target), highlight=False)
-    written = [f"{folder}/analysis.json, spectrum.csv, analysis.png"]
+    written = [f"{folder}/analysis.json, spectrum.csv", *figures]
     if target is not None and save_target is not None:
         save_target.parent.mkdir(parents=True, exist_ok=True)
         target.save(save_target)
@@ -118,16 +122,17 @@ def _write(trials: "Trials", settings: str, mvc: float | None, folder: Path, sav
     out.print(f"Written: {', '.join(written)}", highlight=False)
 
 
-def _write_perturbed(recording: "PerturbedRecording", settings: str, folder: Path) -> None:
+def _write_perturbed(recording: "PerturbedRecording", settings: str, folder: Path, formats: list[str]) -> None:
     from rich.table import Table
 
+    from jaxmuscle._common.figures import write_figure
     from jaxmuscle._common.files import write_json
     from jaxmuscle._common.text import rounded
 
     response, delay = recording.frequency_response(settings), recording.delay(settings)
     classical = {name: (m.value, float(m.stderr or 0.0), m.unit) for name, m in recording.second_order(settings).items()}
     classical["delay"] = (*delay, "s")
-    save_figure(recording.plot(settings), folder / "analysis.png")
+    figures = write_figure(recording.plot(settings), folder, "analysis", formats)
     response.save(folder / "response.csv")
     names = ("name", "source", "rate", "window", "notices")
     found = {
@@ -145,4 +150,4 @@ def _write_perturbed(recording: "PerturbedRecording", settings: str, folder: Pat
         table.add_row(name, " ± ".join(rounded(value, error)), unit)
     out.print(table)
     record(found)
-    out.print(f"Written: {folder}/analysis.json, response.csv, analysis.png", highlight=False)
+    out.print(f"Written: {folder}/{', '.join(['analysis.json', 'response.csv', *figures])}", highlight=False)

@@ -13,14 +13,14 @@ from jaxmuscle._common.inputs import read_text
 from jaxmuscle._common.names import file_names
 from jaxmuscle._common.progress import told
 
-from .console import BAD_INPUT, CONVERGED, NOT_CONVERGED, csv_text, err, out, plain, record, save_figure, writable, write_fit
+from .console import BAD_INPUT, CONVERGED, NOT_CONVERGED, csv_text, err, out, plain, record, writable, write_fit
 from .options import TaskName
 
 if TYPE_CHECKING:
     from jaxmuscle.fits import CohortResult
 
 
-FILES = ("cohort.csv", "differences.csv", "cohort.png")
+FILES = ("cohort.csv", "differences.csv", "cohort.png", "cohort.pdf", "cohort.svg")
 SHOWN = {
     "harmonic_frequency": "harmonic (Hz)",
     "corner_frequency": "corner (Hz)",
@@ -36,6 +36,7 @@ def fit_together(
     groups: Path | None,
     folder: Path,
     options: dict[str, Any],
+    formats: list[str],
     *,
     force: bool,
 ) -> int:
@@ -61,7 +62,7 @@ def fit_together(
     if not found.results:
         raise ValueError(f"none of the targets can be fitted: {_reasons(failed)}")
     cohort = jm.fits.CohortResult(found.results, found.groups, failed)
-    _write(cohort, folder, places)
+    _write(cohort, folder, places, formats)
     _show(cohort, folder, places)
     return BAD_INPUT if failed else CONVERGED if cohort.success else NOT_CONVERGED
 
@@ -90,18 +91,21 @@ def _groups(path: Path) -> dict[str, str]:
     return found
 
 
-def _write(cohort: "CohortResult", folder: Path, places: dict[str, Path]) -> None:
+def _write(cohort: "CohortResult", folder: Path, places: dict[str, Path], formats: list[str]) -> None:
+    from jaxmuscle._common.figures import remove_figures, write_figure
     from jaxmuscle._common.files import remove, write_text
 
-    remove(folder, *FILES[1:])  # an earlier cohort may have had them
+    remove(folder, "differences.csv")  # an earlier cohort may have had them
+    remove_figures(folder, "cohort")
     for name, result in cohort.results.items():
-        write_fit(result, places[name])
+        write_fit(result, places[name], formats)
     write_text(folder / "cohort.csv", csv_text(_columns(cohort.table())))
     differences = [_row(d) for d in cohort.differences()]
     if differences:
         write_text(folder / "differences.csv", csv_text(_columns(differences)))
     if any(row["stderr"] is not None for row in cohort.table()):
-        save_figure(cohort.plot("group" if len(set(cohort.groups.values())) > 1 else "person"), folder / "cohort.png")
+        by = "group" if len(set(cohort.groups.values())) > 1 else "person"
+        write_figure(cohort.plot(by), folder, "cohort", formats)
     fits = {name: str(places[name] / "fit.json") for name in cohort.results}
     record({"success": cohort.success, "verdict": cohort.verdict, "table": cohort.table(), "differences": differences,
             "failed": cohort.failed, "fits": fits})  # fmt: skip

@@ -8,8 +8,22 @@ import typer
 import jaxmuscle as jm
 from jaxmuscle._common.progress import told
 
-from .console import CONVERGED, NOT_CONVERGED, aim_of, csv_text, out, plain, record, reporting, save_figure, writable
-from .options import Fix, Force, Free, Json, Output, Quantity, Seed, Segments, TargetTask, fixed_values, names_in
+from .console import CONVERGED, NOT_CONVERGED, aim_of, csv_text, out, plain, record, reporting, writable
+from .options import (
+    Fix,
+    Force,
+    Formats,
+    Free,
+    Json,
+    Output,
+    Quantity,
+    Seed,
+    Segments,
+    TargetTask,
+    fixed_values,
+    formats_of,
+    names_in,
+)
 
 if TYPE_CHECKING:
     from jaxmuscle.comparison import Comparison
@@ -26,6 +40,7 @@ def compare(
     segments: Segments = None,
     quantity: Quantity = None,
     output: Output = Path("out"),
+    formats: Formats = None,
     force: Force = False,
     as_json: Json = False,
 ) -> None:
@@ -52,25 +67,26 @@ def compare(
         writable(output, "compare.json", force=force)
         with told(True, f"comparing models on {aim.name}") as tell:
             found = jm.compare_noise(model, aim, free=names, fix=fixed, key=seed, progress=tell)
-        _write(found, output)
+        files = _write(found, output, formats_of(formats))
         record(output / "compare.json")
-        _show(found, output)
+        _show(found, f"{output}/{', '.join(files)}")
     raise typer.Exit(CONVERGED if found.success else NOT_CONVERGED)
 
 
-def _write(found: "Comparison", folder: Path) -> None:
+def _write(found: "Comparison", folder: Path, formats: list[str]) -> list[str]:
+    from jaxmuscle._common.figures import write_figure
     from jaxmuscle._common.files import write_text
 
     rows = found.table()
     write_text(folder / "compare.csv", csv_text({name: [row[name] for row in rows] for name in rows[0]}))
     found.save(folder / "compare.json")
-    save_figure(found.plot(), folder / "compare.png")
+    return ["compare.csv", "compare.json", *write_figure(found.plot(), folder, "compare", formats)]
 
 
-def _show(found: "Comparison", folder: Path) -> None:
+def _show(found: "Comparison", files: str) -> None:
     out.print(plain(found), highlight=False, soft_wrap=True)
     if not found.success:
         out.print(
             "[bold red]failed:[/] not every model came to its maximum: fix a parameter, or free fewer", highlight=False
         )
-    out.print(f"Written: {folder}/compare.csv, compare.json, compare.png", highlight=False)
+    out.print(f"Written: {files}", highlight=False)

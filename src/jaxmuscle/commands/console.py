@@ -7,7 +7,7 @@ import json
 import os
 import re
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -151,27 +151,20 @@ def _field(value: Any) -> str:
     return f"{value:.8g}"
 
 
-def save_figure(figure: Any, path: Path) -> None:
-    import matplotlib.pyplot as plt
-
-    from jaxmuscle._common.files import replacing
-
-    with replacing(path) as temporary:
-        figure.savefig(temporary, dpi=150)
-    plt.close(figure)
-
-
-def write_fit(result: "FitResult", folder: Path, *, figure: bool = True) -> None:
-    """fit.json, fit.png, and spectrum.csv and stiffness.csv of what was fitted, each whole or not there."""
+def write_fit(result: "FitResult", folder: Path, formats: Iterable[str] = ()) -> list[str]:
+    """fit.json, fit in each of the formats, and the tables of what was fitted, each whole or not there; their names."""
+    from jaxmuscle._common.figures import remove_figures, write_figure
     from jaxmuscle._common.files import remove, write_text
 
-    remove(folder, "fit.png", *(tables := fit_tables(result)))
+    tables = fit_tables(result)
+    remove(folder, *tables)
+    remove_figures(folder, "fit")
     result.save(folder / "fit.json")
     for name, columns in tables.items():
         if columns:
             write_text(folder / name, csv_text(columns))
-    if figure:
-        save_figure(result.plot(), folder / "fit.png")
+    figures = write_figure(result.plot(), folder, "fit", formats) if formats else []
+    return ["fit.json", *figures, *(name for name, columns in tables.items() if columns)]
 
 
 def fit_tables(result: "FitResult") -> dict[str, dict[str, Any]]:

@@ -7,8 +7,8 @@ import typer
 
 import jaxmuscle as jm
 
-from .console import out, plain, record, reporting, save_figure, writable
-from .options import Force, Json, Output, Seed, names_in
+from .console import out, plain, record, reporting, writable
+from .options import Force, Formats, Json, Output, Seed, formats_of, names_in
 
 
 def design(
@@ -23,6 +23,7 @@ def design(
     spread: Annotated[float, typer.Option(metavar="SHARE", help="Share of the motion that is even over the band.")] = 0.1,
     seed: Seed = 0,
     output: Output = Path("out"),
+    formats: Formats = None,
     force: Force = False,
     as_json: Json = False,
 ) -> None:
@@ -37,6 +38,7 @@ def design(
     """
     with reporting(as_json):
         from jaxmuscle._common.environment import keep_compiled_programs
+        from jaxmuscle._common.figures import write_figure
 
         keep_compiled_programs()
         writable(output, "motor.csv", "design.json", force=force)
@@ -47,10 +49,10 @@ def design(
         )  # fmt: skip
         found.save(output / "motor.csv")
         found.save(output / "design.json")
-        save_figure(found.plot(), output / "design.png")
+        figures = write_figure(found.plot(), output, "design", formats_of(formats))
         record(output / "design.json")
         out.print(plain(found), highlight=False, soft_wrap=True)
-        out.print(f"Written: {output}/motor.csv, design.json, design.png", highlight=False)
+        out.print(f"Written: {output}/{', '.join(['motor.csv', 'design.json', *figures])}", highlight=False)
 
 
 def _source(name: str) -> Any:

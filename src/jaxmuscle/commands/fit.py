@@ -14,7 +14,6 @@ from .console import (
     aim_of,
     aimed,
     err,
-    fit_tables,
     out,
     plain,
     record,
@@ -26,6 +25,7 @@ from .console import (
 from .options import (
     Fix,
     Force,
+    Formats,
     Free,
     Json,
     MethodName,
@@ -38,6 +38,7 @@ from .options import (
     TargetTask,
     Window,
     fixed_values,
+    formats_of,
     names_in,
 )
 from .recordings import read_recordings, reads_perturbed, unused
@@ -94,6 +95,7 @@ def fit(
         bool, typer.Option("--quick", help="Leave out the simulated check, the harmonic's profile and p-value, the figure.")
     ] = False,
     output: Output = Path("out"),
+    formats: Formats = None,
     force: Force = False,
     as_json: Json = False,
     reading: dict[str, Any],
@@ -161,7 +163,7 @@ def fit(
                 raise ValueError("several targets are fitted together in linear response, without checks: leave out "
                                  "--method, --seeds and --quick, or fit them one at a time")  # fmt: skip
             options |= {"rung": rungs or 0}
-            raise typer.Exit(fit_together(target, read, task, groups, output, options, force=force))
+            raise typer.Exit(fit_together(target, read, task, groups, output, options, formats_of(formats), force=force))
         if groups is not None:
             raise ValueError(
                 "--groups needs several targets; recordings of several people are a study: see `jaxmuscle study`"
@@ -183,36 +185,38 @@ def fit(
             unused(reading, "axis", window=window, what="recordings; this is a spectrum")
             aim = aim_of(target[0], task, read)
         writable(output, "fit.json", force=force)
-        converged = _fit_one(*aim, output, options, quick=quick)
+        converged = _fit_one(*aim, output, options, [] if quick else formats_of(formats))
     raise typer.Exit(CONVERGED if converged else NOT_CONVERGED)
 
 
-def _fit_one(target: Any, model: Any, folder: Path, options: dict[str, Any], *, quick: bool) -> bool:
+def _fit_one(target: Any, model: Any, folder: Path, options: dict[str, Any], formats: list[str]) -> bool:
     """The table as soon as the search has ended, then what the checks add; the fit is written before these."""
     printed = []
 
-    def answer(result: Any) -> None:
+    def table(result: Any) -> None:
         show(result, success=result.success and result.adequate is not False)
         printed.append(result)
-        write_fit(result, folder, figure=False)  # a program of the checks may run longer than a signal can wait
+
+    def answer(result: Any) -> None:
+        table(result)
+        write_fit(result, folder)  # a program of the checks may run longer than a signal can wait
 
     try:
         with told(True, f"fitting {target[0].name if isinstance(target, list) else target.name}") as tell:
             result = jm.fit(model, target, progress=tell, answer=answer, **options)
             tell("writing", 1.0)
-            write_fit(result, folder, figure=not quick)
+            files = write_fit(result, folder, formats)
     except jm.fits.FitInterrupted as stop:
-        write_fit(stop.result, folder, figure=False)
+        write_fit(stop.result, folder)
         record(folder / "fit.json")
         err.print(f"interrupted: what had been reached is in {folder}")
         raise typer.Exit(interrupted()) from None
     record(folder / "fit.json")
     if not printed:
-        answer(result)
+        table(result)
     told_before = {*printed[0].remarks, *printed[0].notices}
     for sentence in (*result.remarks, *(f"note: {notice}" for notice in result.notices)):
         if sentence.removeprefix("note: ") not in told_before:
             out.print(plain(sentence), highlight=False)
-    files = ["fit.json", *["fit.png"] * (not quick), *(name for name, columns in fit_tables(result).items() if columns)]
     out.print(f"Written: {folder}/{', '.join(files)}", highlight=False, soft_wrap=True)
     return result.success

@@ -33,6 +33,12 @@ class SpectrumName(StrEnum):
     pwelch = "pwelch"
 
 
+class FormatName(StrEnum):
+    png = "png"
+    pdf = "pdf"
+    svg = "svg"
+
+
 class TaskName(StrEnum):
     isometric = "isometric"
     motion = "prescribed-motion"
@@ -48,6 +54,9 @@ class Observed(StrEnum):
 Output = Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for the results.")]
 Force = Annotated[bool, typer.Option("--force", help="Overwrite an earlier result.")]
 Json = Annotated[bool, typer.Option("--json", help="Print the result as one JSON object instead of text.")]
+Formats = Annotated[
+    list[FormatName] | None, typer.Option("--format", help="Format of the figures (png); repeatable.", show_default=False)
+]
 Seed = Annotated[int, typer.Option(min=0, max=2**32 - 1, help="Seed of all random numbers.")]
 Preset = Annotated[str, typer.Argument(help="Bundled preset (see `jaxmuscle presets`), preset file or fit.json.")]
 OtherTask = Annotated[TaskName | None, typer.Option(help="Put the same muscle into another task.")]
@@ -107,6 +116,11 @@ SAME_NAME = (
     "quantity",
     "segments",
 )  # arguments in messages that are options of the same name
+
+
+def formats_of(given: list[FormatName] | None) -> list[str]:
+    """The formats of every --format, png where there is none."""
+    return [str(name) for name in given or [FormatName.png]]
 
 
 def names_in(given: str | None, option: str = "--free") -> list[str] | None:

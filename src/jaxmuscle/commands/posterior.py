@@ -8,22 +8,11 @@ import typer
 import jaxmuscle as jm
 from jaxmuscle._common.progress import told
 
-from .console import (
-    CONVERGED,
-    NOT_CONVERGED,
-    aim_of,
-    err,
-    out,
-    plain,
-    record,
-    reporting,
-    save_figure,
-    show,
-    writable,
-)
+from .console import CONVERGED, NOT_CONVERGED, aim_of, err, out, plain, record, reporting, show, writable
 from .options import (
     Fix,
     Force,
+    Formats,
     Free,
     Json,
     Noise,
@@ -33,6 +22,7 @@ from .options import (
     Segments,
     TargetTask,
     fixed_values,
+    formats_of,
     names_in,
 )
 
@@ -54,6 +44,7 @@ def posterior(
     warmup: Annotated[int, typer.Option(min=1, max=10**9, help="Steps of each chain before its draws.")] = 500,
     seed: Seed = 0,
     output: Output = Path("out"),
+    formats: Formats = None,
     force: Force = False,
     as_json: Json = False,
 ) -> None:
@@ -96,7 +87,7 @@ def posterior(
         except KeyboardInterrupt:
             err.print(f"the fit stays: go on with jaxmuscle posterior {output}/fit.json --out {output}", soft_wrap=True)
             raise
-        _write(found, output)
+        _write(found, output, formats_of(formats))
         record(output / "posterior.json")
         _show(found, output)
     raise typer.Exit(CONVERGED if found.success else NOT_CONVERGED)
@@ -120,16 +111,16 @@ def _fitted(target: str, read: dict[str, Any], asked: dict[str, Any], seed: int)
                    progress=tell)  # fmt: skip
 
 
-def _write(found: "Posterior", folder: Path) -> None:
-    from jaxmuscle._common.files import remove
+def _write(found: "Posterior", folder: Path, formats: list[str]) -> None:
+    from jaxmuscle._common.figures import remove_figures, write_figure
 
-    remove(folder, "corner.png", "predictive.png")
+    remove_figures(folder, "corner", "predictive")
     found.save(folder / "posterior.nc")
     found.save(folder / "posterior.json")
-    save_figure(found.plot_chains(), folder / "chains.png")
+    write_figure(found.plot_chains(), folder, "chains", formats)
     if found.success:
-        save_figure(found.plot(), folder / "corner.png")
-        save_figure(found.plot_predictive().figure, folder / "predictive.png")
+        write_figure(found.plot(), folder, "corner", formats)
+        write_figure(found.plot_predictive().figure, folder, "predictive", formats)
 
 
 def _show(found: "Posterior", folder: Path) -> None:

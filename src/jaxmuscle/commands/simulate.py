@@ -7,8 +7,8 @@ import typer
 
 import jaxmuscle as jm
 
-from .console import csv_text, out, record, reporting, save_figure, task_of, writable
-from .options import Force, Json, Observe, OtherTask, Output, Preset, Seed
+from .console import csv_text, out, record, reporting, task_of, writable
+from .options import Force, Formats, Json, Observe, OtherTask, Output, Preset, Seed, formats_of
 
 if TYPE_CHECKING:
     from jaxmuscle.model import AbstractTask
@@ -21,6 +21,7 @@ def simulate(
     seeds: Annotated[int, typer.Option(min=1, help="Noise paths.")] = 50,
     seed: Seed = 0,
     output: Output = Path("out"),
+    formats: Formats = None,
     force: Force = False,
     as_json: Json = False,
 ) -> None:
@@ -40,13 +41,14 @@ def simulate(
         keep_compiled_programs()
         model = task_of(preset, task, observe)
         writable(output, "trajectories.nc", force=force)
-        _simulate(model, seeds, seed, output)
+        _simulate(model, seeds, seed, output, formats_of(formats))
 
 
-def _simulate(model: "AbstractTask", seeds: int, seed: int, folder: Path) -> None:
+def _simulate(model: "AbstractTask", seeds: int, seed: int, folder: Path, formats: list[str]) -> None:
     import jax
     import numpy as np
 
+    from jaxmuscle._common.figures import write_figure
     from jaxmuscle._common.files import replacing, write_text
 
     runs = jm.ensemble(model, jax.random.key(seed), seeds=seeds, progress=True)
@@ -60,7 +62,8 @@ def _simulate(model: "AbstractTask", seeds: int, seed: int, folder: Path) -> Non
     columns = {"frequency_hz": np.asarray(mean.frequency), "power": np.asarray(mean.power), "power_stderr": estimate.stderr,
                "proportional_power": np.asarray(mean.proportional), "quantile_05": low, "quantile_95": high}  # fmt: skip
     write_text(folder / "spectrum.csv", csv_text(columns))
-    save_figure(jm.plot.simulation(runs), folder / "simulate.png")
+    figures = write_figure(jm.plot.simulation(runs), folder, "simulate", formats)
+    files = ["trajectories.nc", "spectrum.csv", *figures]
     held = runs.filtered()
     found = jm.spectra.peaks(mean)
     still = model.quantity == "acceleration"  # about a mean of zero
@@ -72,11 +75,11 @@ def _simulate(model: "AbstractTask", seeds: int, seed: int, folder: Path) -> Non
             "coefficient_of_variation": variation, "maximum_hz": float(found.maximum.frequency),
             "local_maxima_hz": [float(p.frequency) for p in found.local_maxima],
             "spectrum": {name: np.asarray(column).tolist() for name, column in columns.items()},
-            "files": [str(folder / name) for name in ("trajectories.nc", "spectrum.csv", "simulate.png")]})  # fmt: skip
+            "files": [str(folder / name) for name in files]})  # fmt: skip
     out.print(f"{type(model).__name__}, {seeds} seeds of {runs.time[-1]:g} s", highlight=False)
     level = f"{held.mean():.4g} {model.output_unit}"
     spread = spread or f", standard deviation {held.std():.3g} {model.output_unit}"
     out.print(f"{model.output_name}: mean {level}{spread}", highlight=False)
     locals_ = ", ".join(f"{p.frequency:.3f}" for p in found.local_maxima) or "none"
     out.print(f"Spectrum: maximum at {found.maximum.frequency:.3f} Hz, local maxima at {locals_} Hz", highlight=False)
-    out.print(f"Written: {folder}/trajectories.nc, spectrum.csv, simulate.png", highlight=False)
+    out.print(f"Written: {folder}/{', '.join(files)}", highlight=False)

@@ -5,8 +5,8 @@ from typing import Any
 
 import jaxmuscle as jm
 
-from .console import out, plain, record, reporting, save_figure, writable
-from .options import Force, Json, Output, Recordings, Window
+from .console import out, plain, record, reporting, writable
+from .options import Force, Formats, Json, Output, Recordings, Window, formats_of
 from .recordings import read_trials, reads_recordings
 
 
@@ -16,6 +16,7 @@ def steadiness(
     *,
     window: Window = None,
     output: Output = Path("out"),
+    formats: Formats = None,
     force: Force = False,
     as_json: Json = False,
     reading: dict[str, Any],
@@ -30,6 +31,7 @@ def steadiness(
         jaxmuscle steadiness trial1.csv trial2.csv trial3.csv --column force --rate 2048 --window 8:25
     """
     with reporting(as_json):
+        from jaxmuscle._common.figures import write_figure
         from jaxmuscle._common.files import write_text
 
         writable(output, "steadiness.json", force=force)
@@ -37,7 +39,7 @@ def steadiness(
         found.save(output / "steadiness.json")
         table = found.to_dataframe().to_csv(index=False, float_format="%.8g", lineterminator="\n")
         write_text(output / "steadiness.csv", table)
-        save_figure(found.plot(), output / "steadiness.png")
+        figures = write_figure(found.plot(), output, "steadiness", formats_of(formats))
         record(output / "steadiness.json")
         out.print(plain(found), highlight=False, soft_wrap=True)
-        out.print(f"Written: {output}/steadiness.json, steadiness.csv, steadiness.png", highlight=False)
+        out.print(f"Written: {output}/{', '.join(['steadiness.json', 'steadiness.csv', *figures])}", highlight=False)

@@ -8,7 +8,7 @@ import typer
 import jaxmuscle as jm
 
 from .console import CONVERGED, NOT_CONVERGED, err, out, plain, record, reporting, show, writable
-from .options import READING, Force, Json, NoiseName, Output, Seed, SpectrumName, Window, names_in
+from .options import READING, Force, Formats, Json, NoiseName, Output, Seed, SpectrumName, Window, formats_of, names_in
 from .recordings import edges_of, reads_recordings
 
 
@@ -25,6 +25,7 @@ def study(
     correction: Annotated[str | None, typer.Option(help="For many comparisons: holm (default), fdr or none.")] = None,
     seed: Seed = 0,
     output: Output = Path("out"),
+    formats: Formats = None,
     force: Force = False,
     as_json: Json = False,
     reading: dict[str, Any],
@@ -68,7 +69,7 @@ def study(
         for notice, names in whose.items():
             said = "all" if len(names) == len(found.cells) else "; ".join(names)
             err.print(f"[yellow]notice:[/] {plain(said)}: {plain(notice)}", highlight=False)
-        found.save(output)
+        found.save(output, formats_of(formats))
         record(output / "study.json")
         show(found, success=found.success)
         files = ", ".join(sorted(path.name for path in output.iterdir()))

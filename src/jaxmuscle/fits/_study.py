@@ -6,7 +6,7 @@ import itertools
 import os
 import tempfile
 import textwrap
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,6 +16,7 @@ import numpy as np
 from jaxmuscle import plot
 from jaxmuscle._common.arrays import with_nulls
 from jaxmuscle._common.environment import versions
+from jaxmuscle._common.figures import remove_figures, write_figure
 from jaxmuscle._common.files import remove, write_json, write_text
 from jaxmuscle._common.keys import check_key
 from jaxmuscle._common.progress import Tell, told
@@ -161,42 +162,41 @@ class StudyResult(eqx.Module):
         """Spectra of people and means of groups, a panel for each condition; see `jaxmuscle.plot.study`."""
         return plot.study(self, ax, proportional=proportional)
 
-    def save(self, folder: str | os.PathLike[str]) -> None:
+    def save(self, folder: str | os.PathLike[str], formats: Sequence[str] = ("png",)) -> None:
         """Write people.csv, differences.csv, study.json, spectra.png, quantities.png and methods.txt into `folder`.
 
         They are made beside it first and then moved: a save that is interrupted changes nothing. Without a comparison there
-        is no differences.csv, and where the fits determine too little no quantities.png.
+        is no differences.csv, and where the fits determine too little no quantities.png. `formats` of the figures: "png",
+        "pdf", "svg"; raises `ValueError` for another.
         """
         folder = Path(folder)
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(prefix=".study-", dir=folder) as made:
             new = Path(made)
-            self._write(new)
-            remove(folder, *FILES)  # an earlier study may have had more of them
+            self._write(new, formats)
+            remove(folder, *FILES)
+            remove_figures(folder, "spectra", "quantities")  # an earlier study may have had more of them
             for path in sorted(new.iterdir()):
                 os.replace(path, folder / path.name)
 
-    def _write(self, folder: Path) -> None:
-        import matplotlib.pyplot as plt
-
+    def _write(self, folder: Path, formats: Sequence[str]) -> None:
         tables = {"people.csv": self.table(), "differences.csv": [_row(d) for d in self.differences()]}
         for name, rows in tables.items():
             if rows:
                 write_text(folder / name, frame(rows).to_csv(index=False, float_format="%.8g"))
         write_json(folder / "study.json", to_table(self))
         write_text(folder / "methods.txt", textwrap.fill(self.methods(), WIDTH) + "\n")
-        figures: dict[str, Any] = {"spectra.png": self.plot()}
+        figures: dict[str, Any] = {"spectra": self.plot()}
         with contextlib.suppress(ValueError):  # nothing that half of the targets determine
-            figures["quantities.png"] = plot.cohort(self.cohort, "group", quantities=self.quantities)
+            figures["quantities"] = plot.cohort(self.cohort, "group", quantities=self.quantities)
         for name, figure in figures.items():
-            figure.savefig(folder / name, dpi=150)
-            plt.close(figure)
+            write_figure(figure, folder, name, formats)
 
     def __str__(self) -> str:
         return folded(report_lines(self))
 
 
-FILES = ("people.csv", "differences.csv", "study.json", "methods.txt", "spectra.png", "quantities.png")
+FILES = ("people.csv", "differences.csv", "study.json", "methods.txt")
 
 
 def _row(difference: Difference) -> dict[str, Any]:

@@ -15,8 +15,10 @@ from ._posterior import chains as chains
 from ._posterior import posterior as posterior
 from ._posterior import predictive as predictive
 from ._profile import profile as profile
+from ._profile import profiles as profiles
 from ._recording import recording as recording
 from ._recording import trials as trials
+from ._schematic import schematic as schematic
 from ._sensitivity import sensitivity as sensitivity
 from ._simulation import simulation as simulation
 from ._simulation import trajectory as trajectory
@@ -24,6 +26,7 @@ from ._spectra import QUANTILES as QUANTILES
 from ._spectra import estimate as estimate
 from ._spectra import spectrum as spectrum
 from ._spectra import target as target
+from ._starts import starts as starts
 from ._steadiness import steadiness as steadiness
 from ._study import study as study
 from ._style import BLUE as BLUE

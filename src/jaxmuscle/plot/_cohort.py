@@ -1,5 +1,6 @@
 """The figure of a cohort: what its data determine, by person, group or level."""
 
+import textwrap
 from collections.abc import Collection
 from typing import Any
 
@@ -10,8 +11,8 @@ from matplotlib.figure import Figure, SubFigure
 from ._style import BLUE, GREY, PALETTE, canvas, styled
 
 WAYS = ("person", "group", "level")
-WIDTH, HEIGHT, ACROSS = 3.6, 2.5, 2  # inches, inches, panels
-LABELLED = 16  # people who get a name on the axis
+WIDTH, HEIGHT, ACROSS = 2.25, 1.8, 2  # inches, inches, panels: legible in a column of 85 mm
+LABELLED = 12  # people who get a name on the axis
 SHARE = 0.5  # of the targets that must determine a quantity for it to be drawn
 
 
@@ -64,7 +65,9 @@ def _panel(ax: Axes, rows: list[dict[str, Any]], people: list[str], groups: list
                 ax.hlines(value.mean(), number - 0.35, number + 0.35, color=GREY, linewidth=1)
         ax.errorbar(place, value, error, fmt="o", markersize=3.5, capsize=2, linewidth=1, color=colour, label=group or None)
     unit = rows[0]["unit"]
-    ax.set_ylabel(f"{rows[0]['quantity'].replace('_', ' ')}" + ("" if unit == "1" else f" ({unit})"))
+    name = rows[0]["quantity"]
+    label = (name if name[1] == "_" else name.replace("_", " ")) + ("" if unit == "1" else f" ({unit})")
+    ax.set_ylabel(textwrap.fill(label, 18))
     if by == "group":
         ax.set_xticks(range(len(groups)), [group or "all" for group in groups])
         ax.set_xlim(-0.6, len(groups) - 0.4)
@@ -73,6 +76,7 @@ def _panel(ax: Axes, rows: list[dict[str, Any]], people: list[str], groups: list
     else:
         ax.set_xlim(-0.5, len(people) - 0.5)
         if len(people) <= LABELLED:
-            ax.set_xticks(range(len(people)), people, rotation=35, ha="right", rotation_mode="anchor")
+            turned = 35 if len(people) <= 6 else 60
+            ax.set_xticks(range(len(people)), people, rotation=turned, ha="right", rotation_mode="anchor")
         else:
             ax.set_xlabel("Target number")

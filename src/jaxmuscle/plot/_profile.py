@@ -1,11 +1,13 @@
-"""The figure of a profile likelihood."""
+"""The figures of profile likelihoods, one or several."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.figure import Figure, SubFigure
 
-from ._style import BLUE, GREY, ORANGE, axes_or_new, log_axis, styled
+from ._style import BLUE, GREY, ORANGE, axes_or_new, canvas, log_axis, styled
 
 SHOWN = 3.0  # times the threshold
 
@@ -40,6 +42,31 @@ def profile(found: Any, ax: Axes | None = None) -> Axes:
         ax.text(0.99, 0.97, f"open {side}", transform=ax.transAxes, color=GREY, fontsize=7, ha="right", va="top")
     ax.legend(frameon=False, loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=3, borderaxespad=0.0)
     return ax
+
+
+@styled
+def profiles(profiles: Sequence[Any], ax: Axes | None = None) -> Figure | SubFigure:
+    """Draws several `profiles` of one fit beside each other, each as `profile` does, with one legend; `ax`, their place.
+
+    Returns the figure. Raises `ValueError` where there is none.
+    """
+    if not profiles:
+        raise ValueError("profiles: is empty; give [jm.profile(result, name) for name in ...]")
+    columns = min(len(profiles), 3)
+    rows = -(-len(profiles) // columns)
+    fig = canvas(ax, (2.25 * columns, 1.7 * rows + 0.5))
+    for number, found in enumerate(profiles, start=1):
+        panel = profile(found, fig.add_subplot(rows, columns, number))
+        panel.set_title("")
+        panel.set_ylabel("Rise of -2 ln L" if (number - 1) % columns == 0 else "")
+        handles, labels = panel.get_legend_handles_labels()
+        legend = panel.get_legend()
+        if legend is not None:
+            legend.remove()
+        if number == 1:
+            fig.legend(handles, labels, loc="outside lower center", ncols=3, frameon=False)
+    fig.suptitle(profiles[0].target, x=0.02, ha="left", size=9, weight="bold", parse_math=False)
+    return fig
 
 
 def _beside(inside: np.ndarray) -> np.ndarray:

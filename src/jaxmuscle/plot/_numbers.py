@@ -1,0 +1,31 @@
+"""Numbers as figures print them: value, standard error, unit."""
+
+import math
+import re
+from typing import Any
+
+from jaxmuscle._common.text import rounded
+
+
+def quantity(estimate: Any) -> tuple[str, str, str]:
+    """Value, standard error and unit of an estimate in print: the error to two digits, the value to as many places."""
+    value, stderr = float(estimate.value), estimate.stderr
+    if not math.isfinite(value):
+        return "not finite", "", unit_in_print(estimate.unit)
+    stderr = float(stderr) if stderr is not None and 0 < stderr < math.inf else 0.0
+    largest = max(abs(value), stderr)
+    power = math.floor(math.log10(largest)) if largest > 0 else 0
+    power = 0 if -2 <= power <= 3 else power
+    value, stderr = value / 10.0**power, stderr / 10.0**power
+    if estimate.identifiable and stderr > 0:
+        shown, error = rounded(value, stderr)
+        return shown, f"± {error}", unit_in_print(estimate.unit, power)
+    error = "–" if estimate.identifiable else "not determined"
+    return f"{value:#.3g}".rstrip("."), error, unit_in_print(estimate.unit, power)
+
+
+def unit_in_print(unit: str, power: int = 0) -> str:
+    digits = str.maketrans("0123456789-", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻")
+    raised = re.sub(r"\^(-?\d+)", lambda match: match[1].translate(digits), unit)
+    ten = f"10{str(power).translate(digits)}" if power else ""
+    return " ".join(part for part in (ten, raised if raised != "1" or not ten else "") if part)
