@@ -1,6 +1,5 @@
 """Commands and hostile input: what is no file, a reader that crashes, and names that lead elsewhere."""
 
-import functools
 import json
 import os
 
@@ -12,7 +11,7 @@ from test_result import made_result
 from typer.testing import CliRunner
 
 import jaxmuscle as jm
-from jaxmuscle.commands import cohort as _cli_cohort
+from jaxmuscle._common import figures
 from jaxmuscle.commands.main import app
 
 GRID = 0.390625 * np.arange(1, 31)
@@ -128,8 +127,12 @@ def test_fits_of_many_targets_stay_in_their_folder(tmp_path, monkeypatch):
         path.write_text(tomli_w.dumps(jm.Target("name", POWER).to_table() | {"name": name}))
     fitted = lambda targets, **options: jm.fits.CohortResult({t.name: made_result() for t in targets}, {}, {})  # noqa: E731
     monkeypatch.setattr(jm, "fit_cohort", fitted, raising=False)
-    monkeypatch.setattr(_cli_cohort, "save_figure", lambda figure, path: path.touch())
-    monkeypatch.setattr(_cli_cohort, "write_fit", functools.partial(_cli_cohort.write_fit, figure=False))
+
+    def drawn(figure, folder, name, formats):
+        (folder / f"{name}.png").touch()
+        return [f"{name}.png"]
+
+    monkeypatch.setattr(figures, "write_figure", drawn)
     before, out = set(tmp_path.rglob("*")), inner / "out"
     result = run("fit", *paths, "--out", out, "--json")
     assert result.exit_code in (0, 1)

@@ -12,7 +12,7 @@ import pytest
 
 import jaxmuscle as jm
 from jaxmuscle.ensembles._places import place_of
-from jaxmuscle.ensembles._store import read_tallies
+from jaxmuscle.ensembles._tallies import read_tallies
 
 SRC = Path(__file__).parents[2] / "src"
 BEGIN = """

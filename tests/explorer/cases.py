@@ -13,10 +13,9 @@ from typing import Any
 import numpy as np
 
 import jaxmuscle as jm
-from jaxmuscle.explorer._facts import facts
+from jaxmuscle.explorer._facts import bare_table, facts
 from jaxmuscle.explorer._page import MODULES, part_of
 from jaxmuscle.model import Constant, Decay, RampHold, WhiteNoise
-from jaxmuscle.model._task_tables import task_to_table
 from jaxmuscle.response._expected import expected_moments
 from jaxmuscle.spectra._settings import WINDOW
 
@@ -112,7 +111,7 @@ def main() -> None:
     import jax
 
     with jax.enable_x64(True):
-        cases = {name: {"table": task_to_table(task), "rows": rows_of(task, name)} for name, task in STRUCTURES.items()}
+        cases = {name: {"table": bare_table(task), "rows": rows_of(task, name)} for name, task in STRUCTURES.items()}
     worst = by_javascript(cases)
     for name, difference in sorted(worst.items(), key=lambda pair: -pair[1]):
         print(f"{difference:.1e}  {name}")

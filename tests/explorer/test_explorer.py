@@ -250,7 +250,7 @@ def test_a_dropped_spectrum_is_shown_and_compared(page, tmp_path, x64):
         assert page.run("window.explorer.spectrum.chi2") == pytest.approx(chi2_of(task, target), rel=SAME)
     drop(page, "bad.csv", "frequency_hz,proportional_power\n1,0.5\n1,0.6\n")
     assert "line 3" in page.run("document.getElementById('message').textContent")
-    table = cases.task_to_table(jm.Isometric())
+    table = cases.bare_table(jm.Isometric())
     table["muscle"]["damping_w"]["type"] = "Own"
     drop(page, "own.json", json.dumps({"task_table": table}))
     page.wait("document.getElementById('message').textContent.includes('own.json: its muscle')")

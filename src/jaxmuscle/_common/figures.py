@@ -10,7 +10,7 @@ from .text import choices
 FORMATS = ("png", "pdf", "svg")
 DPI = 300  # of a PNG: what journals ask for
 # The same figure gives the same file, and its letters can be searched and changed.
-SETTINGS: dict[str, Any] = {"svg.hashsalt": "jaxmuscle", "pdf.fonttype": 42}
+SETTINGS: Any = {"svg.hashsalt": "jaxmuscle", "pdf.fonttype": 42}
 UNDATED: dict[str, dict[str, Any]] = {"png": {}, "pdf": {"CreationDate": None}, "svg": {"Date": None}}
 
 

@@ -5,8 +5,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from jaxmuscle._common.arguments import positive
-
 from .console import absent, csv_text, err, out, plain, record, reporting, writable
 from .options import READING, Force, Formats, Json, Output, Recordings, SpectrumName, Window, formats_of
 from .recordings import perturbed, read_perturbed, read_trials, reads_perturbed, unused
@@ -60,6 +58,8 @@ def analyse(
     """
     with reporting(as_json):
         if mvc is not None:
+            from jaxmuscle._common.arguments import positive
+
             positive("--mvc", mvc)
         if save_target is not None and save_target.suffix.lower() != ".toml":
             raise ValueError(f"--save-target {save_target}: a target is saved as TOML; give a name that ends in .toml")

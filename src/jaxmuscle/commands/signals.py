@@ -33,6 +33,7 @@ class Ear:
 
     def __init__(self) -> None:
         self.code = 0
+        self.raised = False
         self.working = True
         self.wakes, self.woken = socket.socketpair()
         self.wakes.setblocking(False)
@@ -53,9 +54,9 @@ class Ear:
 
     def __call__(self, number: int, frame: FrameType | None) -> None:
         if number != LATER:
-            if self.code:
+            if self.raised:
                 return  # it is ending; `watch` sees to a second signal
-            self.code = 128 + number
+            self.raised, self.code = True, self.code or 128 + number  # `watch` may have heard it before
         if not self.working:
             leave(self.code)  # all is written: Python's own end can take long
         if importing(frame) and LATER is not None:

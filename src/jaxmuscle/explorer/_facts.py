@@ -11,7 +11,7 @@ from jaxmuscle.model._parameters import PARAMETERS, USUALLY_FREE, Parameter
 from jaxmuscle.model._resonant_noise import ResonantNoise
 from jaxmuscle.model._rungs import on_rung
 from jaxmuscle.model._task_tables import task_to_table
-from jaxmuscle.model._tasks import TASKS, Isometric, Observed, PrescribedForce
+from jaxmuscle.model._tasks import TASKS, AbstractTask, Isometric, Observed, PrescribedForce
 from jaxmuscle.spectra._settings import NAMED, SpectrumSettings
 
 REACH = 3.0  # prior standard deviations to either side of the default
@@ -30,7 +30,7 @@ def facts() -> dict[str, Any]:
     return {
         "parameters": {name: parameter(row) for name, row in PARAMETERS.items()},
         "usually_free": list(USUALLY_FREE),
-        "tasks": {name: task_to_table(task) for name, task in tasks.items()},
+        "tasks": {name: bare_table(task) for name, task in tasks.items()},
         "noises": {name: noise_table(noise) for name, noise in kinds.items()},
         "resonances": [noise_table(part) for part in richest.noise.components if isinstance(part, ResonantNoise)],
         "settings": {name: SpectrumSettings.named(name).to_dict() for name in NAMED},
@@ -38,6 +38,11 @@ def facts() -> dict[str, Any]:
         "smoothness_needed": needed,
         "observed": list(get_args(Observed)),
     }
+
+
+def bare_table(task: AbstractTask) -> dict[str, Any]:
+    """A task as a preset holds it, without the parts that it does not have (`"none"`)."""
+    return {key: value for key, value in task_to_table(task).items() if value != "none"}
 
 
 def noise_table(noise: AbstractNoise) -> dict[str, Any]:

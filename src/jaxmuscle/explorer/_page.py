@@ -8,11 +8,10 @@ from typing import Any
 from jaxmuscle.data._target import Target
 from jaxmuscle.model._muscle import Muscle, QuadraticDamping, QuadraticStiffness
 from jaxmuscle.model._signals import AbstractSignal, Constant, RampHold, SmoothStep
-from jaxmuscle.model._task_tables import task_to_table
 from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.response._linearised import has_response
 
-from ._facts import facts
+from ._facts import bare_table, facts
 
 # In an order in which each follows those that it imports.
 MODULES = ("numbers", "settings", "task", "noise", "covariance", "harmonic", "spectrum", "statistics", "simulate", "target",
@@ -60,12 +59,12 @@ def content(task: AbstractTask | None, target: Target | None) -> dict[str, Any]:
         return {}
     _check(task)
     if target is None:
-        return {"state": {"table": task_to_table(task)}}
+        return {"state": {"table": bare_table(task)}}
     if not target.bins.size:
         raise ValueError(f"{target.name} has no spectrum, only a frequency response: the explorer draws spectra")
     seen = target.to_table() | {"bins": target.bins.tolist(), "frequency": target.frequency.tolist()}
     shown = {key: seen.get(key) for key in _SHOWN} | {"dispersion": target.dispersion, "notices": list(target.notices)}
-    return {"state": {"table": task_to_table(task.with_parts(settings=target.settings)), "target": shown}}
+    return {"state": {"table": bare_table(task.with_parts(settings=target.settings)), "target": shown}}
 
 
 def _check(task: AbstractTask) -> None:

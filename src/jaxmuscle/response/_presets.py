@@ -78,7 +78,7 @@ def _checked(text: str, file: str, kind: str) -> PresetFile | _InFit:
     if not isinstance(table.get("task_table"), dict):
         several = " It is the fit of several targets: give that of one." if "parts" in table else ""
         raise PresetError(f"{file}: has no [task_table]: is it a preset or a fit.json?{several}")
-    if kind == "JSON":  # a fit.json since format 3 leaves nothing out
+    if kind == "JSON" and "success" in table:  # a fit.json since format 3 leaves nothing out
         formats = table.get("format")
         if type(formats) is not int or formats not in FIT_FORMATS:
             raise PresetError(

@@ -245,7 +245,8 @@ async function open(file) {
 }
 
 function save() {
-  const text = JSON.stringify({ description: "Set in the explorer", task_table: state.table }, null, 2);
+  const task_table = { activation: "none", initial: "none", ...state.table };
+  const text = JSON.stringify({ format: 2, description: "Set in the explorer", task_table }, null, 2);
   const link = document.createElement("a");
   link.href = URL.createObjectURL(new Blob([text], { type: "application/json" }));
   link.download = "explored.json";

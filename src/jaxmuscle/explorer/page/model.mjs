@@ -63,7 +63,7 @@ export function taskIn(table, file, facts) {
   if (kindsOf(table.muscle).join() !== kindsOf(known).join()) {
     throw new Error(`${file}: its muscle or one of its laws is not that of the paper, which alone is known here.`);
   }
-  return table;
+  return Object.fromEntries(Object.entries(table).filter(([, part]) => part !== "none"));
 }
 
 // Channels of a noise that is rougher than the task allows, as {part, j, name, needs}.
