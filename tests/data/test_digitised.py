@@ -308,10 +308,10 @@ def axes(**changes):
 BAD_PROJECTS = {
     "empty": (lambda _: "", {}, "is empty"),
     "no JSON": (lambda _: "{'version'", {}, "is not valid JSON: Expecting property name"),
-    "nested": (lambda _: "[" * 100000, {}, "is not valid JSON"),
+    "nested": (lambda _: "[" * 100000, {}, "is nested too deeply"),
     "binary": (lambda _: b"\x89PNG\r\n\0", {}, "is not UTF-8 text"),
     "other JSON": (lambda _: '{"success": true}', {}, "is not a WebPlotDigitizer project (it has no axesColl)"),
-    "a list": (lambda _: "[]", {}, "is not a WebPlotDigitizer project"),
+    "a list": (lambda _: "[]", {}, "holds no table, but a list"),
     "newer": (broken(lambda p: p.update(version=[9, 0])), {}, "version [9, 0] is not known (3 and 4 are); export"),
     "older": (lambda _: {"wpd": {"version": [2, 0]}}, {}, "project version [2, 0] is not known"),
     "version 3 without axes": (lambda _: {"wpd": {"version": [3, 8]}}, {}, "'axesParameters' is missing"),
@@ -327,7 +327,7 @@ BAD_PROJECTS = {
     "infinite pixel": (
         broken(lambda p: p["datasetColl"][0]["data"][0].update(y=1e999)),
         {},
-        "dataset 'curve', point 1: y inf is not a number",
+        "is not valid JSON: Infinity is no number in JSON",
     ),
     "unknown axes": (axes(name="other"), {}, "belongs to axes 'XY', of which the project has 0"),
     "bar axes": (axes(type="BarAxes"), {}, "axes 'XY': of type 'BarAxes'; calibrate the figure as '2D (X-Y) Plot'"),

@@ -223,7 +223,7 @@ def test_draws_of_any_shape_make_a_design():
         (lambda: jm.Sweep.design(TASK, {"k_v": [4e5]}), "unknown parameter 'k_v'"),
         (lambda: jm.Sweep.of([TASK], names=["a", "b"]), "names has 2 entries for 1 tasks"),
         (lambda: jm.ensemble(TASK, KEY, seeds=0), "seeds = 0"),
-        (lambda: jm.ensemble(TASK, KEY, seeds=-3), "needs at least one seed"),
+        (lambda: jm.ensemble(TASK, KEY, seeds=-3), "seeds = -3: give at least one seed"),
         (lambda: jm.ensemble(TASK, KEY, seeds=1, chunk=0), "chunk = 0"),
         (lambda: jm.ensemble(TASK, KEY, seeds=1, resume=True), "resume = True belongs to a store"),
         (lambda: jm.ensemble(TASK, KEY, seeds=1, reduce=(0.5, 1.0)), "between 0 and 1"),

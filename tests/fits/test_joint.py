@@ -405,7 +405,7 @@ SHIFT = jm.Target("shift", 1 / np.arange(1.0, 31.0), segments=12, quantity="disp
          "target 'b' is a displacement, but its task Isometric gives F_ext in N"),
         ({"a": A, "b": B}, {"bounds": {"m_w": (0.1, 1.0)}}, "bounds: unknown or not free parameter 'm_w'"),
         ({"a": A, "b": B}, {"priors": {"k_w@a": 0.1}}, "priors: unknown or not free parameter 'k_w@a'"),
-        ({"a": A, "b": B}, {"starts": 0}, "starts = 0 must be at least 1"),
+        ({"a": A, "b": B}, {"starts": 0}, "starts = 0: give a whole number from 1"),
         ({"a": A, "b": B}, {"residual": "square"}, "residual = 'square'"),
     ],
 )  # fmt: skip

@@ -148,7 +148,7 @@ def test_a_preset_with_an_impossible_part_is_refused(tmp_path):
     for before, after, message in (
         ("time = 0.06", "time = -1.0", "must be positive"),
         ("width = 1.0", "width = 0.0", "resonance_width = 0.0 Hz must be positive"),
-        ('type = "Activation"\ntime', 'type = "Constant"\nlevel', r"task.activation = .* is of the wrong kind"),
+        ('type = "Activation"\ntime', 'type = "Constant"\nlevel', r"task.activation.type = .* is of the wrong kind"),
         ('type = "PinkNoise"', 'type = "PinkNoises"', "did you mean 'PinkNoise'"),
     ):
         assert text.count(before) == 1

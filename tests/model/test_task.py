@@ -84,7 +84,8 @@ def test_what_is_observed_is_saved(tmp_path):
     jm.save_preset(tmp_path / "task.toml", task)
     assert jm.load_preset(tmp_path / "task.toml") == task
     text = (tmp_path / "task.toml").read_text()
-    (tmp_path / "old.toml").write_text(text.replace('observe = "acceleration"', ""))
+    old = text.replace('observe = "acceleration"', "").replace("format = 2", "format = 1")  # which had no such key
+    (tmp_path / "old.toml").write_text(old)
     assert getattr(jm.load_preset(tmp_path / "old.toml"), "observe") == "displacement"  # noqa: B009
     (tmp_path / "wrong.toml").write_text(text.replace('observe = "acceleration"', 'observe = "velocity"'))
     with pytest.raises(jm.errors.PresetError, match=r"wrong.toml: (.|\n)*'velocity'"):

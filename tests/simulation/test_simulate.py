@@ -236,8 +236,8 @@ def test_what_does_not_stay_finite_is_named(x64):
     [
         ({"dt": 3e-3}, r"dt = 0.003 s does not divide the sampling interval 0.01 s: use one of 0.01, 0.005"),
         ({"dt": 0.02}, "does not divide"),
-        ({"dt": 0.0}, "must be positive"),
-        ({"duration": -1.0}, "must be positive"),
+        ({"dt": 0.0}, "dt = 0.0: give a finite number above 0"),
+        ({"duration": -1.0}, "duration = -1.0: give a finite number above 0"),
         ({"duration": 1.005}, "duration = 1.005 s is not a whole number of sampling intervals"),
         ({"sampling": "mean"}, "sampling = 'mean' must be one of instant, average, filtered"),
         ({"sampling": "filtered", "dt": 0.01}, "dt = 0.01 s is a whole sampling interval, .*: use half of it or less"),

@@ -49,7 +49,7 @@ def fitted(task=TRUTH, free=DEFAULT_FREE, settings: dict[str, Any] | None = None
     quantity = "displacement" if task.output_unit == "m" else "force"
     made = jm.Target("made", power, quantity=quantity, **({"segments": SEGMENTS} | target))
     table = {
-        "free": list(free), "residual": "log", "mean_force": None, "bounds": {}, "starts": 1,
+        "free": list(free), "residual": "log", "mean_force": None, "bounds": {}, "starts": 1, "dt": 1e-3,
         "prior_centre": {n: float(task[n]) for n in free}, "prior_sd": {n: PARAMETERS[n].prior_sd for n in free},
         "coefficient_of_variation": made.coefficient_of_variation is not None,
     }  # fmt: skip

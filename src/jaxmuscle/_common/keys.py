@@ -28,10 +28,9 @@ def seeds_of(seeds: Any, name: str = "seeds") -> range | Int[np.ndarray, " seeds
     except ValueError:  # lists of several lengths
         raise ValueError(f"{name} = {seeds!r}: give a number of seeds, or whole numbers in a list") from None
     if single:
-        number = seed_of(seeds, name)
-        if number < 1:
+        if isinstance(seeds, int | np.integer) and seeds < 1:
             raise ValueError(f"{name} = {seeds!r}: give at least one seed")
-        return range(number)
+        return range(seed_of(seeds, name))
     numbers = seeds if isinstance(seeds, range) else np.asarray(seeds)
     if isinstance(numbers, np.ndarray) and (numbers.ndim != 1 or not np.issubdtype(numbers.dtype, np.integer)):
         raise ValueError(f"{name}: {numbers.dtype} of shape {numbers.shape}; give a number of seeds, or whole numbers in a "

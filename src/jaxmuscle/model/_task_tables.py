@@ -85,7 +85,10 @@ def _build(kind: type, table: dict[str, Any], where: str, whole: bool) -> Any:
     for key in table:
         if key not in fields:
             raise PresetError(f"unknown key {where}.{key}: {choices(key, fields)}")
-    absent = {} if whole else {name: ABSENT for name, field in fields.items() if NoneType in get_args(field.type)}
+    absent: dict[str, Any] = {}
+    if not whole:  # parts that a task need not have, and choices that are younger than the format
+        absent = {name: ABSENT for name, field in fields.items() if NoneType in get_args(field.type)}
+        absent |= {name: field.default for name, field in fields.items() if isinstance(field.default, str)}
     values = {}
     for name, field in fields.items():
         if name not in table and name not in absent:
@@ -140,9 +143,7 @@ def _part(kind: type, value: Any, where: str, whole: bool) -> Any:
             f"{where}.type = {name!r}: {choices(str(name), known)}; a class of your own must be imported first"
         )
     if not issubclass(known[name], kind):
-        raise PresetError(
-            f"{where}.type = {name!r} is of the wrong kind: a {kind.__name__.removeprefix('Abstract')} belongs there"
-        )
+        raise PresetError(f"{where}.type = {name!r} is of the wrong kind: give {kind.__name__.removeprefix('Abstract')}")
     return _build(known[name], {k: v for k, v in table.items() if k != "type"}, where, whole)
 
 
