@@ -6,9 +6,9 @@ import textwrap
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
-from .text import WIDTH
+from .text import WIDTH, folded
 
-LEAST = 16  # columns that are left to words
+LEAST = 24  # columns that are left to words
 
 
 class Card(NamedTuple):
@@ -46,14 +46,11 @@ def _row(tag: str, cells: Iterable[str]) -> str:
 
 
 class Shown(abc.ABC):
-    """Prints itself, also where its value is shown without `print`; a notebook shows its card."""
+    """Shows itself as its card: the text where it is printed, with or without `print`, the table in a notebook."""
 
     @abc.abstractmethod
     def _card(self) -> Card:
         """What it says of itself."""
-
-    def __str__(self) -> str:
-        return self._card().text
 
     def __repr__(self) -> str:
         return self._card().text
@@ -62,12 +59,27 @@ class Shown(abc.ABC):
         return self._card()._repr_html_()
 
 
+class Printed(Shown):
+    """Shows itself as the text of its `__str__`."""
+
+    @abc.abstractmethod
+    def __str__(self) -> str: ...
+
+    def _card(self) -> Card:
+        return Card(str(self))
+
+
 class Result(Shown):
-    """A result, whose `summary()` is what it prints."""
+    """What is computed, with a `summary()`."""
 
     def summary(self) -> Card:
-        """What it prints, as an object that shows itself as a table in a notebook."""
+        """What it prints, as an object; a notebook shows it as a table where there is one."""
         return self._card()
+
+
+def facts(heading: str, rows: Sequence[tuple[str, str]]) -> Card:
+    """A card of a heading and named facts, a line for each."""
+    return Card(folded([heading, *(f"  {name:<8}  {value}" for name, value in rows)]), heading, ("", ""), tuple(rows))
 
 
 def in_columns(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:

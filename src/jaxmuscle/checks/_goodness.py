@@ -9,6 +9,7 @@ from jax import Array
 from jaxtyping import Float
 
 from jaxmuscle import plot
+from jaxmuscle._common.cards import Printed, Result
 from jaxmuscle._common.environment import versions
 from jaxmuscle._common.parts import of_only, only
 from jaxmuscle._common.tables import frame
@@ -70,7 +71,7 @@ def p_values(observed: dict[str, np.ndarray], reference: dict[str, np.ndarray]) 
     }
 
 
-class GoodnessPart(eqx.Module):
+class GoodnessPart(Printed, Result, eqx.Module):
     """How the spectrum of one target lies about the fit, against spectra drawn from the fit that were themselves fitted.
 
     `residual` z_k of every bin [standard deviations of its log power]; `observed` {chi2_per_bin, runs, largest}, each with
@@ -121,7 +122,7 @@ class GoodnessPart(eqx.Module):
         return folded([head, *(f"- {sentence}" for sentence in self.sentences)])
 
 
-class Goodness(eqx.Module):
+class Goodness(Printed, Result, eqx.Module):
     """Whether a fit is as good as the scatter of its data allows.
 
     `parts`, a `GoodnessPart` for each target by name; `p_value`, that of the smallest p-value of all checks of all targets;

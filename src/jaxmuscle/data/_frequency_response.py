@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Complex, Float
 
 from jaxmuscle import plot
+from jaxmuscle._common.cards import Printed
 from jaxmuscle._common.files import write_text
 from jaxmuscle._common.text import folded
 from jaxmuscle.spectra._settings import require
@@ -19,7 +20,7 @@ from ._target_fields import frozen
 COLUMNS = ("frequency_hz", "gain_N/m", "phase_deg", "stderr_N/m", "coherence")
 
 
-class FrequencyResponse(eqx.Module):
+class FrequencyResponse(Printed, eqx.Module):
     """The dynamic stiffness of a muscle: force per lengthening of its insertion, over frequency.
 
         H(f) = F(f) / X(f)  [N/m]

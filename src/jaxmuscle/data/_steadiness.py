@@ -11,6 +11,7 @@ import scipy
 from jaxtyping import Float
 
 from jaxmuscle import plot
+from jaxmuscle._common.cards import Printed, Result
 from jaxmuscle._common.environment import versions
 from jaxmuscle._common.files import nulled, write_json
 from jaxmuscle._common.tables import frame
@@ -62,7 +63,7 @@ class Measure(eqx.Module):
     error_from: str
 
 
-class Steadiness(eqx.Module):
+class Steadiness(Printed, Result, eqx.Module):
     """What `steadiness` found; `print` shows it as a table, `found["sample_entropy"]` is one `Measure`.
 
     `measures` of all trials together, by name; `trials`, the measures of each by its name, and their `durations` [s];

@@ -8,6 +8,7 @@ from typing import Any, overload
 import numpy as np
 
 from jaxmuscle import plot
+from jaxmuscle._common.cards import Card, Shown
 from jaxmuscle._common.text import folded
 from jaxmuscle.spectra._settings import SpectrumSettings, require
 from jaxmuscle.spectra._welch import Spectrum
@@ -19,7 +20,7 @@ from ._recording_table import Table
 from ._target import Target
 
 
-class Trials(Sequence[Recording]):
+class Trials(Shown, Sequence[Recording]):
     """Trials of one person in one condition: a sequence of `Recording`s, which together give one `Target`.
 
         trials = jm.load_recordings(["trial1.csv", "trial2.csv"]).steady()
@@ -104,13 +105,11 @@ class Trials(Sequence[Recording]):
         """Draw the windows and the spectra of all recordings, that of one as `Recording.plot`; returns the figure."""
         return plot.trials(self, settings, ax)
 
-    def __str__(self) -> str:
+    def _card(self) -> Card:
         head = f"{self.name}: {len(self)} recordings [{self.recordings[0].unit}]"
-        rows = [f"  {r.name}: {r.window_in_words}, mean {np.mean(r.samples):.4g} {r.unit}" for r in self.recordings]
-        return folded([head, *rows])
-
-    def __repr__(self) -> str:
-        return f"Trials({len(self)} recordings, {self.name!r})"
+        rows = tuple((r.name, r.window_in_words, f"{np.mean(r.samples):.4g} {r.unit}") for r in self.recordings)
+        lines = [f"  {name}: {window}, mean {mean}" for name, window, mean in rows]
+        return Card(folded([head, *lines]), head, ("recording", "window", "mean"), rows)
 
 
 def load_recordings(

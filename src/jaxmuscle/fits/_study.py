@@ -15,6 +15,7 @@ import numpy as np
 
 from jaxmuscle import plot
 from jaxmuscle._common.arrays import with_nulls
+from jaxmuscle._common.cards import Printed, Result
 from jaxmuscle._common.environment import versions
 from jaxmuscle._common.files import remove, write_json, write_text
 from jaxmuscle._common.progress import Tell, told
@@ -41,7 +42,7 @@ FORMAT = 1
 COMPARED = tuple(name for name in DERIVED if name != "high_frequency_floor")  # which is the band from 8 to 12 Hz again
 
 
-class StudyResult(eqx.Module):
+class StudyResult(Printed, Result, eqx.Module):
     """What a study found.
 
     `cohort`, the fits, one of each person in each condition; `cells`, whose recordings they stand on; `aic`, the summed AIC

@@ -1,5 +1,7 @@
 """All noises by name."""
 
+from typing import Any
+
 import equinox as eqx
 import numpy as np
 
@@ -21,7 +23,8 @@ def made_by_name(name: str) -> AbstractNoise:
     """The noise of that name at its default amplitudes. Raises `ValueError` for another name."""
     if name not in NOISES:
         raise ValueError(f"noise = {name!r}: {choices(name, NOISES)}")
-    return NOISES[name]().per_channel()
+    kind: Any = NOISES[name]
+    return kind().per_channel()
 
 
 def named_noise(name: str, needed: tuple[int, ...]) -> AbstractNoise:

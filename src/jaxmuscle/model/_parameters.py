@@ -3,7 +3,7 @@
 import collections
 import dataclasses
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -233,7 +233,7 @@ def set_parameters(task: Any, values: dict[str, Any]) -> Any:
 
 def assigned(task: Any, values: dict[str, Any]) -> Any:
     """The same without the task's own checks: of a task that is being made."""
-    values = _proper_values(values)
+    values = proper_values(values)
     time = values.get("activation_time")
     if time is not None and is_concrete(time) and float(time) == 0:
         task, values = task.with_parts(activation=None), {n: v for n, v in values.items() if n != "activation_time"}
@@ -244,7 +244,9 @@ def assigned(task: Any, values: dict[str, Any]) -> Any:
     return _with_values(task, {name: values[name] for name in off})
 
 
-def _proper_values(values: dict[str, Any]) -> dict[str, Any]:
+def proper_values(values: Mapping[str, Any] | None) -> dict[str, Any]:
+    """What is given by names, by those in the parameter table. Raises `ValueError` for one parameter under two names."""
+    values = values or {}
     named = {proper(name): value for name, value in values.items()}
     if len(named) < len(values):
         twice = sorted(name for name in values if proper(name) != name and proper(name) in values)
@@ -293,13 +295,18 @@ def _path(task: Any, name: str) -> tuple:
     paths = paths_of(task)
     if name not in paths:
         known = dict.fromkeys([*paths, *(n for n in OFF if n != name)])
-        raise ValueError(f"{type(task).__name__}: {unknown_parameter(name, known)}")
+        raise ValueError(unknown_parameter(name, known, of=f" of {type(task).__name__}"))
     return paths[name]
 
 
-def unknown_parameter(name: str, known: Iterable[str]) -> str:
+def proper_names(names: Iterable[str] | None) -> tuple[str, ...] | None:
+    """The names in the parameter table of the given ones; None of None."""
+    return None if names is None else tuple(map(proper, names))
+
+
+def unknown_parameter(name: str, known: Iterable[str], *, of: str = "", what: str = "unknown parameter") -> str:
     """The message about a name that is not that of a parameter that can be set or fitted."""
     if name in BASE:
         return (f"{name} is not a parameter but follows from some ({BASE[name]} in the paper's muscle): it can be read, not "
                 f"set or fitted. Give {name[0].lower()}{name[1:3]} instead")  # fmt: skip
-    return f"unknown parameter {name!r}: {choices(name, known)}"
+    return f"{what} {name!r}{of}: {choices(name, known)}"

@@ -13,7 +13,6 @@ from jaxtyping import Array, Float
 
 from jaxmuscle._common.arrays import _is_scalar, is_concrete
 from jaxmuscle._common.cards import Card, Shown, in_columns
-from jaxmuscle._common.text import folded
 from jaxmuscle._common.types import Scalar
 from jaxmuscle.spectra._settings import SpectrumSettings
 
@@ -177,7 +176,7 @@ class AbstractTask(Shown, eqx.Module):
         facts += [f"{name:<8}  {type(value).__name__}" for name, value in self._inputs().items()]
         rows = tuple(_shown_row(self, name, path, name in free) for name, path in paths_of(self).items())
         heading = f"{type(self).__name__}, which gives {self.output_name} [{self.output_unit}]"
-        text = folded([heading, *(f"  {fact}" for fact in facts), *in_columns(COLUMNS, rows)])
+        text = "\n".join([heading, *(f"  {fact}" for fact in facts), *in_columns(COLUMNS, rows)])
         return Card(text, heading, COLUMNS, rows, tuple(" ".join(fact.split()) for fact in facts))
 
     def _inputs(self) -> dict[str, Any]:
@@ -192,12 +191,12 @@ class AbstractTask(Shown, eqx.Module):
 
 
 Task = TypeVar("Task", bound=AbstractTask)
-COLUMNS = ("name", "value", "unit", "in a fit", "what it is")
+COLUMNS = ("name", "value", "unit", "fit", "what it is")
 
 
 def _shown_row(task: AbstractTask, name: str, path: tuple, free: bool) -> tuple[str, ...]:
     row = PARAMETERS.get(name)
-    unit, meaning = ("", "of your own class") if row is None else ("" if row.unit == "1" else row.unit, row.meaning)
+    unit, meaning = ("", "") if row is None else ("" if row.unit == "1" else row.unit, row.meaning)
     return name, in_numbers(value_of(task, path)), unit, "free" if free else "fixed", meaning.partition(";")[0]
 
 
@@ -206,9 +205,10 @@ def in_numbers(value: Any) -> str:
     if not (_is_scalar(value) and is_concrete(value)):
         return eqx.tree_pformat(value)
     numbers = np.asarray(value)
-    if numbers.ndim == 0:
-        return f"{float(numbers):.5g}"
-    return f"{numbers.min():.4g} to {numbers.max():.4g} ({numbers.size})" if numbers.size else "none"
+    if numbers.ndim == 0 or not numbers.size:
+        return f"{float(numbers):.5g}" if numbers.size else "none"
+    low, high = numbers.min(), numbers.max()
+    return f"{numbers.size} of {low:.4g}" if low == high else f"{low:.4g} to {high:.4g}"
 
 
 def fill(task: AbstractTask, fields: Mapping[str, Any], parameters: Mapping[str, Any]) -> None:

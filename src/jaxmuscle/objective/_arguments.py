@@ -17,7 +17,14 @@ from jaxmuscle.data._target import Target
 from jaxmuscle.model._muscle import Muscle
 from jaxmuscle.model._noise import AbstractNoise
 from jaxmuscle.model._noises import with_noise
-from jaxmuscle.model._parameters import PARAMETERS, USUALLY_FREE
+from jaxmuscle.model._parameters import (
+    PARAMETERS,
+    USUALLY_FREE,
+    proper_names,
+    proper_values,
+    unknown_parameter,
+    usually_free,
+)
 from jaxmuscle.model._tasks import AbstractTask, Isometric, Observed, PrescribedForce, PrescribedLength
 from jaxmuscle.response._expected import check_line
 from jaxmuscle.response._linearised import has_response
@@ -25,6 +32,7 @@ from jaxmuscle.response._scaling import FORCES, at_force, is_scalable
 from jaxmuscle.spectra._settings import WINDOW, require, samples_in
 
 from ._coordinates import Coordinates
+from ._least_squares import check_optimiser
 from ._problem import FitProblem, Part, target_variation
 
 RESIDUALS = ("log", "linear", "cumulative")
@@ -79,11 +87,8 @@ def free_names(task: AbstractTask, free: Iterable[str] | None, fix: Mapping[str,
     if target.stiffness is not None:
         bins += 2 * len(target.stiffness.known.frequency)
     if free is None:
-        # Nothing shows the frequency of what has no amplitude.
-        still = [n.removesuffix("amplitude") for n in known if n.endswith("_amplitude") and not float(task[n]) > 0]
         usual = USUALLY_FREE if target.stiffness is None else (*USUALLY_FREE, MOVED_MASS)
-        names = [n for n in usual if n in known and n not in fix and float(task[n]) > 0
-                 and not n.startswith(tuple(f"{of}{what}" for of in still for what in ("frequency", "width")))]  # fmt: skip
+        names = [name for name in usually_free(task, usual) if name not in fix]
     else:
         names = list(dict.fromkeys(free))
         _check_names("free", names, known)
@@ -101,7 +106,7 @@ def _check_names(argument: str, names: Iterable[str], known: Iterable[str]) -> N
     known = list(known)
     for name in names:
         if name not in known:
-            raise ValueError(f"{argument}: unknown or not free parameter {name!r}: {choices(name, known)}")
+            raise ValueError(f"{argument}: {unknown_parameter(name, known, what='unknown or not free parameter')}")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -130,8 +135,15 @@ class FitOptions:
     dt: float = DT
     rungs: int | None = None
     progress: Tell = nothing
+    optimiser: Any = None
 
     def __post_init__(self) -> None:
+        named = {"free": proper_names(self.free)}
+        named |= {name: proper_values(getattr(self, name)) for name in ("fix", "bounds", "priors")}
+        for name, value in named.items():
+            object.__setattr__(self, name, value)
+        if self.optimiser is not None:
+            check_optimiser(self.optimiser)
         for name, known in (("method", METHODS), ("residual", RESIDUALS)):
             if getattr(self, name) not in known:
                 raise ValueError(f"{name} = {getattr(self, name)!r}: {choices(getattr(self, name), known)}")
@@ -210,13 +222,15 @@ def planned(task: AbstractTask, target: Target, options: FitOptions) -> Plan:
     part = Part("", task, target, coordinates, tuple(range(len(names))), variation, mean)
     key = key_of(options.key) if isinstance(options.key, int) else options.key
     problem = FitProblem((part,), coordinates, np.array([0.0 if sds[n] is None else 1.0 for n in names]), options.residual,
-                         options.method, options.dt, key, counts["seeds"], control, options.progress)  # fmt: skip
+                         options.method, options.dt, key, counts["seeds"], control, options.progress, options.optimiser)  # fmt: skip
     settings = {
         **settings_of(problem, bounds), **counts, "max_steps": options.max_steps, "dt": options.dt,
         "coefficient_of_variation": variation is not None,
         "mean_force": None if mean is None else list(mean), "carried": options.carried,
         "spectrum": target.settings.to_dict(), "steps_per_sample": problem.steps_per_sample,
     }  # fmt: skip
+    if options.optimiser is not None:
+        settings["optimiser"] = type(options.optimiser).__name__
     return Plan(problem, counts["starts"], options.max_steps, counts["check_seeds"], settings, options.seed)
 
 
@@ -284,7 +298,7 @@ def check_shared(tasks: Mapping[str, AbstractTask], separate: Iterable[str], pro
     known = dict.fromkeys(n for task in tasks.values() for n in task.parameter_names)
     for argument, names in (("separate", separate), ("proportional", proportional)):
         for name in sorted(names - set(known)):
-            raise ValueError(f"{argument}: no task has a parameter {name!r}: {choices(name, known)}")
+            raise ValueError(f"{argument}: {unknown_parameter(name, known)}")
     if both := sorted(separate & proportional):
         raise ValueError(f"{', '.join(both)} cannot be both separate and proportional")
     for (first, one), (target, other) in itertools.combinations(tasks.items(), 2):
