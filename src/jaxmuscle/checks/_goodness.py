@@ -174,6 +174,9 @@ class Goodness(Printed, Result, eqx.Module):
 def goodness(result: FitResult, target: Target | None = None, *, replicates: int = 999, key: Array | int = 0) -> Goodness:
     """Whether a fit is as good as the scatter of its target allows, by parametric bootstrap with refits.
 
+        result = jm.fit(jm.task_for(target), target)
+        print(jm.goodness(result))
+
     Three numbers, from the residuals `z_k = (ln(p_k / fitted_k) - bias_k - mean) / sd_k`: chi² per bin
     `Σ z_k² / (bins - 1)`, the number of runs of equal sign (few: a smooth misfit), the largest |z_k| (a line). Their
     reference: spectra drawn from the law of the bins about the fitted spectrum (correlated gamma variables; with a sigma

@@ -45,6 +45,8 @@ def compare_noise(
 ) -> Comparison:
     """Fit a spectrum with every colour of noise, with and without harmonic, and say which can be told apart.
 
+        print(jm.compare_noise(jm.task_for(target), target))
+
     So are the richer models that a fit may climb to (`on_rung`), with the task's own noise: "activation", "tremor" instead
     of the harmonic, "two resonances".
 

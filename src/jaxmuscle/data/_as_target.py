@@ -23,6 +23,8 @@ ROWS, POINTS = 90, 500
 def as_target(given: Any, **options: Any) -> Target:
     """The target that is meant.
 
+        target = jm.data.as_target("vastus-lateralis-26mvc")
+
     `given`: a `Target` is taken as it is. A `Recording`, `Trials` or several recordings of one condition give theirs
     (`Trials.target`), in the windows that they have. The path of a recording, or several of trials, is read, and the steady
     part of each found (`Recording.steady`). The path of a frequency response is read by `load_frequency_response`. Another
@@ -66,7 +68,12 @@ def _remedy(given: Any) -> str:
 
 
 def is_recording(path: str | os.PathLike[str]) -> bool:
-    """Whether the file at `path` holds a recording rather than a spectrum: by its ending, a text by its header and rows."""
+    """Whether the file at `path` holds a recording rather than a spectrum: by its ending, a text by its header and rows.
+
+        jm.data.is_recording("trial.csv")
+
+    It is read for that.
+    """
     path = Path(path).expanduser()
     kind = path.suffix.lower()
     if kind not in TEXT or not path.is_file():

@@ -85,7 +85,9 @@ class FrequencyResponse(Printed, eqx.Module):
         coherence: Any = None,
         segments: Any = None,
         stderr: Any = None,
-        **fields: Any,
+        name: str = "response",
+        source: str = "given by the user",
+        notices: Iterable[str] = (),
     ) -> "FrequencyResponse":
         """A response as figures show it: gain, phase and coherence.
 
@@ -94,7 +96,8 @@ class FrequencyResponse(Printed, eqx.Module):
             stderr = gain √((1 - γ²) / (2 K γ²))
 
         **Arguments:** `frequency` [Hz]; `gain` [N/m]; `phase` [deg], positive where the force leads; `coherence` γ²;
-        `segments`, K, one number or one for each frequency; `stderr` [N/m]; `fields` as in `FrequencyResponse` (name, ...).
+        `segments`, K, one number or one for each frequency; `stderr` [N/m]; `name`, `source`, `notices` as in
+        `FrequencyResponse`.
 
         **Raises:** `ValueError` without `stderr` and without (`coherence` and `segments`), and as `FrequencyResponse` does.
 
@@ -116,7 +119,7 @@ class FrequencyResponse(Printed, eqx.Module):
             with np.errstate(divide="ignore"):
                 stderr = gain * np.sqrt((1 - shared) / (2 * averages * shared))
         value = gain * np.exp(1j * np.radians(phase))
-        return cls(frequency, value, stderr, coherence, **fields)
+        return cls(frequency, value, stderr, coherence, name=name, source=source, notices=notices)
 
     @property
     def known(self) -> "FrequencyResponse":

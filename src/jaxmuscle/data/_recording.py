@@ -107,19 +107,21 @@ class Recording(Shown, eqx.Module):
         return recording_of(cls, frame_table(frame), Reading(column, rate, units, axis, reference, time, max_gap), name)
 
     @classmethod
-    def from_array(cls, samples: Any, rate: float | int, *, column: int = 0, **fields: Any) -> "Recording":
+    def from_array(cls, samples: Any, rate: float | int, *, column: int = 0, unit: str = "N", name: str = "recording",
+                   source: str = "given by the user", start: float | int = 0.0, window: Sequence[float | int] | None = None,
+                   notices: Iterable[str] = ()) -> "Recording":  # fmt: skip
         """A recording from an array: one signal, or a column of several.
 
-        **Arguments:** `samples`, shape `(times,)` or `(times, columns)`; `rate` [Hz]; `column`, counted from 0; `fields` as
-        in `Recording` (unit, name, ...).
+        **Arguments:** `samples`, shape `(times,)` or `(times, columns)`; `rate` [Hz]; `column`, counted from 0; the
+        others as in `Recording`.
 
         **Raises:** `ValueError` for a column that is not there, and as `Recording` does.
         """
         array = np.asarray(samples)
-        if array.ndim != 2:
-            return cls(array, rate, **fields)
-        require(0 <= column < array.shape[1], "column", column, f"give a number from 0 to {array.shape[1] - 1}")
-        return cls(array[:, column], rate, **fields)
+        if array.ndim == 2:
+            require(0 <= column < array.shape[1], "column", column, f"give a number from 0 to {array.shape[1] - 1}")
+            array = array[:, column]
+        return cls(array, rate, unit=unit, name=name, source=source, start=start, window=window, notices=notices)
 
     def _checked(self, window: Any) -> tuple[float, float]:
         try:

@@ -147,6 +147,8 @@ def _said(name: str, m: Measure) -> str:
 def steadiness(recordings: Recording | Iterable[Recording]) -> Steadiness:
     """How steady a force, torque or displacement is held: variability, power by band, regularity. No model is fitted.
 
+        print(jm.steadiness(jm.load_recordings(["trial1.csv", "trial2.csv"]).steady()))
+
     Everything is computed of the window of each recording (`steady()` finds it), as `Recording.filtered` gives it:
     resampled to 100 Hz and low-passed at 30 Hz.
 

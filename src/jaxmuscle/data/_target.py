@@ -252,6 +252,9 @@ def load_target(
 ) -> Target:
     """Load a bundled target by name, or a .toml or .csv file or a digitised figure by path.
 
+        target = jm.load_target("vastus-lateralis-26mvc")
+        print(target)
+
     A CSV has the columns `frequency_hz,proportional_power[,sigma]`, sorted and unique. A figure digitised with
     WebPlotDigitizer is its project (.json, .tar), its CSV of all datasets, or two columns without a header; its
     points are sorted and near-duplicates averaged (docs/digitise.md). Points off the grid are interpolated onto

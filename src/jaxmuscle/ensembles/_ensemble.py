@@ -86,6 +86,9 @@ def ensemble(  # pyright: ignore[reportInconsistentOverload]
 ) -> Any:
     """Simulate many seeds (0 to seeds - 1, or those given) of one task, or of every point of a sweep.
 
+        runs = jm.ensemble(jm.Isometric(), jax.random.key(0), seeds=100)
+        runs.spectrum().plot()
+
     Seed i is `simulate(..., seed=i)`, whatever the chunk, the devices or the number of processes. Chunks run on all local
     devices (`jax.config.update("jax_num_cpu_devices", n)` before anything else makes n of a CPU's cores).
 

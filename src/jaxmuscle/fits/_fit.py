@@ -48,6 +48,10 @@ def fit(
 ) -> FitResult:
     """Find the parameters whose expected spectrum is the target's: Levenberg-Marquardt from many starts.
 
+        target = jm.load_target("vastus-lateralis-26mvc")
+        result = jm.fit(jm.task_for(target), target)
+        print(result)
+
     Minimises `½ Σ r_k² + ½ Σ θ_j²`, r the residuals in standard deviations of the target (log residual:
     `(z_k - z̄) / sd_k`, `z_k = ln(target_k / fitted_k) - bias_k`), θ the free parameters' distance from the task's own
     values in standard deviations of the prior.
@@ -71,8 +75,8 @@ def fit(
     `check_seeds` (64, or 200 then; 0: not simulated); `dt` [s], noise grid of a Monte Carlo fit; `progress`, True or a
     function of (text, share); `rungs`, how many richer models may be tried where the base model does not describe the data
     (`on_rung`; 3, or 0 where `noise` or `free` is given); `optimiser`, what makes the steps instead of
-    `optimistix.LevenbergMarquardt`: another of optimistix's solvers of the Gauss-Newton kind, `optimistix.Dogleg(1e-9, 1e-9)`
-    say (for others there is `problem`); `answer`, a function that gets the result as soon as the search ends, before
+    `optimistix.LevenbergMarquardt`: another of optimistix's Gauss-Newton solvers, `optimistix.Dogleg(1e-9, 1e-9)` say
+    (for others there is `problem`); `answer`, a function that gets the result as soon as the search ends, before
     simulated check, profile and p-value.
 
     **Returns:** a `FitResult`; a fit that fails is one, too, and says why.

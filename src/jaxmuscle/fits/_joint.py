@@ -60,6 +60,9 @@ def fit_joint(
 ) -> FitResult:
     """Fit several spectra of the same person with shared parameters: two force levels, or force and displacement.
 
+        together = jm.fit_joint({"low": low, "high": high}, separate=("noise_K_w",))
+        together["k_w"]
+
     Minimises `½ Σ_targets Σ_k r_k² + ½ Σ_j θ_j²`, r as in `fit`, in linear response, from many starts; then with the
     nonlinear model's correction to every target's spectrum. A parameter of one name is the same number in all tasks that
     have it; one that only one task has belongs to that. The inputs (`P_w`, `F_ext`, `x_z`) are each task's own.

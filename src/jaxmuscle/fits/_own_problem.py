@@ -50,10 +50,9 @@ class Problem(Shown):
     def of(cls, given: FitProblem, shares: "list[np.ndarray] | None" = None) -> "Problem":
         """Of the problem of a fit; `shares`, what the harmonic holds of each bin, if that is known."""
         c = given.coordinates
-        spread = all(
-            p.target.segments is not None or p.target.sigma is not None or not len(p.target.bins) for p in given.parts
-        )
-        likelihood = Likelihood.of(given) if spread else None
+        targets = [part.target for part in given.parts]
+        known = all(t.segments is not None or t.sigma is not None or not len(t.bins) for t in targets)
+        likelihood = Likelihood.of(given) if known else None
         return cls(c.names, c.from_theta(np.zeros(len(c.names))), given, given.linear(shares), likelihood)
 
     def parameters(self, theta: Theta) -> dict[str, Scalar]:
@@ -102,10 +101,9 @@ class Problem(Shown):
         """Log density of the prior as one of θ, up to a constant. Flat, and then improper, where the prior is None."""
         theta, c = jnp.asarray(theta), self.objective.coordinates
         scaled = self.objective.theta(theta)
-        width = jnp.where(jnp.isfinite(c.low), c.high - c.low, 1.0)
-        stretch = jnp.where(
-            jnp.isfinite(c.low), jnp.log(width) + jax.nn.log_sigmoid(theta) + jax.nn.log_sigmoid(-theta), 0.0
-        )
+        bounded = np.isfinite(c.low)
+        width = np.log(np.where(bounded, c.high - c.low, 1.0))
+        stretch = jnp.where(bounded, width + jax.nn.log_sigmoid(theta) + jax.nn.log_sigmoid(-theta), 0.0)
         return jnp.sum(stretch) - 0.5 * jnp.sum(self.objective.prior * scaled**2)
 
     def log_density(self, theta: Theta) -> Scalar:
@@ -160,8 +158,8 @@ def problem(
 
     The model is that of the linear response; `task` is fitted as it is, without the richer models that `fit` may try.
 
-    **Arguments:** `task`; `target`, in any form that `fit` takes but a perturbed recording; `free`, `fix`, `noise`, `residual`,
-    `bounds`, `priors`, `coefficient_of_variation`, `mean_force` as in `fit`.
+    **Arguments:** `task`; `target`, in any form that `fit` takes but a perturbed recording; `free`, `fix`, `noise`,
+    `residual`, `bounds`, `priors`, `coefficient_of_variation`, `mean_force` as in `fit`.
 
     **Returns:** a `Problem`. **Raises:** `ValueError` as `fit` does.
     """

@@ -260,7 +260,13 @@ def to_table(result: FitResult) -> dict[str, Any]:
 
 
 def load_result(path: str | Path) -> FitResult:
-    """Read the `fit.json` at `path`, of one target or several. Raises `ResultError` naming the file and what is wrong."""
+    """Read the `fit.json` at `path`, of one target or several. Raises `ResultError` naming the file and what is wrong.
+
+        result.save("fit.json")
+        result = jm.load_result("fit.json")
+
+    A result of another version of the format is refused.
+    """
     path = Path(path)
     try:
         table = json.loads(path.read_text(encoding="utf-8"))

@@ -51,6 +51,9 @@ def task_for(
     """The task that a target measured: `Isometric` for force and torque, `PrescribedLength` for a dynamic stiffness,
     `PrescribedForce` for displacement and acceleration (with `observe="acceleration"`).
 
+        target = jm.load_target("vastus-lateralis-26mvc")
+        task = jm.task_for(target, noise="pink")
+
     Of another `kind` if one is given. It has the target's spectrum settings and default parameters; `noise` is a name of
     `NOISES` or a noise object.
     """
@@ -221,8 +224,9 @@ def planned(task: AbstractTask, target: Target, options: FitOptions) -> Plan:
     variation = target_variation(target) if options.coefficient_of_variation else None
     part = Part("", task, target, coordinates, tuple(range(len(names))), variation, mean)
     key = key_of(options.key) if isinstance(options.key, int) else options.key
-    problem = FitProblem((part,), coordinates, np.array([0.0 if sds[n] is None else 1.0 for n in names]), options.residual,
-                         options.method, options.dt, key, counts["seeds"], control, options.progress, options.optimiser)  # fmt: skip
+    prior = np.array([0.0 if sds[n] is None else 1.0 for n in names])
+    problem = FitProblem((part,), coordinates, prior, options.residual, options.method, options.dt, key, counts["seeds"],
+                         control, options.progress, options.optimiser)  # fmt: skip
     settings = {
         **settings_of(problem, bounds), **counts, "max_steps": options.max_steps, "dt": options.dt,
         "coefficient_of_variation": variation is not None,

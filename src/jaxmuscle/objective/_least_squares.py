@@ -52,8 +52,8 @@ def check_optimiser(optimiser: Any) -> None:
     import optimistix as optx
 
     if not isinstance(optimiser, optx.AbstractGaussNewton):
-        raise ValueError(f"optimiser = {optimiser!r}: give a least-squares solver of optimistix that makes Gauss-Newton steps, "
-                         "as optimistix.Dogleg(rtol=1e-9, atol=1e-9); for any other optimiser there is jaxmuscle.problem(task, "
+        raise ValueError(f"optimiser = {optimiser!r}: give a least-squares solver of optimistix that makes Gauss-Newton "
+                         "steps, as optimistix.Dogleg(rtol=1e-9, atol=1e-9); for any other there is jaxmuscle.problem(task, "
                          "target)")  # fmt: skip
 
 

@@ -18,6 +18,8 @@ def expected_spectrum(
 ) -> Spectrum:
     """The expected Welch spectrum of a task's output, to first order in its perturbations: no Monte Carlo.
 
+        jm.expected_spectrum(jm.Isometric(k_w=4e5)).plot()
+
         E_k = Σ_l M_kl r(l Δ) + line_k,    r(τ) = c exp(𝒜 τ) P cᵀ,    𝒜 P + P 𝒜ᵀ + 𝒬 = 0
 
     𝒜 is the task linearised about its equilibrium together with the filters that shape the noise; M holds window,

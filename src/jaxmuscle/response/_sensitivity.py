@@ -65,6 +65,8 @@ def sensitivity(
 ) -> Sensitivity:
     """How every bin of the expected spectrum answers to every parameter, by forward-mode differentiation.
 
+        jm.sensitivity(jm.Isometric(), ("k_w", "c_w")).plot()
+
     **Arguments:** `task`; `names` of parameters (all by default); `settings` (the task's by default); `window` [s].
 
     **Returns:** a `Sensitivity`. **Raises:** as `expected_spectrum`, and `ValueError` for an unknown name.

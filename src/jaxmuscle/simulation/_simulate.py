@@ -42,6 +42,9 @@ def simulate(
 ) -> Trajectory:
     """Simulate one seed: the Stratonovich equation `dy = f(t, y, S) dt + (∂f/∂u) σ ∘ dW`, or with coloured noise in u.
 
+        run = jm.simulate(jm.Isometric(k_w=4e5), jax.random.key(0), seed=3)
+        run.plot()
+
     Heun's method at fixed steps in diffrax. Differentiable in both modes with respect to the task's parameters.
 
     **Arguments:** `task`; `key`, a `jax.random` key, from which seed i takes `fold_in(key, i)`; `seed`; `duration` [s];

@@ -112,6 +112,8 @@ def profile(
 ) -> Profile:
     """Profile likelihood of a free parameter or a derived quantity, with its confidence interval.
 
+        print(jm.profile(result, "corner_frequency"))
+
     `rise(q) = 2 (max ln L - max_{θ: q(θ) = q} ln L)`, compared with a χ² quantile (Wilks 1938). The likelihood is that of
     `log_likelihood`, its maximum searched from the fit and from other frequencies of the harmonic. Without `with_priors` the
     priors do not count: a quantity that the data leave open has an open interval (they still hold everything else within
