@@ -98,18 +98,6 @@ FUNCTIONS = [name for name in NAMES if inspect.isroutine(operator.attrgetter(nam
 OF_PROCESSES = {"ensembles.join", "ensembles.launched", "ensembles.leave", "ensembles.measure"}  # docs/ensembles.md
 RUN = ("list_", "load_target", "load_preset", "on_rung", "task_for", "save_preset", "data.as_", "response.", "spectra.",
        "at_", "scaled")  # fmt: skip
-    "list_",
-    "load_target",
-    "load_preset",
-    "on_rung",
-    "task_for",
-    "save_preset",
-    "data.as_",
-    "response.",
-    "spectra.",
-    "at_",
-    "scaled",
-)
 
 
 def examples(name):
