@@ -20,7 +20,7 @@ KINDS = list(TASKS.values())
 
 def rows_of(task):
     """Cells of the table: name, value with unit, and whether a fit moves it."""
-    return dict(re.findall(r"^  (\w+) .*? (free|fixed) ", str(task), re.MULTILINE))
+    return dict(re.findall(r"^  (\w+) .*? (free|fixed)(?: |$)", str(task), re.MULTILINE))
 
 
 @pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.__name__)

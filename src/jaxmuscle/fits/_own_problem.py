@@ -130,8 +130,9 @@ class Problem(Shown):
 
     def _card(self) -> Card:
         values = self.fit_problem.coordinates.centre
-        rows = tuple((name, f"{value:.5g}", PARAMETERS[name].unit if name in PARAMETERS else "")
-                     for name, value in zip(self.names, values, strict=True))  # fmt: skip
+        units = [PARAMETERS[name].unit if name in PARAMETERS else "" for name in self.names]
+        rows = tuple((name, f"{value:.5g}", "" if unit == "1" else unit)
+                     for name, value, unit in zip(self.names, values, units, strict=True))  # fmt: skip
         heading = f"problem of {self.fit_problem.title} with {len(self.names)} free parameters"
         text = "\n".join([heading, *(f"  {name:<24}{value:<12}{unit}".rstrip() for name, value, unit in rows)])
         return Card(text, heading, ("name", "start", "unit"), rows)
