@@ -3,7 +3,7 @@
 import abc
 import dataclasses
 from collections.abc import Mapping
-from typing import Any, ClassVar, Self, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 import equinox as eqx
 import jax
@@ -37,6 +37,7 @@ from ._signals import AbstractSignal, Harmonic
 from ._white_noise import BandLimitedNoise
 
 State = Float[Array, " states"]
+Task = TypeVar("Task", bound="AbstractTask")
 
 
 class AbstractTask(Shown, eqx.Module):
@@ -90,14 +91,14 @@ class AbstractTask(Shown, eqx.Module):
     def __dir__(self) -> list[str]:
         return [*object.__dir__(self), *self.parameter_names, *BASE]
 
-    def replace(self, **values: Scalar) -> Self:
+    def replace(self: Task, **values: Scalar) -> Task:
         """A copy with the named parameters set. Raises `ValueError` for an unknown name or an impossible value.
 
         task = jm.Isometric().replace(k_w=4e5, noise_K_w=0.1)
         """
         return set_parameters(self, values)
 
-    def with_parts(self, **parts: Any) -> Self:
+    def with_parts(self: Task, **parts: Any) -> Task:
         """A copy with whole parts exchanged: fields of the task, as `muscle`, `noise`, `harmonic`, `settings`, and inputs.
 
             task = jm.Isometric().with_parts(noise=jm.PinkNoise())
@@ -107,7 +108,7 @@ class AbstractTask(Shown, eqx.Module):
         fields = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
         return type(self)(**(fields | parts))
 
-    def as_task(self, task: "type[Task]", **inputs: Any) -> "Task":
+    def as_task(self, task: type[Task], **inputs: Any) -> Task:
         """The same muscle, perturbation and settings in another task, with that task's default inputs unless given.
 
         moving = jm.Isometric().as_task(jm.PrescribedForce, P_w=4.0)
@@ -190,7 +191,6 @@ class AbstractTask(Shown, eqx.Module):
         return jnp.append(base, jnp.zeros((), base.dtype)) * stiffness
 
 
-Task = TypeVar("Task", bound=AbstractTask)
 COLUMNS = ("name", "value", "unit", "fit", "what it is")
 
 

@@ -53,8 +53,9 @@ def check_optimiser(optimiser: Any) -> None:
 
     if not isinstance(optimiser, optx.AbstractGaussNewton):
         given = optimiser.__name__ if isinstance(optimiser, type) else type(optimiser).__name__
-        raise ValueError(f"optimiser: this is {given}; give a least-squares solver of optimistix that makes Gauss-Newton steps, "
-                         "as optimistix.Dogleg(1e-9, 1e-9); for any other there is jaxmuscle.problem(task, target)")  # fmt: skip
+        raise ValueError(f"optimiser: this is {given}; give a least-squares solver of optimistix that makes Gauss-Newton "
+                         "steps, as optimistix.Dogleg(1e-9, 1e-9); for any other there is jaxmuscle.problem(task, "
+                         "target)")  # fmt: skip
 
 
 def _initial(objective, data, s, seen):
