@@ -83,17 +83,14 @@ def test_log_density_and_its_slope(problem):
 def test_scipy_finds_the_minimum_of_the_fit(problem, result):
     """In the two descents that a fit makes: what the harmonic holds of the bins is unknown first, then known.
 
-    It ends when a step gains less than 1e-4 of its cost.
+    A fit ends when two steps in a row gain less than 1e-4 of the cost; the table of starts is that of the first descent.
     """
     near = problem.theta({name: result[name].value for name in problem.names})
     for turn, used in enumerate((problem, problem.scattering_as(near))):
         given = jax.jit(used.residuals), near + 0.05 * (-1.0) ** np.arange(len(near)), jax.jit(jax.jacfwd(used.residuals))
         found = scipy.optimize.least_squares(*given, ftol=1e-12, xtol=1e-12)
-        cost = 0.5 * float(jnp.sum(given[0](near) ** 2))
-        assert found.success and found.cost <= cost * (1 + 1e-9)
-        if turn:
-            assert cost == pytest.approx(found.cost, rel=1e-3)
-            assert min(start.cost for start in result.starts) == pytest.approx(cost, rel=1e-9)
+        ours = 0.5 * float(jnp.sum(given[0](near) ** 2)) if turn else min(start.cost for start in result.starts)
+        assert found.success and found.cost == pytest.approx(ours, rel=1e-3)
 
 
 @pytest.mark.slow
@@ -101,7 +98,7 @@ def test_another_optimiser_finds_the_same(result):
     other = jm.fit(TASK, TARGET, **ALONE, optimiser=optx.Dogleg(rtol=1e-9, atol=1e-9))
     assert other.success and other.settings["optimiser"] == "Dogleg" and "optimiser" not in result.settings
     best, mine = (min(start.cost for start in each.starts) for each in (other, result))
-    assert best == pytest.approx(mine, rel=5e-3)
+    assert best == pytest.approx(mine, rel=1e-3)
 
 
 def test_what_is_no_least_squares_solver_is_refused():

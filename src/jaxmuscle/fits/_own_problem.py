@@ -84,7 +84,7 @@ class Problem(Shown):
 
     def residuals(self, theta: Theta) -> Float[Array, " residuals"]:
         """What a fit makes small, `½ Σ r²`: those of the data in standard deviations, then those of the prior."""
-        scaled = self.objective.theta(jnp.asarray(theta))
+        scaled: Any = self.objective.theta(jnp.asarray(theta))
         return self.objective.residuals(scaled, self._moments(scaled), self.objective.data)
 
     def log_likelihood(self, theta: Theta) -> Scalar:
@@ -125,7 +125,7 @@ class Problem(Shown):
             shares = [np.clip(np.nan_to_num(m.line / m.power), 0.0, 1.0) for m in seen.moments]
             return Problem.of(self.fit_problem.scattering_as(self.fit_problem.tasks_at(scaled)), shares)
 
-    def _moments(self, scaled: Theta) -> tuple[Moments, ...]:
+    def _moments(self, scaled: Any) -> tuple[Moments, ...]:
         return tuple(part.moments(scaled) for part in self.objective.parts)
 
     def _card(self) -> Card:
