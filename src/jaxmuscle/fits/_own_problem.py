@@ -38,6 +38,8 @@ class Problem(Shown):
 
     All methods are functions of θ that JAX compiles and differentiates. Turn on double precision first
     (`jax.config.update("jax_enable_x64", True)`): in single precision a search ends early.
+
+    `fit_problem`, `objective` and `likelihood` are what the functions are made of, for the package itself.
     """
 
     names: tuple[str, ...]
