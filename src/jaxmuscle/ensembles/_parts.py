@@ -83,6 +83,8 @@ class PartReport(NamedTuple):
 def merge(path: str | Path) -> "xarray.Dataset":
     """Make one ensemble of the parts in a store: checks that all chunks are there, reduces tallies, marks it complete.
 
+        runs = jm.ensembles.merge("runs.zarr")
+
     A store that is complete is checked and opened, as by `open_store`, so a repetition does no harm.
 
     **Arguments:** `path`, the store's folder or URL.
