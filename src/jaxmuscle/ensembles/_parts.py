@@ -115,6 +115,8 @@ def merge(path: str | Path) -> "xarray.Dataset":
 def open_store(path: str | Path) -> "xarray.Dataset":
     """Open a complete store after every chunk of it has been compared with its checksum.
 
+        runs = jm.ensembles.open_store("runs.zarr")
+
     `xarray.open_zarr` compares chunks when they are read, and takes one that is missing for NaN.
 
     **Arguments:** `path`, the store's folder or URL.
