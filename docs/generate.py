@@ -17,9 +17,29 @@ from jaxmuscle.response._presets import PresetFile
 PAGE = Path(__file__).parent / "reference" / "parameters.md"
 HEAD = """# Parameters and units
 
-One table holds every parameter: `jm.PARAMETERS[name]` is its row, `task[name]` its value in a task,
-`task.replace(name=value)` a copy with another value, `--fix NAME=VALUE` and `--free NAMES` the same from a shell. This page
-is written by `docs/generate.py` from that table.
+One table holds every parameter: `jm.PARAMETERS[name]` is its row. `docs/generate.py` writes this page from it.
+
+## One name everywhere
+
+A parameter has the name of this table wherever you write it:
+
+| to | write |
+|---|---|
+| make a task with it | `jm.Isometric(k_w=4e5, noise="pink")` |
+| read it | `task["k_w"]`, `task.k_w`, `result["k_w"]` |
+| change it | `task.replace(k_w=4e5)` |
+| say how it is fitted | `free=("k_w",)`, `fix={"k_w": 4e5}`, `priors={"k_w": 0.5}`, `bounds={"k_w": (1e5, 1e6)}` |
+| do so from a shell | `--free k_w`, `--fix k_w=4e5` |
+
+- Two tissues, one letter: `_w` is the active tissue, `_z` the passive one. Small letters are factors (`k_w`, `c_w`). What
+  begins with `noise_` is the noise on a coefficient (`noise_K_w`).
+- Results call three parameters by the name that people use. Both names work everywhere: `tremor_frequency` is
+  `resonance_frequency`, `tremor_width` is `resonance_width`, `contraction_time` is `activation_time`.
+- `K_w0`, `K_z0`, `C_w0` and `C_z0`, stiffness and damping at rest, follow from parameters. You can read them
+  (`task["K_w0"]`, `result["K_w0"]`), but not set or fit them.
+- `P_w`, `F_ext` and `x_z` are inputs over time. `task["P_w"]` is the level that is held, `task.P_w` the whole signal.
+- In a joint fit `c_w@high` is that of the target "high" alone.
+- A wrong name is an error that says which one you may have meant.
 
 ## Values
 

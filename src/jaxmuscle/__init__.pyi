@@ -34,6 +34,7 @@ from .ensembles._sweep import Sweep as Sweep
 from .fits._cohort import fit_cohort as fit_cohort
 from .fits._fit import fit as fit
 from .fits._joint import fit_joint as fit_joint
+from .fits._own_problem import problem as problem
 from .fits._result import load_result as load_result
 from .fits._study import run_study as run_study
 from .model._activation import Activation as Activation

@@ -56,6 +56,21 @@ def csv_file(folder, rows=30, name="spectrum.csv", **changes):
     return path
 
 
+# --- what a user tries first
+
+
+def test_the_other_spelling_is_the_same_command():
+    commands = typer.main.get_group(app).commands
+    assert commands["analyze"].callback is commands["analyse"].callback and commands["analyze"].hidden
+    assert run("analyze", "--help").output == run("analyse", "--help").output.replace("analyse [", "analyze [")
+
+
+@pytest.mark.parametrize(("words", "meant"), [("jaxmuscle stu", "study"), ("jaxmuscle fit --start", "--starts")])
+def test_the_shell_completes_commands_and_options(words, meant):
+    asked = {"_JAXMUSCLE_COMPLETE": "complete_bash", "COMP_WORDS": words, "COMP_CWORD": str(words.count(" "))}
+    assert CliRunner().invoke(app, [], prog_name="jaxmuscle", env=asked).output.split() == [meant]
+
+
 # --- a user's mistakes: exit code 2 and what would be right
 
 FILES = {

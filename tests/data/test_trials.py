@@ -332,3 +332,13 @@ def test_a_joint_fit_at_two_forces():
         mean = result[f"mean@{name}"]
         assert abs(mean.value - measured) < 2 * mean.stderr < 0.05 * measured
     assert result["P_w@strong"].value > result["P_w@weak"].value
+
+
+def test_what_does_not_say_how_data_are_read_is_refused():
+    target = jm.load_target("fdi-abduction-45mvc")
+    for given, option, what in (
+        (target, {"segments": 3}, "a target"),
+        ("fdi-abduction-45mvc", {"lever_arm": 0.1}, "a spectrum"),
+    ):
+        with pytest.raises(ValueError, match=f"{next(iter(option))} = .*does not belong to {what}; leave it out"):
+            as_target(given, **option)

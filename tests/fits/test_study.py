@@ -210,7 +210,6 @@ def test_the_figure_of_spectra():
         ({"rung": "high"}, "rung = 'high'"),
         ({"alpha": 5.0}, "alpha = 5.0: give a share between 0 and 1"),
         ({"correction": "bonferoni"}, "correction = 'bonferoni': .*holm"),
-        ({"skip_row": 2}, "unknown argument 'skip_row'; did you mean 'skip_rows'"),
         ({"quantities": ["tremor"]}, "quantities: unknown 'tremor'; did you mean 'tremor_"),
     ],
 )

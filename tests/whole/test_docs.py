@@ -1,14 +1,18 @@
 """The documentation against the package: every public name described once, links that lead somewhere, a current table."""
 
 import ast
+import contextlib
 import dataclasses
 import inspect
 import operator
 import re
+import textwrap
 import types
 from collections import Counter
 
+import jax
 import matplotlib.pyplot as plt
+import numpy as np
 import pytest
 from pages import PAGES, ROOT, blocks, module, name_of
 
@@ -47,7 +51,7 @@ def test_reference_describes_every_public_name_once():
 
 
 def test_the_top_has_the_names_of_everyday_work():
-    assert 40 <= len(PUBLIC) - sum("." in name for name in PUBLIC) <= 58
+    assert 40 <= len(PUBLIC) - sum("." in name for name in PUBLIC) <= 59
 
 
 # Values and the module of figures stand on their pages of the reference.
@@ -89,6 +93,35 @@ def test_public_methods_are_documented(name):
     kinds = (types.FunctionType, property, classmethod, staticmethod)
     public = [attribute for attribute, value in vars(thing).items() if attribute[0] != "_" and isinstance(value, kinds)]
     assert not [attribute for attribute in public if not inspect.getdoc(getattr(thing, attribute))]
+
+
+FUNCTIONS = [name for name in NAMES if inspect.isroutine(operator.attrgetter(name)(jm))]
+OF_PROCESSES = {"ensembles.join", "ensembles.launched", "ensembles.leave", "ensembles.measure"}  # docs/ensembles.md
+RUN = ("list_", "load_target", "load_preset", "on_rung", "task_for", "save_preset", "data.as_", "response.", "spectra.",
+       "at_", "scaled")  # fmt: skip
+
+
+def examples(name):
+    """Indented code of a docstring that calls the function."""
+    text = inspect.getdoc(operator.attrgetter(name)(jm)) or ""
+    for block in re.findall(r"(?:^    .*\n?)+", text, re.MULTILINE):
+        code = textwrap.dedent(block)
+        with contextlib.suppress(SyntaxError):  # a formula
+            calls = [ast.unparse(node.func) for node in ast.walk(ast.parse(code)) if isinstance(node, ast.Call)]
+            if name.rpartition(".")[2] in {call.rpartition(".")[2] for call in calls}:
+                yield code
+
+
+@pytest.mark.parametrize("name", sorted(set(FUNCTIONS) - OF_PROCESSES))
+def test_function_has_an_example(name, tmp_path, monkeypatch):
+    """Those that need neither a file of the reader's nor a fit are run."""
+    code = "\n".join(examples(name))
+    assert code
+    named = {f"{wing}.{one}" if one else wing for wing, one in re.findall(r"\bjm\.(\w+)(?:\.([a-z]\w*))?", code)}
+    assert {one for one in named if one.partition(".")[0] not in TOP} == set()
+    if name.startswith(RUN):
+        monkeypatch.chdir(tmp_path)
+        exec(compile(code, name, "exec"), {"jm": jm, "np": np, "jax": jax})
 
 
 @pytest.mark.parametrize("name", FIGURES)

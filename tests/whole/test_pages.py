@@ -26,7 +26,8 @@ ELSEWHERE = {
 BELOW = {"docs/gallery.md"}  # its program is read instead
 RUN_HERE = {
     "README.md", "docs/coming-from-diffrax.md", "docs/coming-from-matlab.md", "docs/ensembles.md", "docs/fit-a-csv.md",
-    "docs/fitting.md", "docs/force.md", "docs/identifiability.md", "docs/index.md", "docs/recordings.md",
+    "docs/fitting.md", "docs/force.md", "docs/how-to/own-optimiser.md", "docs/identifiability.md", "docs/index.md",
+    "docs/recordings.md",
     "docs/reference/figures.md", "docs/scaling.md", "docs/tutorial.md", "docs/uncertainty.md",
 }  # fmt: skip
 FEWER_SEEDS = {"seeds=100_000": "seeds=1_000"}
@@ -188,6 +189,17 @@ def test_coming_from_elsewhere():
     assert names["many"].shape == (8, 101) and np.all(np.isfinite(names["solution"].ys))
     assert set(names["slopes"]) == {"c_w", "noise_K_z"}
     assert names["better"]["c_w"] == pytest.approx(191.9, rel=0.01)  # Levenberg-Marquardt stops within 1e-2 of a coordinate
+
+
+@pytest.mark.slow
+def test_own_optimisers():
+    """scipy's minimum, found as the page says, is that of the fit with another optimiser."""
+    try:
+        names = pages.run("docs/how-to/own-optimiser.md")
+    finally:
+        jax.config.update("jax_enable_x64", False)
+    assert names["found"].success and names["result"].success and len(names["draws"]) == 20
+    assert names["problem"].log_density(names["theta"]) > names["problem"].log_density(names["problem"].start)
 
 
 @pytest.mark.slow

@@ -23,12 +23,22 @@ class BundledPreset(NamedTuple):
 
 
 def list_targets() -> tuple[str, ...]:
-    """Names of the bundled targets, sorted."""
+    """Names of the bundled targets, sorted.
+
+        target = jm.load_target(jm.list_targets()[0])
+
+    `load_target` takes them.
+    """
     return _names("targets")
 
 
 def list_presets() -> tuple[str, ...]:
-    """Names of the bundled presets, sorted."""
+    """Names of the bundled presets, sorted.
+
+        jm.list_presets()[0]
+
+    `load_preset` takes them.
+    """
     return _names("presets")
 
 

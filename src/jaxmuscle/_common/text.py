@@ -47,8 +47,9 @@ def probability(p: float) -> str:
 def choices(word: object, options: Iterable[str]) -> str:
     """The end of a message about an unknown word: the nearest option, then all of them."""
     options = list(options)
-    near = difflib.get_close_matches(str(word).lower(), options, n=1, cutoff=0.4)
-    hint = f"did you mean {near[0]!r}? " if near else ""
+    plain = {option.lower(): option for option in options}
+    near = difflib.get_close_matches(str(word).lower(), plain, n=1, cutoff=0.4)
+    hint = f"did you mean {plain[near[0]]!r}? " if near else ""
     return f"{hint}Known: {', '.join(options)}"
 
 

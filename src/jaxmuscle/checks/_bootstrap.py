@@ -35,6 +35,9 @@ def bootstrap(
 ) -> Bootstrap:
     """Whether the standard errors of a fit hold: data are made from the fitted task and fitted again.
 
+        result = jm.fit(jm.task_for(target), target)
+        print(jm.bootstrap(result))
+
     For every replicate the nonlinear simulator gives one recording for each trial, as long as its Welch segments ask for,
     analysed as the target's (a target with sigma alone: spectra drawn from the Gaussian law in the log about the fit). It
     is fitted as `result` was, with its free parameters, priors, bounds and further data, from 32 starts in linear response

@@ -9,6 +9,7 @@ from jax import Array
 from jaxtyping import Float
 
 from jaxmuscle import plot
+from jaxmuscle._common.cards import Printed, Result
 from jaxmuscle._common.environment import versions
 from jaxmuscle._common.keys import number_of
 from jaxmuscle._common.parts import of_only, only
@@ -72,7 +73,7 @@ def p_values(observed: dict[str, np.ndarray], reference: dict[str, np.ndarray]) 
     }
 
 
-class GoodnessPart(eqx.Module):
+class GoodnessPart(Printed, Result, eqx.Module):
     """How the spectrum of one target lies about the fit, against spectra drawn from the fit that were themselves fitted.
 
     `residual` z_k of every bin [standard deviations of its log power]; `observed` {chi2_per_bin, runs, largest}, each with
@@ -123,7 +124,7 @@ class GoodnessPart(eqx.Module):
         return folded([head, *(f"- {sentence}" for sentence in self.sentences)])
 
 
-class Goodness(eqx.Module):
+class Goodness(Printed, Result, eqx.Module):
     """Whether a fit is as good as the scatter of its data allows.
 
     `parts`, a `GoodnessPart` for each target by name; `p_value`, that of the smallest p-value of all checks of all targets;
@@ -174,6 +175,9 @@ class Goodness(eqx.Module):
 
 def goodness(result: FitResult, target: Target | None = None, *, replicates: int = 999, key: Key = 0) -> Goodness:
     """Whether a fit is as good as the scatter of its target allows, by parametric bootstrap with refits.
+
+        result = jm.fit(jm.task_for(target), target)
+        print(jm.goodness(result))
 
     Three numbers, from the residuals `z_k = (ln(p_k / fitted_k) - bias_k - mean) / sd_k`: chi² per bin
     `Σ z_k² / (bins - 1)`, the number of runs of equal sign (few: a smooth misfit), the largest |z_k| (a line). Their

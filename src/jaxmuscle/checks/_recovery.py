@@ -12,6 +12,7 @@ from jaxtyping import Float
 
 from jaxmuscle import plot
 from jaxmuscle._common.arrays import with_nulls
+from jaxmuscle._common.cards import Printed, Result
 from jaxmuscle._common.environment import versions
 from jaxmuscle._common.files import write_text
 from jaxmuscle._common.tables import frame
@@ -99,7 +100,7 @@ class Recovery(eqx.Module):
         return "holds"
 
 
-class Bootstrap(eqx.Module):
+class Bootstrap(Printed, Result, eqx.Module):
     """What refits of data made from a fit found.
 
     `quantities` {name: `Recovery`}, those that the fit determines; `replicates` asked for; `failed` {replicate: why it

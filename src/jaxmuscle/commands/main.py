@@ -27,7 +27,7 @@ from .speed import speed
 from .steadiness import steadiness
 from .study import study
 
-app = typer.Typer(add_completion=False, no_args_is_help=True, rich_markup_mode="markdown", pretty_exceptions_enable=False)
+app = typer.Typer(no_args_is_help=True, rich_markup_mode="markdown", pretty_exceptions_enable=False)
 
 
 app.command()(fit)
@@ -35,6 +35,7 @@ app.command()(simulate)
 app.command()(ensemble)
 app.command()(merge)
 app.command()(analyse)
+app.command("analyze", hidden=True)(analyse)
 app.command()(steadiness)
 app.command()(posterior)
 app.command()(design)

@@ -15,7 +15,7 @@ from jaxmuscle._common.types import Key
 from jaxmuscle.data._target import Target
 from jaxmuscle.fits._adequacy import Endpoint
 from jaxmuscle.model._noises import NOISES, with_noise
-from jaxmuscle.model._parameters import HARMONIC, PARAMETERS
+from jaxmuscle.model._parameters import HARMONIC, PARAMETERS, proper_names, proper_values, unknown_parameter
 from jaxmuscle.model._rungs import on_rung
 from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.objective._arguments import FitOptions, planned
@@ -45,6 +45,8 @@ def compare_noise(
     progress: bool | Callable[[str, float], None] = False,
 ) -> Comparison:
     """Fit a spectrum with every colour of noise, with and without harmonic, and say which can be told apart.
+
+        print(jm.compare_noise(jm.task_for(target), target))
 
     So are the richer models that a fit may climb to (`on_rung`), with the task's own noise: "activation", "tremor" instead
     of the harmonic, "two resonances".
@@ -77,8 +79,9 @@ def compare_noise(
     if not 2 <= groups <= len(target.bins):
         raise ValueError(f"groups = {groups}: give a number from 2 to that of the target's bins, {len(target.bins)}")
     with told(progress, f"comparing models on {target.name}") as tell, jax.enable_x64(True):
-        carried, left_out = _carried(task, noises, dict(fix or {}))
-        problems = _setups(carried, target, free, dict(fix or {}), dict(priors or {}), dict(bounds or {}), key)
+        fixed = proper_values(fix)
+        carried, left_out = _carried(task, noises, fixed)
+        problems = _setups(carried, target, free, fixed, proper_values(priors), proper_values(bounds), key)
         folds = None if target.segments is None else Folds.of([target], groups)
         found: dict[tuple[str, bool], dict[str, Any]] = {}
         for number, (noise, problem) in enumerate(problems.items()):
@@ -127,11 +130,11 @@ def _setups(
     """The fit of each noise; what concerns a parameter that only other noises have is left to them."""
     everywhere = {name for task in carried.values() for name in task.parameter_names}
     everywhere |= {name for name in PARAMETERS if name.startswith("noise_")}
-    chosen = None if free is None else tuple(free)
+    chosen = proper_names(free)
     for argument, names in (("free", chosen or ()), ("fix", fix), ("priors", priors), ("bounds", bounds)):
         for name in names:
             if name not in everywhere:
-                raise ValueError(f"{argument}: unknown parameter {name!r}: {choices(name, everywhere)}")
+                raise ValueError(f"{argument}: {unknown_parameter(name, everywhere)}")
     problems = {}
     for noise, task in carried.items():
         own = set(task.parameter_names) - set(HARMONIC if RICHER.get(noise, 0) > 1 else ())

@@ -11,6 +11,7 @@ from jaxtyping import Float
 
 from jaxmuscle import plot
 from jaxmuscle._common.arrays import with_nulls
+from jaxmuscle._common.cards import Printed, Result
 from jaxmuscle._common.environment import versions
 from jaxmuscle._common.files import write_text
 from jaxmuscle._common.tables import frame
@@ -41,7 +42,7 @@ class Evidence(NamedTuple):
     scores: Float[np.ndarray, " bins"] | None
 
 
-class Decision(eqx.Module):
+class Decision(Printed, Result, eqx.Module):
     """Model `a` against model `b`.
 
     How much lower the AIC of `a` is (`aic_gain`), how much higher its held-out score (`score_gain`, `score_stderr`; None
@@ -147,7 +148,7 @@ def lowest(rows: list[Row]) -> Row:
     return min(rows, key=lambda row: row.aic if math.isfinite(row.aic) else math.inf)
 
 
-class Comparison(eqx.Module):
+class Comparison(Printed, Result, eqx.Module):
     """Which noise a spectrum speaks for.
 
     `rows`, a `ComparedModel` each; `left_out` {noise: why the task cannot carry it}; `tasks` and `fitted` (proportional

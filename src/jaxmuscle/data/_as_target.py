@@ -1,7 +1,7 @@
 """Whatever a fit may be given as its data, made a target: spectra, recordings, names and paths of both."""
 
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,36 +20,61 @@ from ._trials import Trials, load_recordings
 ROWS, POINTS = 90, 500
 
 
-def as_target(given: Any, **options: Any) -> Target:
+def as_target(
+    given: Any,
+    *,
+    quantity: str | None = None,
+    segments: int | Sequence[int] | None = None,
+    dataset: str | None = None,
+    axis: str | None = None,
+    lever_arm: float | int | None = None,
+) -> Target:
     """The target that is meant.
+
+        target = jm.data.as_target("vastus-lateralis-26mvc")
 
     `given`: a `Target` is taken as it is. A `Recording`, `Trials` or several recordings of one condition give theirs
     (`Trials.target`), in the windows that they have. The path of a recording, or several of trials, is read, and the steady
     part of each found (`Recording.steady`). The path of a frequency response is read by `load_frequency_response`. Another
     path, or the name of a bundled target, is read as a spectrum.
 
-    **Arguments:** `options`, how files are read: as in `load_recording`, `load_frequency_response` or `load_target`.
+    **Arguments:** `quantity`, `segments`, `dataset`, `axis`, how a spectrum is read, as in `load_target`; `segments`,
+    `lever_arm`, how a frequency response is read, as in `load_frequency_response`.
 
     **Raises:** `TargetError`, a `ValueError`, for anything else, with the remedy.
     """
+    asked = {"quantity": quantity, "segments": segments, "dataset": dataset, "axis": axis, "lever_arm": lever_arm}
+    options = {name: value for name, value in asked.items() if value is not None}
     if isinstance(given, Target):
+        _check_options(options, (), "a target")
         return given
     if isinstance(given, Recording | Trials | PerturbedRecording):
+        _check_options(options, (), "a recording")
         return given.target()
     if isinstance(given, str | os.PathLike) and is_frequency_response(given):
+        _check_options(options, ("segments", "lever_arm"), "a frequency response")
         given = load_frequency_response(given, **options)
     if isinstance(given, FrequencyResponse):
         return Target(given.name, None, source=given.source, stiffness=given, notices=given.notices)
     if isinstance(given, str | os.PathLike):
         if not is_recording(given):
+            _check_options(options, ("quantity", "segments", "dataset", "axis"), "a spectrum")
             return load_target(given, **options)
-        return load_recordings([given], **options).steady().target()
+        given = [given]
     if isinstance(given, Sequence) and len(given) > 0:
+        _check_options(options, (), "a recording")
         if all(isinstance(one, Recording) for one in given):
             return Trials(given).target()
         if all(isinstance(one, str | os.PathLike) and is_recording(one) for one in given):
-            return load_recordings(given, **options).steady().target()
+            return load_recordings(given).steady().target()
     raise TargetError(_remedy(given))
+
+
+def _check_options(options: Mapping[str, Any], known: tuple[str, ...], what: str) -> None:
+    """Refuse what does not say how this is read."""
+    for name, value in options.items():
+        if name not in known:
+            raise TargetError(f"{name} = {value!r}: does not belong to {what}; leave it out")
 
 
 def _remedy(given: Any) -> str:
@@ -66,7 +91,12 @@ def _remedy(given: Any) -> str:
 
 
 def is_recording(path: str | os.PathLike[str]) -> bool:
-    """Whether the file at `path` holds a recording rather than a spectrum: by its ending, a text by its header and rows."""
+    """Whether the file at `path` holds a recording rather than a spectrum: by its ending, a text by its header and rows.
+
+        jm.data.is_recording("trial.csv")
+
+    It is read for that.
+    """
     path = Path(path).expanduser()
     kind = path.suffix.lower()
     if kind not in TEXT or not path.is_file():

@@ -11,6 +11,7 @@ from jaxtyping import Complex, Float
 from msgspec import Meta
 
 from jaxmuscle import plot
+from jaxmuscle._common.cards import Printed
 from jaxmuscle._common.documents import Table, checked
 from jaxmuscle._common.files import write_text
 from jaxmuscle._common.text import folded
@@ -35,7 +36,7 @@ class ResponseTable(Table, kw_only=True):
     coherence: Annotated[Numbers | None, Meta(description="Squared coherence, 0 to 1")] = None
 
 
-class FrequencyResponse(eqx.Module):
+class FrequencyResponse(Printed, eqx.Module):
     """The dynamic stiffness of a muscle: force per lengthening of its insertion, over frequency.
 
         H(f) = F(f) / X(f)  [N/m]
@@ -100,7 +101,9 @@ class FrequencyResponse(eqx.Module):
         coherence: Any = None,
         segments: Any = None,
         stderr: Any = None,
-        **fields: Any,
+        name: str = "response",
+        source: str = "given by the user",
+        notices: Iterable[str] = (),
     ) -> "FrequencyResponse":
         """A response as figures show it: gain, phase and coherence.
 
@@ -109,7 +112,8 @@ class FrequencyResponse(eqx.Module):
             stderr = gain √((1 - γ²) / (2 K γ²))
 
         **Arguments:** `frequency` [Hz]; `gain` [N/m]; `phase` [deg], positive where the force leads; `coherence` γ²;
-        `segments`, K, one number or one for each frequency; `stderr` [N/m]; `fields` as in `FrequencyResponse` (name, ...).
+        `segments`, K, one number or one for each frequency; `stderr` [N/m]; `name`, `source`, `notices` as in
+        `FrequencyResponse`.
 
         **Raises:** `ValueError` without `stderr` and without (`coherence` and `segments`), and as `FrequencyResponse` does.
 
@@ -131,7 +135,7 @@ class FrequencyResponse(eqx.Module):
             with np.errstate(divide="ignore"):
                 stderr = gain * np.sqrt((1 - shared) / (2 * averages * shared))
         value = gain * np.exp(1j * np.radians(phase))
-        return cls(frequency, value, stderr, coherence, **fields)
+        return cls(frequency, value, stderr, coherence, name=name, source=source, notices=notices)
 
     @property
     def known(self) -> "FrequencyResponse":

@@ -36,6 +36,9 @@ def load_frequency_response(
 ) -> FrequencyResponse:
     """Load a dynamic stiffness over frequency, as published figures show it, from a text (.csv, ...) or a sheet (.xlsx).
 
+        response = jm.load_frequency_response("response.csv", segments=30)
+        result = jm.fit(jm.PrescribedLength(), response)
+
         frequency_hz,gain_N/mm,phase_deg,coherence
         0.5,4.1,3,0.92
 
@@ -69,7 +72,12 @@ def load_frequency_response(
 
 
 def is_frequency_response(path: str | os.PathLike[str]) -> bool:
-    """Whether the text at `path` has columns called frequency, gain and phase, as `load_frequency_response` reads them."""
+    """Whether the text at `path` has columns called frequency, gain and phase, as `load_frequency_response` reads them.
+
+        jm.data.is_frequency_response("response.csv")
+
+    It is read for that.
+    """
     path = Path(path).expanduser()
     return path.suffix.lower() in TEXT and path.is_file() and is_response(beginning(path)[1])
 

@@ -9,6 +9,7 @@ import scipy
 from jaxtyping import Complex, Float
 
 from jaxmuscle import plot
+from jaxmuscle._common.cards import Printed
 from jaxmuscle._common.text import folded
 from jaxmuscle.spectra._cross_spectrum import Response, response_of
 from jaxmuscle.spectra._settings import SpectrumSettings, require
@@ -25,7 +26,7 @@ SURE = 4.0  # standard errors from which on the sign of the displacement is foun
 UNITS = ("N/m", "N s/m", "kg", "s")
 
 
-class PerturbedRecording(eqx.Module):
+class PerturbedRecording(Printed, eqx.Module):
     """A recording of two channels: the force of a muscle while its insertion is moved a little.
 
     The displacement counts *lengthening* as positive. The dynamic stiffness H(f) = force / lengthening then has a positive

@@ -12,7 +12,8 @@ import scipy
 from jaxtyping import Float
 
 from jaxmuscle import plot
-from jaxmuscle._common.text import choices, folded
+from jaxmuscle._common.cards import Card, Shown, facts
+from jaxmuscle._common.text import choices
 from jaxmuscle.spectra._measures import peaks, regularity
 from jaxmuscle.spectra._settings import SpectrumSettings, require
 from jaxmuscle.spectra._welch import Spectrum, lowpass, spectrum_of
@@ -31,7 +32,7 @@ LOWEST_RATE = 24.0  # Hz; half of it lies above bin 30
 SEGMENTS = 2  # a steady part holds at least this many
 
 
-class Recording(eqx.Module):
+class Recording(Shown, eqx.Module):
     """A recording of one signal at a fixed rate, with the window that is to be analysed.
 
     **Arguments:**
@@ -106,19 +107,21 @@ class Recording(eqx.Module):
         return recording_of(cls, frame_table(frame), Reading(column, rate, units, axis, reference, time, max_gap), name)
 
     @classmethod
-    def from_array(cls, samples: Any, rate: float | int, *, column: int = 0, **fields: Any) -> "Recording":
+    def from_array(cls, samples: Any, rate: float | int, *, column: int = 0, unit: str = "N", name: str = "recording",
+                   source: str = "given by the user", start: float | int = 0.0, window: Sequence[float | int] | None = None,
+                   notices: Iterable[str] = ()) -> "Recording":  # fmt: skip
         """A recording from an array: one signal, or a column of several.
 
-        **Arguments:** `samples`, shape `(times,)` or `(times, columns)`; `rate` [Hz]; `column`, counted from 0; `fields` as
-        in `Recording` (unit, name, ...).
+        **Arguments:** `samples`, shape `(times,)` or `(times, columns)`; `rate` [Hz]; `column`, counted from 0; the
+        others as in `Recording`.
 
         **Raises:** `ValueError` for a column that is not there, and as `Recording` does.
         """
         array = np.asarray(samples)
-        if array.ndim != 2:
-            return cls(array, rate, **fields)
-        require(0 <= column < array.shape[1], "column", column, f"give a number from 0 to {array.shape[1] - 1}")
-        return cls(array[:, column], rate, **fields)
+        if array.ndim == 2:
+            require(0 <= column < array.shape[1], "column", column, f"give a number from 0 to {array.shape[1] - 1}")
+            array = array[:, column]
+        return cls(array, rate, unit=unit, name=name, source=source, start=start, window=window, notices=notices)
 
     def _checked(self, window: Any) -> tuple[float, float]:
         try:
@@ -318,15 +321,15 @@ class Recording(eqx.Module):
         """Draw the trace with its window, and the spectra (Welch, FFT), linear and logarithmic; returns the figure."""
         return plot.recording(self, settings, ax)
 
-    def __str__(self) -> str:
+    def _card(self) -> Card:
         what = "recording" if self.quantity is None else self.quantity
-        lines = [
-            f"{self.name}: {what} [{self.unit}], {self.whole.size} samples at {self.rate:g} Hz",
-            f"  source    {self.source}",
-            f"  time      {self.start:g} s to {self.stop:g} s; {self.window_in_words}",
-            f"  range     {np.min(self.samples):.4g} to {np.max(self.samples):.4g} {self.unit}",
+        known = [
+            ("source", self.source),
+            ("time", f"{self.start:g} s to {self.stop:g} s; {self.window_in_words}"),
+            ("range", f"{np.min(self.samples):.4g} to {np.max(self.samples):.4g} {self.unit}"),
+            *(("notice", notice) for notice in self.notices),
         ]
-        return folded(lines + [f"  notice    {notice}" for notice in self.notices])
+        return facts(f"{self.name}: {what} [{self.unit}], {self.whole.size} samples at {self.rate:g} Hz", known)
 
 
 def recorded_settings(settings: SpectrumSettings | str | None) -> SpectrumSettings:

@@ -45,6 +45,9 @@ def load_recording(  # pyright: ignore[reportInconsistentOverload]
 ) -> Recording | PerturbedRecording:
     """Load a recording from text, Excel, MATLAB, NumPy, C3D, EDF, TDMS, AcqKnowledge or Spike2 files.
 
+        recording = jm.load_recording("trial.csv", column="force", rate=2048, units="N")
+        result = jm.fit(jm.Isometric(), recording.steady())
+
     Text (.csv, .tsv, .txt, .dat, .asc): delimiter, header, a row of units and decimal commas are detected, `#` starts a
     comment. Headers of LabChart, Spike2, AcqKnowledge and DIAdem are understood. MATLAB: variables by name, `trial.force`
     for a field of a struct, `Data:74` for a column of a table, **counted from 0** as in `Data[:, 74]`. C3D: points, and

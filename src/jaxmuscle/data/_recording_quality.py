@@ -8,6 +8,7 @@ import numpy as np
 import scipy
 from jaxtyping import Bool, Float, Int
 
+from jaxmuscle._common.cards import Printed
 from jaxmuscle._common.files import nulled
 from jaxmuscle._common.tables import frame
 from jaxmuscle.spectra._measures import Peaks
@@ -17,7 +18,7 @@ if TYPE_CHECKING:
     import pandas
 
 
-class RecordingSummary(eqx.Module):
+class RecordingSummary(Printed, eqx.Module):
     """Numbers of a window.
 
     Its `duration` [s] and Welch `segments`; `mean` and `standard_deviation` in `unit`; without unit

@@ -11,6 +11,7 @@ import scipy
 from jaxtyping import Float
 
 from jaxmuscle import plot
+from jaxmuscle._common.cards import Printed, Result
 from jaxmuscle._common.environment import versions
 from jaxmuscle._common.files import nulled, write_json
 from jaxmuscle._common.tables import frame
@@ -62,7 +63,7 @@ class Measure(eqx.Module):
     error_from: str
 
 
-class Steadiness(eqx.Module):
+class Steadiness(Printed, Result, eqx.Module):
     """What `steadiness` found; `print` shows it as a table, `found["sample_entropy"]` is one `Measure`.
 
     `measures` of all trials together, by name; `trials`, the measures of each by its name, and their `durations` [s];
@@ -145,6 +146,8 @@ def _said(name: str, m: Measure) -> str:
 
 def steadiness(recordings: Recording | Iterable[Recording]) -> Steadiness:
     """How steady a force, torque or displacement is held: variability, power by band, regularity. No model is fitted.
+
+        print(jm.steadiness(jm.load_recordings(["trial1.csv", "trial2.csv"]).steady()))
 
     Everything is computed of the window of each recording (`steady()` finds it), as `Recording.filtered` gives it:
     resampled to 100 Hz and low-passed at 30 Hz.

@@ -11,9 +11,9 @@ import tomli_w
 from jaxtyping import Float, Int
 
 from jaxmuscle import plot
+from jaxmuscle._common.cards import Card, Shown, facts
 from jaxmuscle._common.errors import TargetError
 from jaxmuscle._common.files import write_text
-from jaxmuscle._common.text import folded
 from jaxmuscle._common.units import NEWTONS
 from jaxmuscle.spectra._bin_law import bin_statistics, dispersion_of, trial_samples
 from jaxmuscle.spectra._settings import SpectrumSettings
@@ -30,7 +30,7 @@ MEAN_ERROR, LEAST_MEAN_ERROR = 0.02, 0.002
 UNUSUAL = 1.25  # dispersion from which trials are said to differ
 
 
-class Target(eqx.Module):
+class Target(Shown, eqx.Module):
     """What a fit is given: a proportional power spectrum p_k = P_k / Σ_j P_j on the bins k that are covered, and its origin.
 
     **Arguments:**
@@ -226,28 +226,28 @@ class Target(eqx.Module):
         """Draw the spectrum, see `jaxmuscle.plot.target`; `log`: both axes logarithmic. Returns the axes."""
         return plot.target(self, ax, log=log)
 
-    def __str__(self) -> str:
+    def _card(self) -> Card:
         peak = int(np.argmax(self.proportional_power))
         f, p, settings = self.frequency, self.proportional_power, self.settings
-        lines = [
-            f"{self.name}: proportional power of {self.quantity}, {self.provenance}",
-            f"  source    {self.source}",
-            f"  spectrum  {settings.name or 'settings of its own'}",
-            f"  bins      {f.size} of {settings.frequency.size}, {f[0]:.3f} to {f[-1]:.3f} Hz",
-            f"  maximum   {p[peak]:.3f} at {f[peak]:.3f} Hz",
+        known = [
+            ("source", self.source),
+            ("spectrum", settings.name or "settings of its own"),
+            ("bins", f"{f.size} of {settings.frequency.size}, {f[0]:.3f} to {f[-1]:.3f} Hz"),
+            ("maximum", f"{p[peak]:.3f} at {f[peak]:.3f} Hz"),
         ]
         if self.segments is not None:
-            lines.append(f"  segments  {_words(self.segments)} ({self.degrees_of_freedom:.1f} degrees of freedom)")
+            known.append(("segments", f"{_words(self.segments)} ({self.degrees_of_freedom:.1f} degrees of freedom)"))
         if self.coefficient_of_variation is not None:
             variation = ", ".join(f"{100 * value:.3g} %" for value in self.coefficient_of_variation)
-            lines.append(f"  coefficient of variation  {variation}")
+            known.append(("coefficient of variation", variation))
         if self.mvc_fraction is not None:
-            lines.append(f"  level     {100 * self.mvc_fraction:.4g} % MVC")
+            known.append(("level", f"{100 * self.mvc_fraction:.4g} % MVC"))
         if self.mean is not None:
-            lines.append(f"  mean      {np.mean(self.mean):.4g} {self.unit or '(unit unknown)'}")
+            known.append(("mean", f"{np.mean(self.mean):.4g} {self.unit or '(unit unknown)'}"))
         if self.dispersion:
-            lines.append(f"  trials    {_dispersion_in_words(self.dispersion)}")
-        return folded(lines + [f"  notice    {notice}" for notice in self.notices])
+            known.append(("trials", _dispersion_in_words(self.dispersion)))
+        known += [("notice", notice) for notice in self.notices]
+        return facts(f"{self.name}: proportional power of {self.quantity}, {self.provenance}", known)
 
 
 def load_target(
@@ -259,6 +259,9 @@ def load_target(
     axis: str = "linear",
 ) -> Target:
     """Load a bundled target by name, or a .toml or .csv file or a digitised figure by path.
+
+        target = jm.load_target("vastus-lateralis-26mvc")
+        print(target)
 
     A CSV has the columns `frequency_hz,proportional_power[,sigma]`, sorted and unique. A figure digitised with
     WebPlotDigitizer is its project (.json, .tar), its CSV of all datasets, or two columns without a header; its

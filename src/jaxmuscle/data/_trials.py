@@ -8,6 +8,7 @@ from typing import Any, overload
 import numpy as np
 
 from jaxmuscle import plot
+from jaxmuscle._common.cards import Card, Shown
 from jaxmuscle._common.text import folded
 from jaxmuscle.spectra._settings import SpectrumSettings, require
 from jaxmuscle.spectra._welch import Spectrum
@@ -19,7 +20,7 @@ from ._recording_table import Table
 from ._target import Target
 
 
-class Trials(Sequence[Recording]):
+class Trials(Shown, Sequence[Recording]):
     """Trials of one person in one condition: a sequence of `Recording`s, which together give one `Target`.
 
         trials = jm.load_recordings(["trial1.csv", "trial2.csv"]).steady()
@@ -104,20 +105,25 @@ class Trials(Sequence[Recording]):
         """Draw the windows and the spectra of all recordings, that of one as `Recording.plot`; returns the figure."""
         return plot.trials(self, settings, ax)
 
-    def __str__(self) -> str:
+    def _card(self) -> Card:
         head = f"{self.name}: {len(self)} recordings [{self.recordings[0].unit}]"
-        rows = [f"  {r.name}: {r.window_in_words}, mean {np.mean(r.samples):.4g} {r.unit}" for r in self.recordings]
-        return folded([head, *rows])
-
-    def __repr__(self) -> str:
-        return f"Trials({len(self)} recordings, {self.name!r})"
+        rows = tuple((r.name, r.window_in_words, f"{np.mean(r.samples):.4g} {r.unit}") for r in self.recordings)
+        lines = [f"  {name}: {window}, mean {mean}" for name, window, mean in rows]
+        return Card(folded([head, *lines]), head, ("recording", "window", "mean"), rows)
 
 
 def load_recordings(
     paths: "Iterable[str | os.PathLike[str] | Table] | str | os.PathLike[str] | Table",
     *,
     columns: Iterable[str | int] | None = None,
-    **options: Any,
+    column: str | int | None = None,
+    rate: float | int | None = None,
+    units: str | None = None,
+    axis: str | None = None,
+    reference: str | int | None = None,
+    time: str | int | None = None,
+    skip_rows: int = 0,
+    max_gap: float | int = 0.2,
 ) -> Trials:
     """Load the trials of one person in one condition.
 
@@ -125,13 +131,17 @@ def load_recordings(
 
     **Arguments:** `paths`, a list of files, or the path of one file that has a column for each trial (or what
     `jaxmuscle.data.read_table` read of them); `columns`, which columns of this one file are trials (by default all with
-    numbers but the time); `options` as in `load_recording`, the same for all files.
+    numbers but the time); `column`, `rate`, `units`, `axis`, `reference`, `time`, `skip_rows`, `max_gap` as in
+    `load_recording`, the same for all files.
 
     **Returns:** `Trials`, in the order given. **Raises:** `ValueError` as `load_recording` does, and for different units.
     """
+    options: dict[str, Any] = {"rate": rate, "units": units, "axis": axis, "reference": reference, "time": time,
+                               "skip_rows": skip_rows, "max_gap": max_gap}  # fmt: skip
     if isinstance(paths, str | os.PathLike | Table):
+        require(column is None, "column", column, "one file holds all trials here; name several with `columns`")
         return Trials(load_columns(paths, columns, **options))
     files = list(paths)
     if columns is not None:
         raise ValueError("columns: these are for one file that holds all trials; give its path alone, as a text")
-    return Trials(load_recording(path, **options) for path in files)
+    return Trials(load_recording(path, column=column, **options) for path in files)

@@ -15,7 +15,7 @@ from jaxmuscle._common.progress import told
 from jaxmuscle._common.text import listed
 from jaxmuscle._common.types import Key, Seeds
 from jaxmuscle.model._stream import Draws
-from jaxmuscle.model._tasks import AbstractTask, require_task
+from jaxmuscle.model._task import AbstractTask, require_task
 from jaxmuscle.response._linearised import LinearTask
 from jaxmuscle.simulation._simulate import DT, DURATION, require_finite, trajectories
 from jaxmuscle.simulation._trajectory import Trajectory
@@ -87,6 +87,9 @@ def ensemble(  # pyright: ignore[reportInconsistentOverload]
     generator: str = "hash",
 ) -> Any:
     """Simulate many seeds (0 to seeds - 1, or those given) of one task, or of every point of a sweep.
+
+        runs = jm.ensemble(jm.Isometric(), jax.random.key(0), seeds=100)
+        runs.spectrum().plot()
 
     Seed i is `simulate(..., seed=i)`, whatever the chunk, the devices or the number of processes. Chunks run on all local
     devices (`jax.config.update("jax_num_cpu_devices", n)` before anything else makes n of a CPU's cores).

@@ -83,6 +83,8 @@ class PartReport(NamedTuple):
 def merge(path: str | Path) -> "xarray.Dataset":
     """Make one ensemble of the parts in a store: checks that all chunks are there, reduces tallies, marks it complete.
 
+        runs = jm.ensembles.merge("runs.zarr")
+
     A store that is complete is checked and opened, as by `open_store`, so a repetition does no harm.
 
     **Arguments:** `path`, the store's folder or URL.
@@ -112,6 +114,8 @@ def merge(path: str | Path) -> "xarray.Dataset":
 
 def open_store(path: str | Path) -> "xarray.Dataset":
     """Open a complete store after every chunk of it has been compared with its checksum.
+
+        runs = jm.ensembles.open_store("runs.zarr")
 
     `xarray.open_zarr` compares chunks when they are read, and takes one that is missing for NaN.
 

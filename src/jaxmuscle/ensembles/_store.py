@@ -99,6 +99,8 @@ def writing(place: AbstractPlace) -> Iterator[None]:
 def attributes_of(path: str | Path) -> dict[str, Any] | None:
     """Attributes of the store at `path`, a folder or a URL; None if nothing is there.
 
+        jm.ensembles.attributes_of("runs.zarr")["complete"]
+
     **Raises:** `StoreError` if something else is there, or if the URL cannot be used.
     """
     place = place_of(path)

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxmuscle import plot
+from jaxmuscle._common.cards import Printed, Result
 from jaxmuscle._common.text import folded, listed, squared
 from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.spectra._mean import SpectrumEstimate
@@ -28,7 +29,7 @@ SPECTRUM = {"power": "power", "stderr": "power_stderr", "plain_power": "plain_po
             "expected": "power_expected"}  # fmt: skip
 
 
-class EnsembleSummary(eqx.Module):
+class EnsembleSummary(Printed, Result, eqx.Module):
     """An ensemble reduced to its moments; of a sweep all arrays have a leading axis `point`.
 
     `mean` and `variance` of the output at every `time` [s] over the seeds that stayed finite, `quantile` at `levels`;

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxmuscle._common.arrays import as_arrays, as_numbers, checked
-from jaxmuscle.model._parameters import PARAMETERS
+from jaxmuscle.model._parameters import PARAMETERS, proper_values
 from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.simulation._trajectory import Trajectory
 
@@ -68,7 +68,7 @@ class Sweep(eqx.Module):
 
         **Raises:** `ValueError` for an unknown name, a value outside its bounds, columns of different lengths, no point.
         """
-        columns = {name: np.asarray(column, dtype=float).ravel() for name, column in values.items()}
+        columns = {name: np.asarray(column, dtype=float).ravel() for name, column in proper_values(values).items()}
         sizes = {name: column.size for name, column in columns.items()}
         if len(set(sizes.values())) != 1 or 0 in sizes.values():
             raise ValueError(f"a design needs columns of one length of at least 1, not {sizes}")

@@ -24,6 +24,9 @@ _SHOWN = ("name", "bins", "frequency", "proportional_power", "sigma", "segments"
 def page(task: AbstractTask | None = None, target: Target | None = None) -> str:
     """The explorer as the text of one HTML file, which needs neither server nor network.
 
+        text = jm.explorer.page(jm.Isometric(k_w=4e5))
+        Path("explorer.html").write_text(text, encoding="utf-8")
+
     It computes the expected spectrum of a task in JavaScript, as `expected_spectrum` does, while sliders move.
 
     **Arguments:** `task` that it begins with (default: `Isometric()`); `target` that is drawn over its spectrum.

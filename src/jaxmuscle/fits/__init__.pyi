@@ -5,6 +5,8 @@ from ._cohort import fit_cohort as fit_cohort
 from ._differences import Difference as Difference
 from ._fit import fit as fit
 from ._joint import fit_joint as fit_joint
+from ._own_problem import Problem as Problem
+from ._own_problem import problem as problem
 from ._part import Estimate as Estimate
 from ._part import FittedPart as FittedPart
 from ._result import FitResult as FitResult

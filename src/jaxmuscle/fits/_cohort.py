@@ -9,9 +9,11 @@ import jax
 import numpy as np
 
 from jaxmuscle import plot
+from jaxmuscle._common.cards import Card, Result, in_columns
 from jaxmuscle._common.environment import versions
 from jaxmuscle._common.progress import told
 from jaxmuscle._common.tables import frame
+from jaxmuscle._common.text import folded
 from jaxmuscle._common.types import Key
 from jaxmuscle.data._target import Target
 from jaxmuscle.model._noise import AbstractNoise
@@ -38,7 +40,7 @@ COLUMNS = ("target", "group", "quantity", "value", "stderr", "unit", "determined
            "adequate", "adequacy_p", "success")  # fmt: skip
 
 
-class CohortResult(eqx.Module):
+class CohortResult(Result, eqx.Module):
     """`results` by target name; `groups`, the group of each (empty without); `failed`, why others were not fitted."""
 
     results: dict[str, FitResult]
@@ -57,6 +59,13 @@ class CohortResult(eqx.Module):
         bad = [name for name, adequate in judged.items() if not adequate]
         said = f"the model describes {len(judged) - len(bad)} of {len(judged)} targets"
         return said + (f"; not {', '.join(bad)}: their errors are widened" if bad else "")
+
+    def _card(self) -> Card:
+        columns = ("target", "group", "in words")
+        rows = [(name, self.groups.get(name, ""), result.verdict) for name, result in self.results.items()]
+        rows += [(name, self.groups.get(name, ""), f"not fitted: {why}") for name, why in self.failed.items()]
+        heading = f"{len(rows)} targets: {self.verdict}"
+        return Card("\n".join([folded([heading]), *in_columns(columns, rows)]), heading, columns, tuple(rows))
 
     def table(self) -> list[dict[str, Any]]:
         """Tidy rows, one per target and quantity (free parameters, then derived ones), with the keys of `COLUMNS`."""
@@ -159,6 +168,9 @@ def fit_cohort(
     progress: bool | Callable[[str, float], None] = False,
 ) -> CohortResult:
     """Fit many targets, in linear response, all starts of all of them in one batch.
+
+        targets = [jm.load_target(name) for name in ("vastus-lateralis-26mvc", "fdi-abduction-45mvc")]
+        jm.fit_cohort(targets).to_dataframe()
 
     As `fit` with `method="linear"` for each, without its last steps: no nonlinear correction (0.2 % of a bin), no check
     on simulated seeds, no profile over the harmonic's frequency; fit a target alone for those. Targets that can share a

@@ -12,7 +12,7 @@ from jaxmuscle.data._target import Target
 from jaxmuscle.model._noise import AbstractNoise
 from jaxmuscle.model._noises import with_noise
 from jaxmuscle.model._rungs import QUIET, RUNGS, is_base
-from jaxmuscle.model._tasks import AbstractTask, require_task
+from jaxmuscle.model._task import AbstractTask, require_task
 from jaxmuscle.model._white_noise import BandLimitedNoise
 from jaxmuscle.objective._arguments import DT, FitOptions, at_mean, planned
 
@@ -43,9 +43,14 @@ def fit(
     check_seeds: int | None = None,
     rungs: int | None = None,
     progress: bool | Callable[[str, float], None] = False,
+    optimiser: Any = None,
     answer: Callable[[FitResult], None] | None = None,
 ) -> FitResult:
     """Find the parameters whose expected spectrum is the target's: Levenberg-Marquardt from many starts.
+
+        target = jm.load_target("vastus-lateralis-26mvc")
+        result = jm.fit(jm.task_for(target), target)
+        print(result)
 
     Minimises `½ Σ r_k² + ½ Σ θ_j²`, r the residuals in standard deviations of the target (log residual:
     `(z_k - z̄) / sd_k`, `z_k = ln(target_k / fitted_k) - bias_k`), θ the free parameters' distance from the task's own
@@ -69,8 +74,10 @@ def fit(
     newtons: the task is then carried to it (`at_force`) and P_w is free (False: not used); `max_steps` for each descent;
     `check_seeds` (64, or 200 then; 0: not simulated); `dt` [s], noise grid of a Monte Carlo fit; `progress`, True or a
     function of (text, share); `rungs`, how many richer models may be tried where the base model does not describe the data
-    (`on_rung`; 3, or 0 where `noise` or `free` is given); `answer`, a function that gets the result as soon as the search
-    ends, before simulated check, profile and p-value.
+    (`on_rung`; 3, or 0 where `noise` or `free` is given); `optimiser`, what makes the steps instead of
+    `optimistix.LevenbergMarquardt`: another of optimistix's Gauss-Newton solvers, `optimistix.Dogleg(1e-9, 1e-9)` say
+    (for others there is `problem`); `answer`, a function that gets the result as soon as the search ends, before
+    simulated check, profile and p-value.
 
     **Returns:** a `FitResult`; a fit that fails is one, too, and says why.
 
@@ -85,6 +92,7 @@ def fit(
             free=free, fix=fix, method=method, residual=residual, starts=starts, seeds=seeds, check_seeds=check_seeds,
             key=key, bounds=bounds, priors=priors, coefficient_of_variation=coefficient_of_variation,
             mean_force=mean_force, max_steps=max_steps, dt=dt, progress=tell, rungs=rungs,
+            optimiser=optimiser,
         )  # fmt: skip
         task = with_noise(task, noise, fix)
         if recordings:

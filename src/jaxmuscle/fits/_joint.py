@@ -12,6 +12,7 @@ from jaxmuscle._common.types import Key
 from jaxmuscle.data._target import Target
 from jaxmuscle.model._noise import AbstractNoise
 from jaxmuscle.model._noises import with_noise
+from jaxmuscle.model._parameters import proper, proper_values, unknown_parameter
 from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.objective._arguments import (
     FitOptions,
@@ -59,6 +60,9 @@ def fit_joint(
 ) -> FitResult:
     """Fit several spectra of the same person with shared parameters: two force levels, or force and displacement.
 
+        together = jm.fit_joint({"low": low, "high": high}, separate=("noise_K_w",))
+        together["k_w"]
+
     Minimises `½ Σ_targets Σ_k r_k² + ½ Σ_j θ_j²`, r as in `fit`, in linear response, from many starts; then with the
     nonlinear model's correction to every target's spectrum. A parameter of one name is the same number in all tasks that
     have it; one that only one task has belongs to that. The inputs (`P_w`, `F_ext`, `x_z`) are each task's own.
@@ -88,7 +92,7 @@ def fit_joint(
         for name in named:
             if name not in loaded:
                 raise ValueError(f"{argument}: no target is called {name!r}: {choices(name, loaded)}")
-    models = _models(loaded, tasks or {}, noise, dict(fix or {}))
+    models = _models(loaded, tasks or {}, noise, proper_values(fix))
     carried: tuple[str, ...] = ()
     if mean_force is None and not tasks and "P_w" not in map(base_of, fix or ()):
         models, mean_force, factor = _at_means(models, loaded)
@@ -111,7 +115,7 @@ def planned_jointly(
 
     `carried`: the targets whose P_w is free, too, since it follows from their mean force.
     """
-    separate, proportional = tuple(separate), tuple(proportional)
+    separate, proportional = tuple(map(proper, separate)), tuple(map(proper, proportional))
     bounds, priors, means = dict(options.bounds or {}), dict(options.priors or {}), dict(mean_force or {})
     check_shared(tasks, separate, proportional)
     local = _local_free(
@@ -206,7 +210,8 @@ def _at_means(tasks: Tasks, targets: dict[str, Target]) -> tuple[Tasks, dict[str
 def _check_known(argument: str, given: Mapping[str, Any], known: list[str]) -> None:
     for name in given:
         if name not in known and name not in map(base_of, known):
-            raise ValueError(f"{argument}: unknown or not free parameter {name!r}: {choices(name, known)}")
+            told = unknown_parameter(name, known, what="unknown or not free parameter")
+            raise ValueError(f"{argument}: {told}")
 
 
 def _own(given: Mapping[str, Any], names: Mapping[str, str]) -> dict[str, Any]:

@@ -7,7 +7,7 @@ import numpy as np
 
 from jaxmuscle._common.types import Key
 from jaxmuscle.data._target import Target
-from jaxmuscle.model._parameters import PARAMETERS
+from jaxmuscle.model._parameters import PARAMETERS, proper_names, proper_values
 from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.objective._arguments import FitOptions, base_of, planned, target_of
 from jaxmuscle.objective._problem import FitProblem
@@ -37,17 +37,18 @@ def reopened(
     if target is not None and len(result.parts) > 1:
         raise ValueError(f"target: this fit has several ({', '.join(result.parts)}), so none of them can be exchanged")
     settings = result.settings
-    names = tuple(settings["free"] if free is None else free)
+    names = proper_names(settings["free"] if free is None else free) or ()
+    priors, bounds = proper_values(priors), proper_values(bounds)
     fitted = settings["prior_centre"]
     centres = {n: fitted[n] if n in fitted else _default(result, n) for n in names}
     sds = {
         n: settings["prior_sd"].get(n, PARAMETERS[base_of(n)].prior_sd if base_of(n) in PARAMETERS else 1.0) for n in names
     }
-    for name, given in (priors or {}).items():
+    for name, given in priors.items():
         if name not in names:
             raise ValueError(f"priors: {name} is not free; free are {', '.join(names)}")
         centres[name], sds[name] = given if isinstance(given, tuple) else (centres[name], given)
-    limits = {n: _open(*b) for n, b in settings["bounds"].items() if n in names} | dict(bounds or {})
+    limits = {n: _open(*b) for n, b in settings["bounds"].items() if n in names} | bounds
     for name, (low, high) in limits.items():
         if name in centres and not low < centres[name] < high:
             raise ValueError(f"the prior of {name} is centred at {centres[name]:g}, outside its bounds ({low:g}, {high:g}): "

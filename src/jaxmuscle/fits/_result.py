@@ -12,6 +12,7 @@ from jaxtyping import Float
 
 from jaxmuscle import plot
 from jaxmuscle._common.arrays import from_nulls, with_nulls
+from jaxmuscle._common.cards import Card, Result
 from jaxmuscle._common.documents import checked, contradiction, converted, parsed
 from jaxmuscle._common.errors import ResultError
 from jaxmuscle._common.files import expanded, write_json
@@ -27,7 +28,7 @@ from ._adequacy import Adequacy
 from ._fit_file import FORMAT, FORMATS, FitTable, PartTable, disagreement
 from ._ladder import Rung
 from ._part import Estimate, FittedPart, Start, estimates_to_table, part_to_table, read_estimates, read_part
-from ._result_text import per_newton, text_of
+from ._result_text import card_of, per_newton
 
 if TYPE_CHECKING:
     import pandas
@@ -43,7 +44,7 @@ ALIASES = {
 PROFILE = ("frequency_hz", "chi2_rise")
 
 
-class FitResult(eqx.Module):
+class FitResult(Result, eqx.Module):
     """What a fit found, of one target or of several.
 
     `success` and `message`, whether the search converged; `adequacy`, whether the model describes the data (an
@@ -224,8 +225,8 @@ class FitResult(eqx.Module):
         """A table of quantities as it is shown: per newton of mean force where the scale of force is unknown."""
         return per_newton(table, self.derived["mean"].value) if self.per_newton else dict(table)
 
-    def __str__(self) -> str:
-        return text_of(self)
+    def _card(self) -> Card:
+        return card_of(self)
 
 
 def to_table(result: FitResult) -> dict[str, Any]:
@@ -263,6 +264,9 @@ def to_table(result: FitResult) -> dict[str, Any]:
 
 def load_result(path: str | Path) -> FitResult:
     """Read the `fit.json` at `path`, of one target or several. Raises `ResultError` naming the file and what is wrong.
+
+        result.save("fit.json")
+        result = jm.load_result("fit.json")
 
     Nothing gets a default: a key that is missing, unknown, of a wrong type, or that contradicts another is an error.
     """

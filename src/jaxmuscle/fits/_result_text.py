@@ -3,9 +3,11 @@
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
+from jaxmuscle._common.cards import Card
 from jaxmuscle._common.text import folded
+from jaxmuscle.model._parameters import PARAMETERS
 from jaxmuscle.objective._arguments import base_of
-from jaxmuscle.objective._consequences import BANDS
+from jaxmuscle.objective._consequences import BANDS, MEANINGS
 
 from ._ladder import HEAD
 from ._part import Estimate, FittedPart
@@ -16,10 +18,31 @@ if TYPE_CHECKING:
 RELATIVE = {"N": "1", "N/m": "1/m", "N s/m": "s/m", "N/m^3": "1/m^3", "N s^3/m^3": "s^3/m^3", "kg": "kg/N"}
 
 
+COLUMNS = ("name", "value", "95 % interval", "unit", "in the fit", "what it is")
+
+
+def card_of(result: "FitResult") -> Card:
+    """The result as text, and as a table of all its numbers: those that the data determine first, then what was fixed."""
+    rows = []
+    for name, p in result.as_shown(result.found | result.parameters).items():
+        state = ("determined" if p.stderr is not None else "not determined") if p.free else "fixed"
+        row, unit = PARAMETERS.get(base_of(name)), "" if p.unit == "1" else p.unit
+        words = MEANINGS.get(base_of(name), "") if row is None else row.meaning.partition(";")[0]
+        rows.append((name, p.in_words(), p.interval_in_words(), unit, state, words))
+    order = ("determined", "not determined", "fixed")
+    rows.sort(key=lambda row: order.index(row[4]))
+    remarks = (f"{_head(result)}: {result.message}", *result.advice, *result.notices, *result.remarks)
+    return Card(text_of(result), _sentence(result.verdict), COLUMNS, tuple(rows), remarks)
+
+
+def _sentence(words: str) -> str:
+    return words[0].upper() + words[1:]
+
+
 def text_of(result: "FitResult") -> str:
     """The verdict, what the data determine and what they do not, and what to know about it."""
     single = len(result.parts) == 1
-    lines = [result.verdict[0].upper() + result.verdict[1:], f"  {_head(result)}"]
+    lines = [_sentence(result.verdict), f"  {_head(result)}"]
     lines += [f"  {result.message}"] * result.success
     lines += [f"  {HEAD}", *(f"  {rung}" for rung in result.ladder)] if len(result.ladder) > 1 else []
     if not single:

@@ -15,6 +15,7 @@ import numpy as np
 
 from jaxmuscle import plot
 from jaxmuscle._common.arrays import with_nulls
+from jaxmuscle._common.cards import Printed, Result
 from jaxmuscle._common.environment import versions
 from jaxmuscle._common.figures import remove_figures, write_figure
 from jaxmuscle._common.files import remove, write_json, write_text
@@ -44,7 +45,7 @@ FORMAT = 1
 COMPARED = tuple(name for name in DERIVED if name != "high_frequency_floor")  # which is the band from 8 to 12 Hz again
 
 
-class StudyResult(eqx.Module):
+class StudyResult(Printed, Result, eqx.Module):
     """What a study found.
 
     `cohort`, the fits, one of each person in each condition; `cells`, whose recordings they stand on; `aic`, the summed AIC
@@ -236,19 +237,14 @@ def _fit_to_table(cell: Cell, cohort: CohortResult) -> dict[str, Any]:
                   "estimates": estimates_to_table(result.found)}  # fmt: skip
 
 
-def run_study(
-    study: "str | os.PathLike[str] | Iterable[Mapping[str, Any]]",
-    *,
-    rung: int | str | None = None,
-    noise: str | None = None,
-    quantities: Iterable[str] | None = None,
-    alpha: float | None = None,
-    correction: str | None = None,
-    starts: int = 32,
-    key: Key = 0,
-    progress: bool | Tell = False,
-    **reading: Any,
-) -> StudyResult:
+def run_study(study: "str | os.PathLike[str] | Iterable[Mapping[str, Any]]", *, rung: int | str | None = None,
+              noise: str | None = None, quantities: Iterable[str] | None = None, alpha: float | None = None,
+              correction: str | None = None, starts: int = 32, key: Key = 0, progress: bool | Tell = False,
+              window: Sequence[float | int] | str | None = None, column: str | int | None = None,
+              rate: float | int | None = None, units: str | None = None, axis: str | None = None,
+              reference: str | int | None = None, time: str | int | None = None, skip_rows: int | None = None,
+              max_gap: float | int | None = None, spectrum: str | None = None,
+              mvc: float | int | None = None) -> StudyResult:  # fmt: skip
     """Fit the recordings of a whole study with one model and compare groups and conditions.
 
         found = jm.run_study("study.csv")
@@ -262,7 +258,7 @@ def run_study(
 
     - `study`: one of three things. A table (.csv, .tsv, .txt) with a line for each recording. It has the columns file
       (relative to the table) and person; it may have group, condition, trial, window_start, window_stop and those of
-      `reading` but window. Or a .toml with `table = "study.csv"` or `[[recordings]]` of the same fields, and any of the
+      the last item but window. Or a .toml with `table = "study.csv"` or `[[recordings]]` of the same fields, and any of the
       options below but `starts`, `key` and `progress`. Or rows, as dictionaries.
     - `rung`: the model of all people (`on_rung`), 0 to 3; by default 2, with activation and tremor. "auto" fits several and
       takes the one whose AIC, summed over all targets, is lowest; that is three or four times as long.
@@ -273,8 +269,8 @@ def run_study(
     - `correction` for many comparisons: "holm" (default), "fdr" or "none". All comparisons of one kind (groups, conditions,
       interaction) are corrected together.
     - `progress`: True or a function of (text, share).
-    - `reading`: how files are read where a row does not say it. `window` (start, stop) [s] or "all" (by default the steady
-      part); `column`, `rate`, `units`, `axis`, `reference`, `time`, `skip_rows`, `max_gap` as in `load_recording`;
+    - How files are read where a row does not say it: `window` (start, stop) [s] or "all" (by default the steady part);
+      `column`, `rate`, `units`, `axis`, `reference`, `time`, `skip_rows`, `max_gap` as in `load_recording`;
       `spectrum`, a name of settings, the same for all; `mvc` as in `Trials.target`.
 
     An option that is given here replaces that of the .toml; what a row says about its own file stays.
@@ -284,9 +280,8 @@ def run_study(
     **Raises:** `ValueError` naming file, line and column, or the argument, and the remedy.
     """
     check_key(key)
-    for name in reading:
-        if name not in READING:
-            raise ValueError(f"unknown argument {name!r}; {choices(name, READING)}")
+    reading = {"window": window, "column": column, "rate": rate, "units": units, "axis": axis, "reference": reference,
+               "time": time, "skip_rows": skip_rows, "max_gap": max_gap, "spectrum": spectrum, "mvc": mvc}  # fmt: skip
     table = read_study(study)
     given = {"rung": rung, "noise": noise, "quantities": quantities, "alpha": alpha, "correction": correction} | reading
     options = USUAL | table.options | {name: value for name, value in given.items() if value is not None}

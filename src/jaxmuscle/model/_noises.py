@@ -1,28 +1,18 @@
-"""All noises by name, and a task with another noise."""
+"""A task with another noise."""
 
 from collections.abc import Mapping
-from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from jaxmuscle._common.text import choices
-
 from ._activation import ACTIVE
 from ._noise import AbstractNoise, NoiseSum
+from ._noise_names import NOISES as NOISES
+from ._noise_names import made_by_name
 from ._parameters import CHANNELS
-from ._pink_noise import PinkNoise
 from ._resonant_noise import ResonantNoise
 from ._tasks import AbstractTask
-from ._white_noise import BandLimitedNoise, OrnsteinUhlenbeckNoise, WhiteNoise
-
-NOISES: dict[str, type[AbstractNoise]] = {
-    "white": WhiteNoise,
-    "band-limited": BandLimitedNoise,
-    "ornstein-uhlenbeck": OrnsteinUhlenbeckNoise,
-    "pink": PinkNoise,
-}
 
 
 def with_noise(
@@ -33,10 +23,7 @@ def with_noise(
         return task
     if isinstance(noise, AbstractNoise):
         return task.with_parts(noise=noise)
-    if not isinstance(noise, str) or noise not in NOISES:
-        raise ValueError(f"noise = {noise!r}: {choices(noise, NOISES)}")
-    kind: Any = NOISES[noise]
-    made = kind().per_channel()
+    made = made_by_name(noise)
     values = {f"noise_{c}": float(made.amplitude[i]) for i, c in enumerate(CHANNELS)} | dict(fix or {})
     fixed = [values[f"noise_{c}"] for c in CHANNELS]
     made = eqx.tree_at(lambda n: n.amplitude, made, np.array(fixed))

@@ -3,6 +3,7 @@
 import collections
 import dataclasses
 import math
+from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -142,8 +143,9 @@ def paths_of(task: Any) -> dict[str, tuple]:
         paths["activation_time"] = ("activation", "time")
     for field in ("amplitude", "frequency", "phase"):
         paths[f"harmonic_{field}"] = ("harmonic", field)
+    fields = {field.name for field in dataclasses.fields(task)}
     for field in ("P_w", "F_ext", "x_z"):
-        if hasattr(task, field):
+        if field in fields:
             paths[field] = (field, "level") if isinstance(getattr(task, field), eqx.Module) else (field,)
     return paths
 
@@ -178,10 +180,47 @@ def amplitude_names(task: Any) -> tuple[str, ...]:
 
 
 OFF = ("activation_time", "noise_P_w")
+# What a result calls by the name that people use.
+SYNONYMS = {
+    "tremor_frequency": "resonance_frequency",
+    "tremor_width": "resonance_width",
+    "contraction_time": "activation_time",
+}
+BASE = {"K_w0": "k_w x_ref_w^2", "K_z0": "k_z x_ref_z^2", "C_w0": "c_w v_ref_w^2", "C_z0": "c_z v_ref_z^2"}
+
+
+def proper(name: str) -> str:
+    """The name of a parameter in the parameter table: that of "tremor_width" is "resonance_width"; of one target's, too."""
+    own, at, target = name.partition("@")
+    return SYNONYMS.get(own, own) + at + target
+
+
+def usually_free(task: Any, usual: Iterable[str] = USUALLY_FREE) -> tuple[str, ...]:
+    """What a fit lets free by default: of the `usual` parameters those that are not 0."""
+    values = {name: value_of(task, path) for name, path in paths_of(task).items()}
+    # Nothing shows the frequency of what has no amplitude.
+    still = [n.removesuffix("amplitude") for n, v in values.items() if n.endswith("_amplitude") and not _positive(v)]
+    unseen = tuple(f"{of}{what}" for of in still for what in ("frequency", "width"))
+    return tuple(n for n in usual if n in values and _positive(values[n]) and not n.startswith(unseen))
+
+
+def _positive(value: Any) -> bool:
+    return not is_concrete(value) or not _is_scalar(value) or bool(np.all(np.asarray(value) > 0))
+
+
+def value_of(task: Any, path: tuple) -> Any:
+    """The value at a path, without a computation of JAX; of an array of amplitudes that cannot be looked at the whole."""
+    if not isinstance(path[-1], int):
+        return _follow(task, path)
+    node = _follow(task, path[:-1])
+    return np.asarray(node)[..., path[-1]] if _is_scalar(node) and is_concrete(node) else node
 
 
 def get_parameter(task: Any, name: str) -> Any:
-    """Value of a parameter by name; 0 of one that is switched off."""
+    """Value of a parameter by name, or of a base coefficient (`BASE`); 0 of a parameter that is switched off."""
+    name = proper(name)
+    if name in BASE:
+        return task.muscle.base()[tuple(BASE).index(name)]
     if name in OFF and name not in paths_of(task):
         return 0.0
     return _follow(task, _path(task, name))
@@ -189,12 +228,33 @@ def get_parameter(task: Any, name: str) -> Any:
 
 def set_parameters(task: Any, values: dict[str, Any]) -> Any:
     """A copy of the task with the named values, validated as a constructor would; what is off is switched on."""
+    return checked(assigned(task, values))
+
+
+def assigned(task: Any, values: dict[str, Any]) -> Any:
+    """The same without the task's own checks: of a task that is being made."""
+    values = proper_values(values)
     time = values.get("activation_time")
     if time is not None and is_concrete(time) and float(time) == 0:
         task, values = task.with_parts(activation=None), {n: v for n, v in values.items() if n != "activation_time"}
-    for name in OFF:
-        if name in values and name not in paths_of(task):
-            task = task.with_input(name)
+    off = [name for name in OFF if name in values and name not in paths_of(task)]
+    task = _with_values(task, {name: value for name, value in values.items() if name not in off})
+    for name in off:
+        task = task.with_input(name)
+    return _with_values(task, {name: values[name] for name in off})
+
+
+def proper_values(values: Mapping[str, Any] | None) -> dict[str, Any]:
+    """What is given by names, by those in the parameter table. Raises `ValueError` for one parameter under two names."""
+    values = values or {}
+    named = {proper(name): value for name, value in values.items()}
+    if len(named) < len(values):
+        twice = sorted(name for name in values if proper(name) != name and proper(name) in values)
+        raise ValueError(f"{twice[0]} and {proper(twice[0])} are the same parameter: give one of them")
+    return named
+
+
+def _with_values(task: Any, values: dict[str, Any]) -> Any:
     for name, value in values.items():
         row = PARAMETERS.get(name)
         if isinstance(value, bool | str | None):
@@ -212,7 +272,7 @@ def set_parameters(task: Any, values: dict[str, Any]) -> Any:
             parts[index] = value
             value = _stack(parts)
         task = eqx.tree_at(lambda t, f=fields: _follow(t, f), task, value, is_leaf=lambda x: x is None)
-    return checked(task)
+    return task
 
 
 def _stack(parts: list[Any]) -> Any:
@@ -237,5 +297,18 @@ def _path(task: Any, name: str) -> tuple:
     paths = paths_of(task)
     if name not in paths:
         known = dict.fromkeys([*paths, *(n for n in OFF if n != name)])
-        raise ValueError(f"unknown parameter {name!r} of {type(task).__name__}: {choices(name, known)}")
+        raise ValueError(unknown_parameter(name, known, of=f" of {type(task).__name__}"))
     return paths[name]
+
+
+def proper_names(names: Iterable[str] | None) -> tuple[str, ...] | None:
+    """The names in the parameter table of the given ones; None of None."""
+    return None if names is None else tuple(map(proper, names))
+
+
+def unknown_parameter(name: str, known: Iterable[str], *, of: str = "", what: str = "unknown parameter") -> str:
+    """The message about a name that is not that of a parameter that can be set or fitted."""
+    if name in BASE:
+        return (f"{name} is not a parameter but follows from some ({BASE[name]} in the paper's muscle): it can be read, not "
+                f"set or fitted. Give {name[0].lower()}{name[1:3]} instead")  # fmt: skip
+    return f"{what} {name!r}{of}: {choices(name, known)}"

@@ -22,6 +22,9 @@ def rung_name(rung: int) -> str:
 def on_rung(task: AbstractTask, rung: int) -> AbstractTask:
     """The task with what measured force asks for beyond the base model, by `rung`:
 
+        task = jm.on_rung(jm.Isometric(), 2)  # with activation and tremor
+        task["tremor_frequency"]
+
     0, as it is; 1, with an `Activation` between the nervous drive and the active tissue; 2, with a `ResonantNoise` on the
     drive as well, the tremor, instead of the harmonic; 3, with a second resonance. Each begins at the default of the
     parameter table.

@@ -18,7 +18,14 @@ from jaxmuscle.data._target import Target
 from jaxmuscle.model._muscle import Muscle
 from jaxmuscle.model._noise import AbstractNoise
 from jaxmuscle.model._noises import with_noise
-from jaxmuscle.model._parameters import PARAMETERS, USUALLY_FREE
+from jaxmuscle.model._parameters import (
+    PARAMETERS,
+    USUALLY_FREE,
+    proper_names,
+    proper_values,
+    unknown_parameter,
+    usually_free,
+)
 from jaxmuscle.model._tasks import AbstractTask, Isometric, Observed, PrescribedForce, PrescribedLength
 from jaxmuscle.response._expected import check_line
 from jaxmuscle.response._linearised import has_response
@@ -27,6 +34,7 @@ from jaxmuscle.spectra._settings import WINDOW, require, samples_in
 
 from ._coordinates import Coordinates
 from ._given import check_data, check_named
+from ._least_squares import check_optimiser
 from ._problem import FitProblem, Part, target_variation
 
 RESIDUALS = ("log", "linear", "cumulative")
@@ -45,6 +53,9 @@ def task_for(
 ) -> AbstractTask:
     """The task that a target measured: `Isometric` for force and torque, `PrescribedLength` for a dynamic stiffness,
     `PrescribedForce` for displacement and acceleration (with `observe="acceleration"`).
+
+        target = jm.load_target("vastus-lateralis-26mvc")
+        task = jm.task_for(target, noise="pink")
 
     Of another `kind` if one is given. It has the target's spectrum settings and default parameters; `noise` is a name of
     `NOISES` or a noise object.
@@ -82,11 +93,8 @@ def free_names(task: AbstractTask, free: Iterable[str] | None, fix: Mapping[str,
     if target.stiffness is not None:
         bins += 2 * len(target.stiffness.known.frequency)
     if free is None:
-        # Nothing shows the frequency of what has no amplitude.
-        still = [n.removesuffix("amplitude") for n in known if n.endswith("_amplitude") and not float(task[n]) > 0]
         usual = USUALLY_FREE if target.stiffness is None else (*USUALLY_FREE, MOVED_MASS)
-        names = [n for n in usual if n in known and n not in fix and float(task[n]) > 0
-                 and not n.startswith(tuple(f"{of}{what}" for of in still for what in ("frequency", "width")))]  # fmt: skip
+        names = [name for name in usually_free(task, usual) if name not in fix]
     else:
         names = list(dict.fromkeys(free))
         _check_names("free", names, known)
@@ -104,7 +112,7 @@ def _check_names(argument: str, names: Iterable[str], known: Iterable[str]) -> N
     known = list(known)
     for name in names:
         if name not in known:
-            raise ValueError(f"{argument}: unknown or not free parameter {name!r}: {choices(name, known)}")
+            raise ValueError(f"{argument}: {unknown_parameter(name, known, what='unknown or not free parameter')}")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -133,8 +141,16 @@ class FitOptions:
     dt: float = DT
     rungs: int | None = None
     progress: Tell = nothing
+    optimiser: Any = None
 
     def __post_init__(self) -> None:
+        check_named(self.free, self.fix, self.bounds, self.priors)
+        named = {"free": proper_names(self.free)}
+        named |= {name: proper_values(getattr(self, name)) for name in ("fix", "bounds", "priors")}
+        for name, value in named.items():
+            object.__setattr__(self, name, value)
+        if self.optimiser is not None:
+            check_optimiser(self.optimiser)
         for name, known in (("method", METHODS), ("residual", RESIDUALS)):
             if getattr(self, name) not in known:
                 raise ValueError(f"{name} = {getattr(self, name)!r}: {choices(getattr(self, name), known)}")
@@ -143,7 +159,6 @@ class FitOptions:
                 count(name, getattr(self, name), least, MOST)
         check_key(self.key)
         positive("dt", self.dt)
-        check_named(self.free, self.fix, self.bounds, self.priors)
         check_data(self.coefficient_of_variation, self.mean_force)
 
     @property
@@ -214,15 +229,17 @@ def planned(task: AbstractTask, target: Target, options: FitOptions) -> Plan:
     coordinates = Coordinates.of({n: float(task[n]) for n in names}, bounds, {n: sd or 1.0 for n, sd in sds.items()})
     variation = target_variation(target) if options.coefficient_of_variation else None
     part = Part("", task, target, coordinates, tuple(range(len(names))), variation, mean)
-    key = key_of(options.key)
-    problem = FitProblem((part,), coordinates, np.array([0.0 if sds[n] is None else 1.0 for n in names]), options.residual,
-                         options.method, options.dt, key, counts["seeds"], control, options.progress)  # fmt: skip
+    key, prior = key_of(options.key), np.array([0.0 if sds[n] is None else 1.0 for n in names])
+    problem = FitProblem((part,), coordinates, prior, options.residual, options.method, options.dt, key, counts["seeds"],
+                         control, options.progress, options.optimiser)  # fmt: skip
     settings = {
         **settings_of(problem, bounds), **counts, "max_steps": options.max_steps, "dt": options.dt,
         "coefficient_of_variation": variation is not None,
         "mean_force": None if mean is None else list(mean), "carried": options.carried,
         "spectrum": target.settings.to_dict(), "steps_per_sample": problem.steps_per_sample,
     }  # fmt: skip
+    if options.optimiser is not None:
+        settings["optimiser"] = type(options.optimiser).__name__
     return Plan(problem, counts["starts"], options.max_steps, counts["check_seeds"], settings, options.seed)
 
 
@@ -290,7 +307,7 @@ def check_shared(tasks: Mapping[str, AbstractTask], separate: Iterable[str], pro
     known = dict.fromkeys(n for task in tasks.values() for n in task.parameter_names)
     for argument, names in (("separate", separate), ("proportional", proportional)):
         for name in sorted(names - set(known)):
-            raise ValueError(f"{argument}: no task has a parameter {name!r}: {choices(name, known)}")
+            raise ValueError(f"{argument}: {unknown_parameter(name, known)}")
     if both := sorted(separate & proportional):
         raise ValueError(f"{', '.join(both)} cannot be both separate and proportional")
     for (first, one), (target, other) in itertools.combinations(tasks.items(), 2):

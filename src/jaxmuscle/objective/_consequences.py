@@ -36,6 +36,26 @@ UNITS = {
 }
 
 
+MEANINGS = {
+    "corner_frequency": "where the slow response of the muscle falls off",
+    "half_power_frequency": "where muscle and activation together let half the power through",
+    "contraction_time": "contraction time of a twitch",
+    "tremor_frequency": "frequency of the tremor",
+    "tremor_width": "full width of the tremor at half power",
+    "tremor_share": "the tremor's share of the power",
+    "resonance_2_share": "the second resonance's share of the power",
+    "harmonic_share": "the harmonic's share of the power",
+    "high_frequency_floor": "mean power of the highest third of the bins",
+    "K_w0": "active stiffness at rest",
+    "K_z0": "passive stiffness at rest",
+    "C_w0": "active damping at rest",
+    "C_z0": "passive damping at rest",
+    "coefficient_of_variation": "standard deviation over mean of the output",
+    "mean": "mean of the output",
+    **{name: f"share of the power from {low:g} to {high:g} Hz" for name, (low, high) in BANDS.items()},
+}
+
+
 OF_SPECTRUM = {"harmonic_share", "harmonic_frequency", "high_frequency_floor", "tremor_frequency", "tremor_width",
                "tremor_share", "resonance_2_share", "coefficient_of_variation", "mean", *BANDS}  # fmt: skip
 

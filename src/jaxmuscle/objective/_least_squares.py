@@ -39,16 +39,29 @@ def _residuals(s: Float[Array, " free"], given: tuple[Any, Any, Expansion]) -> t
     return objective.residuals(theta, seen.near(theta), data), None
 
 
-def _solver() -> Any:
+def _solver(objective: Any) -> Any:
+    if objective.optimiser is not None:
+        return objective.optimiser
     import optimistix as optx  # only here, since a program that is loaded does without
 
     return optx.LevenbergMarquardt(rtol=1e-9, atol=1e-9)
 
 
+def check_optimiser(optimiser: Any) -> None:
+    """Raise a `ValueError` for what is not one of optimistix's solvers of the Gauss-Newton kind."""
+    import optimistix as optx
+
+    if not isinstance(optimiser, optx.AbstractGaussNewton):
+        given = optimiser.__name__ if isinstance(optimiser, type) else type(optimiser).__name__
+        raise ValueError(f"optimiser: this is {given}; give a least-squares solver of optimistix that makes Gauss-Newton "
+                         "steps, as optimistix.Dogleg(1e-9, 1e-9); for any other there is jaxmuscle.problem(task, "
+                         "target)")  # fmt: skip
+
+
 def _initial(objective, data, s, seen):
     given = (objective, data, seen)
     shape = jax.eval_shape(lambda s: _residuals(s, given)[0], s)
-    return _solver().init(_residuals, s, given, {}, shape, None, frozenset())
+    return _solver(objective).init(_residuals, s, given, {}, shape, None, frozenset())
 
 
 @kept
@@ -64,7 +77,7 @@ def _step(objective, data, s, state, seen):
     def one(data, s, state, seen):
         shapes, functions = eqx.partition(eqx.filter_eval_shape(_initial, objective, data, s, seen), _is_shape)
         state = eqx.combine(jax.tree.unflatten(jax.tree.structure(shapes), state), functions)
-        s, state, _ = _solver().step(_residuals, s, (objective, data, seen), {}, state, frozenset())
+        s, state, _ = _solver(objective).step(_residuals, s, (objective, data, seen), {}, state, frozenset())
         return s, _arrays(state), state.y_eval, 0.5 * (state.f_info.residual**2).sum(), state.num_accepted_steps
 
     return eqx.filter_vmap(one)(data, s, state, seen)

@@ -240,6 +240,9 @@ def _whittle(task, settings, power, window):
 def log_likelihood(task: AbstractTask, data: Target | Recording) -> Scalar:
     """Log likelihood of measured data under a task in linear response; differentiable in the task.
 
+        target = jm.load_target("vastus-lateralis-26mvc")
+        jm.log_likelihood(jm.task_for(target), target)
+
     A `Target` with segments: its Welch bins are correlated gamma variables about the expected spectrum (`log_density`),
     their unknown total integrated out; with its coefficient of variation as one more datum, Gaussian in the log with the
     standard deviation that it has under this task, if it states one; and with its dynamic stiffness, Gaussian in real and

@@ -132,7 +132,7 @@ class Part:
 class FitProblem:
     """What a fit is about, its arguments checked: one target, or several of one person with what they share.
 
-    `control`: whether all tasks have a linear response.
+    `control`: whether all tasks have a linear response; `optimiser`, which makes the steps (None: Levenberg-Marquardt).
     """
 
     parts: tuple[Part, ...]
@@ -145,6 +145,7 @@ class FitProblem:
     seeds: int
     control: bool
     tell: Callable[[str, float], None]
+    optimiser: Any = None
 
     @classmethod
     def shared(cls, problems: "Mapping[str, FitProblem]", names: Mapping[str, Mapping[str, str]]) -> "FitProblem":
@@ -232,7 +233,8 @@ class FitProblem:
 
     def _residuals(self, parts: Any) -> Residuals:
         free = as_arrays({"prior": self.prior, "moving": np.ones(len(self.prior))})
-        return Residuals(tuple(parts), self.coordinates, **free, columns=tuple(part.columns for part in self.parts))
+        return Residuals(tuple(parts), self.coordinates, **free, columns=tuple(part.columns for part in self.parts),
+                         optimiser=self.optimiser)  # fmt: skip
 
     def _paths(self, part: Part, seeds: int) -> MonteCarlo:
         task, settings, every = as_arrays(part.task), part.target.settings, self.steps_per_sample

@@ -1,5 +1,7 @@
 """The residuals of a fit: what each target and the prior contribute, of one target or of several."""
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -81,7 +83,7 @@ class Residuals(eqx.Module):
     """Everything that the residuals of a fit depend on besides the free coordinates.
 
     Of one target or of several: `columns` says of every part where its own coordinates stand among those of the fit. Moments
-    and data are tuples, one entry for each part.
+    and data are tuples, one entry for each part. `optimiser` makes the steps that lower them (None: Levenberg-Marquardt).
     """
 
     parts: tuple[PartResiduals, ...]
@@ -89,6 +91,7 @@ class Residuals(eqx.Module):
     prior: Float[Array | np.ndarray, " free"]
     moving: Float[Array | np.ndarray, " free"]
     columns: tuple[tuple[int, ...], ...] = eqx.field(static=True)
+    optimiser: Any = eqx.field(static=True, default=None)
 
     @property
     def linear(self) -> bool:

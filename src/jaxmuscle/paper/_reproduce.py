@@ -18,6 +18,8 @@ def reproduce(
 ) -> Reproduction:
     """Compute, draw and write the paper's figures and the table of its statements.
 
+        jm.reproduce("out/reproduce")
+
     Writes fig2, fig3, fig4a, fig4b, fig5, fig6a, fig6b, fig7, fig8 as .png and .pdf, claims.json and index.html.
 
     **Arguments:** `out`, a folder; `recordings`, three of your own (`Recording` or file) instead of the simulated ones of

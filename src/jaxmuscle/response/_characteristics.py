@@ -71,6 +71,8 @@ def static_characteristics(
 ) -> StaticCharacteristics:
     """K(x), C(v) and force against displacement of a task's muscle, from the methods of `AbstractMuscle` alone.
 
+        jm.static_characteristics(jm.Isometric()).plot()
+
         F_w(x) = active_force(x, 0),      F_z(x) = passive_force(0, 0, x, 0),      K_j(x) = (F_j(x) - F_j(0)) / x
         D_w(v) = active_force(0, v),      D_z(v) = passive_force(0, 0, 0, v),      C_j(v) = (D_j(v) - D_j(0)) / v
 

@@ -18,6 +18,8 @@ GUESS = 1e-3
 def equilibrium(task: AbstractTask, time: float = HOLD) -> Float[Array, " states"]:
     """State y of `task` with `vector_field(time, y, 0) = 0` [m, m/s], by Newton's method; differentiable (implicitly).
 
+        state = jm.response.equilibrium(jm.Isometric())
+
     Not finite where there is none: `operating_point` turns that into an error.
     """
     import optimistix as optx  # only here, since a program that is loaded does without

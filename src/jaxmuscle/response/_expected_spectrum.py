@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxmuscle._common.arrays import all_concrete, is_concrete
-from jaxmuscle.model._tasks import AbstractTask, require_task
+from jaxmuscle.model._task import AbstractTask, require_task
 from jaxmuscle.spectra._settings import WINDOW, SpectrumSettings
 from jaxmuscle.spectra._welch import Spectrum
 
@@ -17,6 +17,8 @@ def expected_spectrum(
     task: AbstractTask, settings: SpectrumSettings | None = None, window: tuple[float, float] = WINDOW
 ) -> Spectrum:
     """The expected Welch spectrum of a task's output, to first order in its perturbations: no Monte Carlo.
+
+        jm.expected_spectrum(jm.Isometric(k_w=4e5)).plot()
 
         E_k = Σ_l M_kl r(l Δ) + line_k,    r(τ) = c exp(𝒜 τ) P cᵀ,    𝒜 P + P 𝒜ᵀ + 𝒬 = 0
 

@@ -84,6 +84,8 @@ def _checked(task: AbstractTask) -> None:
 def dynamic_stiffness(task: AbstractTask, frequency: Frequencies) -> Complex[Array, " frequencies"]:
     """Force per lengthening of the muscle at each frequency, in linear response about the operating point.
 
+        stiffness = jm.response.dynamic_stiffness(jm.Isometric(), np.array([1.0, 10.0]))
+
         H(f) = -F_ext(f) / x_z(f) = -[C (s - A)⁻¹ (b₀ + s b₁) + d₀ + s d₁ + s² d₂],    s = 2πif
 
     with y' = A y + b₀ x_z + b₁ x_z', F_ext = C y + d₀ x_z + d₁ x_z' + d₂ x_z'', d₂ = -m_z. At low frequency it is the static
@@ -103,6 +105,8 @@ def dynamic_stiffness(task: AbstractTask, frequency: Frequencies) -> Complex[Arr
 
 def noise_density(task: AbstractTask, frequency: Frequencies) -> Float[Array, " frequencies"]:
     """One-sided power density [unit²/Hz] of the noise in a task's output, in linear response, before it is sampled.
+
+        density = jm.response.noise_density(jm.Isometric(), np.array([1.0, 10.0]))
 
         S(f) = 2 Σ_j |T_j(f)|² S_j(f)
 

@@ -86,6 +86,8 @@ def _sum(row: Array, values: Any) -> Array:
 def settled(task: AbstractTask, time: float = HOLD) -> AbstractTask:
     """The task with its inputs held at their values at `time` [s] from the start, and starting from equilibrium.
 
+        run = jm.simulate(jm.settled(jm.Isometric()), jax.random.key(0), duration=10.0)
+
     Its simulation has no rise and no transient of the mean: what the linear response describes.
     """
     traced = not all(is_concrete(leaf) for leaf in jax.tree.leaves(task))

@@ -27,6 +27,8 @@ FIT_FORMATS = (2, 3)  # of a fit.json; 2 may
 def load_preset(name_or_path: str | Path) -> AbstractTask:
     """The task of a bundled preset, of a preset file (.toml), or of a `fit.json`: `name_or_path`.
 
+        task = jm.load_preset("zagrodny-slifkin")
+
     A preset file may state the mean force of a person, above its `[task_table]`:
 
         mean = 40.5
@@ -113,6 +115,12 @@ def _carried(task: AbstractTask, mean: Any, unit: Any) -> AbstractTask:
 
 
 def save_preset(path: str | Path, task: AbstractTask, *, description: str = "", fit: dict[str, Any] | None = None) -> None:
-    """Write a task to `path` as a preset: TOML with a description, the fit that made it and the task table."""
+    """Write a task to `path` as a preset: TOML with a description, the fit that made it and the task table.
+
+        jm.save_preset("mine.toml", jm.Isometric(k_w=4e5))
+        task = jm.load_preset("mine.toml")
+
+    `load_preset` reads it back equal.
+    """
     table: dict[str, Any] = {"format": FORMAT, "description": description} | ({"fit": fit} if fit else {})
     write_text(path, tomli_w.dumps(table | {"task_table": task_to_table(task)}))

@@ -28,6 +28,8 @@ SIZES_OF_A_SIGNAL = ("level", "initial", "final")
 def relative_variation(mvc_fraction: Scalar, *, steadiest: Scalar = 0.3, contrast: Scalar = 1.0) -> Scalar:
     """Coefficient of variation of force at a level L (`mvc_fraction`) over that at the steadiest level L* (`steadiest`).
 
+        jm.response.relative_variation(0.95)
+
         g(L) = (L*/L · exp(L/L* - 1))^contrast
 
     With `contrast = 1` the standard deviation grows as exp(L/L*); the smallest coefficient of variation is at L*, whatever
@@ -55,6 +57,8 @@ def at_level(
     damping: Scalar = 1.0,
 ) -> AbstractTask:
     """The task at another level of contraction, `mvc_fraction` L; as it is, it stands for `reference` L₀.
+
+        strong = jm.at_level(jm.Isometric(), 0.6)
 
         P_w, F_ext ∝ L,   k_j ∝ κ(L) = resting + (1 - resting) L,   c_j ∝ κ(L)^damping
         coefficient of variation of the output ∝ g(L) = relative_variation(L)
@@ -90,6 +94,8 @@ def at_level(
 def at_force(task: AbstractTask, mean: Scalar) -> AbstractTask:
     """The task carried to another mean force: forces, masses, stiffness and damping multiplied by one number.
 
+        task = jm.at_force(jm.Isometric(), 40.5)
+
         P_w, F_ext, m_j, k_j, c_j ∝ s    (and noise in absolute units),    s = mean / (mean force of the task)
 
     Every term of (1a) and (1b) is then s times what it was: displacements, times, spectra and the coefficient of variation
@@ -124,6 +130,8 @@ def scaled(
     task: AbstractTask, size: Scalar, *, time_exponent: Scalar = 1.0, strength_exponent: Scalar = 0.25
 ) -> AbstractTask:
     """A geometrically similar muscle, all lengths multiplied by `size` s, under the same stress.
+
+        bigger = jm.scaled(jm.Isometric(), 1.2)
 
         x_ref, x_z ∝ s,   P_w, F_ext ∝ s²,   m ∝ s³,   K_0 ∝ s (k ∝ 1/s),   C_0 ∝ s^(1 + e),   v_ref ∝ s^(1 - e)
         coefficient of variation of the output ∝ (s²)^(-strength_exponent)

@@ -12,8 +12,7 @@ from jaxtyping import Float
 from jaxmuscle import plot
 from jaxmuscle._common.arrays import as_arrays
 from jaxmuscle._common.programs import kept
-from jaxmuscle._common.text import choices
-from jaxmuscle.model._parameters import PARAMETERS, set_parameters
+from jaxmuscle.model._parameters import PARAMETERS, proper_names, set_parameters, unknown_parameter
 from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.spectra._settings import WINDOW, SpectrumSettings
 
@@ -66,6 +65,8 @@ def sensitivity(
 ) -> Sensitivity:
     """How every bin of the expected spectrum answers to every parameter, by forward-mode differentiation.
 
+        jm.sensitivity(jm.Isometric(), ("k_w", "c_w")).plot()
+
     **Arguments:** `task`; `names` of parameters (all by default); `settings` (the task's by default); `window` [s].
 
     **Returns:** a `Sensitivity`. **Raises:** as `expected_spectrum`, and `ValueError` for an unknown name.
@@ -73,10 +74,10 @@ def sensitivity(
     settings = task.settings if settings is None else settings
     expected_spectrum(task, settings, window)
     known = task.parameter_names
-    chosen = tuple(known if names is None else names)
+    chosen = proper_names(known if names is None else names) or ()
     for name in chosen:
         if name not in known:
-            raise ValueError(f"unknown parameter {name!r}: {choices(name, known)}")
+            raise ValueError(unknown_parameter(name, known))
     with jax.enable_x64(True):
         values = np.array([float(task[name]) for name in chosen])
         slopes = np.asarray(_slopes(as_arrays(task), chosen, values, settings, window)).T

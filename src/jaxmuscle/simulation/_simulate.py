@@ -16,7 +16,7 @@ from jaxmuscle._common.programs import kept
 from jaxmuscle._common.text import listed
 from jaxmuscle._common.types import Key, Seed
 from jaxmuscle.model._stream import Draws
-from jaxmuscle.model._tasks import AbstractTask, require_task
+from jaxmuscle.model._task import AbstractTask, require_task
 from jaxmuscle.response._equilibrium import fastest_rate
 from jaxmuscle.response._linearised import LinearTask, check_equilibrium, check_inputs, linearised
 from jaxmuscle.spectra._settings import WINDOW, Sampling
@@ -45,6 +45,9 @@ def simulate(
     sampling: str | None = None,
 ) -> Trajectory:
     """Simulate one seed: the Stratonovich equation `dy = f(t, y, S) dt + (∂f/∂u) σ ∘ dW`, or with coloured noise in u.
+
+        run = jm.simulate(jm.Isometric(k_w=4e5), jax.random.key(0), seed=3)
+        run.plot()
 
     Heun's method at fixed steps in diffrax. Differentiable in both modes with respect to the task's parameters.
 

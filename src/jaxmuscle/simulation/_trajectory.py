@@ -10,7 +10,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Integer
 
 from jaxmuscle import plot
-from jaxmuscle._common.arrays import as_numbers, is_concrete
+from jaxmuscle._common.arrays import _is_scalar, as_numbers, is_concrete
+from jaxmuscle._common.cards import Card, Shown, facts
 from jaxmuscle._common.environment import versions
 from jaxmuscle.model._parameters import PARAMETERS
 from jaxmuscle.model._stream import VERSION as STREAM
@@ -25,7 +26,7 @@ if TYPE_CHECKING:
     import xarray
 
 
-class Trajectory(eqx.Module):
+class Trajectory(Shown, eqx.Module):
     """States and output of a task, sampled at `rate` from t = 0; a leading axis of seeds if it is an ensemble.
 
     **Fields:** `task`; `states` [m, m/s], shape (seeds, samples, states) or (samples, states); `output` [N or m], shape
@@ -45,6 +46,17 @@ class Trajectory(eqx.Module):
     linear: Float[Array | np.ndarray, "*seeds samples"] | None = None
 
     analysed: ClassVar[tuple[float, float]] = WINDOW
+
+    def _card(self) -> Card:
+        if not isinstance(self.task, AbstractTask) or not _is_scalar(self.output):
+            return Card(eqx.tree_pformat(self))  # a tree that JAX or Equinox took apart
+        samples, name, unit = self.output.shape[-1], self.task.output_name, self.task.output_unit
+        known = [("task", type(self.task).__name__), ("time", f"0 to {(samples - 1) / self.rate:g} s at {self.rate:g} Hz")]
+        known.append(("seeds", str(int(np.prod(self.output.shape[:-1], dtype=int)))))
+        if is_concrete(self.output):
+            low, high = np.min(np.asarray(self.output)), np.max(np.asarray(self.output))
+            known.append(("range", f"{low:.4g} to {high:.4g} {unit}"))
+        return facts(f"trajectory of {name} [{unit}]", known)
 
     @property
     def time(self) -> Float[np.ndarray, " samples"]:

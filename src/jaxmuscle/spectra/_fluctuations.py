@@ -28,6 +28,8 @@ def variance_spectrum(
 ) -> tuple[Float[np.ndarray, " frequencies"], Float[np.ndarray, " frequencies"]]:
     """The variance of one record by frequency, without loss: P_k = X_k² / N, Σ_k P_k = σ². Not traceable.
 
+        frequency, variance = jm.spectra.variance_spectrum(np.sin(np.arange(1000.0)), 100.0)
+
     X_k = √(2/N) Σ_m (x_m - μ) cos(πk(m + ½)/N), the cosine transform (DCT-II), for k = 1 to N - 1; its frequency is
     k `rate` / 2N. The cosines continue the record as its mirror image, so that a drift makes no jump at the ends, which in
     a plain periodogram spreads over all frequencies. For a stationary Gaussian record the P_k are nearly independent,
@@ -48,6 +50,8 @@ def variance_spectrum(
 
 def dfa(signal: Real[Array | np.ndarray, "..."], smallest: int = 4, largest: int | None = None) -> float:
     """Exponent α of the detrended fluctuation analysis, F(n) ∝ n^α, of one record. Not traceable.
+
+        jm.spectra.dfa(np.sin(np.arange(1000.0)))
 
     y_m = Σ_{j ≤ m} (x_j - μ) is cut into ⌊N/n⌋ windows of n samples, from its start on. A straight line (order 1) is taken
     off in each; F(n) is the root mean square of what is left in all of them. α is the slope of the least-squares line

@@ -27,6 +27,8 @@ def _standard_deviation(signal: Float[Array, "*batch times"]) -> Float[Array, "*
 def coefficient_of_variation(signal: Real[Array | np.ndarray, "*batch times"]) -> Float[Array, "*batch"]:
     """Coefficient of variation, CV = σ / |μ|, along the last axis; differentiable.
 
+        jm.spectra.coefficient_of_variation(5 + np.sin(np.arange(1000.0)))
+
     **Arguments:** `signal` in any unit, time along the last axis. σ divides by the number of samples.
 
     **Returns:** a fraction without unit, not a percentage; 0 for a constant signal, infinite for a zero mean.
@@ -39,6 +41,8 @@ def coefficient_of_variation(signal: Real[Array | np.ndarray, "*batch times"]) -
 
 def signal_to_noise(signal: Real[Array | np.ndarray, "*batch times"]) -> Float[Array, "*batch"]:
     """Signal-to-noise ratio, SNR = μ / σ, along the last axis; differentiable.
+
+        jm.spectra.signal_to_noise(5 + np.sin(np.arange(1000.0)))
 
     **Arguments:** `signal` in any unit, time along the last axis. σ divides by the number of samples.
 
@@ -84,6 +88,8 @@ def regularity(signal: Real[Array | np.ndarray, "..."], m: int = 2, tolerance: f
 def approximate_entropy(signal: Real[Array | np.ndarray, "..."], m: int = 2, tolerance: float = 0.2) -> float:
     """Approximate entropy, ApEn = Φ_m - Φ_{m+1}, of one record: low is regular. Not traceable.
 
+        jm.spectra.approximate_entropy(np.sin(np.arange(1000.0)))
+
     Φ_m is the mean of ln C_i over the N - m + 1 templates of m successive samples. C_i is the fraction of
     templates, i itself included, whose samples all lie within r = `tolerance` σ of those of template i.
 
@@ -98,6 +104,8 @@ def approximate_entropy(signal: Real[Array | np.ndarray, "..."], m: int = 2, tol
 
 def sample_entropy(signal: Real[Array | np.ndarray, "..."], m: int = 2, tolerance: float = 0.2) -> float:
     """Sample entropy, SampEn = ln(B / A), of one record: low is regular. Not traceable.
+
+        jm.spectra.sample_entropy(np.sin(np.arange(1000.0)))
 
     B and A count the pairs of different templates, of m and of m + 1 successive samples and both starting in
     the first N - m samples, whose samples all lie within r = `tolerance` σ of each other.
@@ -115,6 +123,8 @@ def sample_entropy(signal: Real[Array | np.ndarray, "..."], m: int = 2, toleranc
 
 def spearman(a: Real[Array | np.ndarray, "..."], b: Real[Array | np.ndarray, "..."]) -> float:
     """Spearman's rank correlation, for instance between the spectra of two people. Not traceable.
+
+        jm.spectra.spearman(np.arange(30.0), np.arange(30.0) ** 2)  # 1.0
 
     **Arguments:** `a`, `b` (bins,), paired values in any units.
 
@@ -138,6 +148,8 @@ def normalised(
     mvc: float | Real[Array | np.ndarray, ""] | None = None,
 ) -> Float[Array, "*batch times"]:
     """The signal over its mean, its largest absolute value, or the maximal voluntary contraction (MVC).
+
+        shares = jm.spectra.normalised(5 + np.sin(np.arange(1000.0)), "maximum")
 
     **Arguments:** `signal` [unit], force or displacement, time along the last axis; `by`, one of `"mean"`,
     `"maximum"`, `"mvc"`; `mvc` [unit], for `by="mvc"` only.
@@ -185,6 +197,9 @@ class Peaks(eqx.Module):
 
 def peaks(spectrum: Spectrum, *, min_prominence: float = 0.01) -> Peaks:
     """Global and local maxima of proportional power. Not traceable.
+
+        spectrum = jm.expected_spectrum(jm.Isometric())
+        jm.spectra.peaks(spectrum).maximum.frequency
 
     The interpolated frequency is the vertex of the parabola through the log power l of a bin and of its two
     neighbours, f_k + Δf (l_{k-1} - l_{k+1}) / (2 (l_{k-1} - 2 l_k + l_{k+1})). A maximum in the first or last

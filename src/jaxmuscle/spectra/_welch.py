@@ -68,6 +68,8 @@ def _convolve(signal: Float[Array, "*batch times"], response: Float[np.ndarray, 
 def lowpass(signal: Real[Array | np.ndarray, "*batch times"], settings: SpectrumSettings) -> Float[Array, "*batch times"]:
     """Butterworth low-pass along the last axis, differentiable and without a loop over time.
 
+        smooth = jm.spectra.lowpass(np.sin(np.arange(1000.0)), jm.SpectrumSettings())
+
     y_n = Σ_m h_m x_{n - m}, h the impulse response. `"forward"` starts from rest as `scipy.signal.sosfilt`,
     `"both"` is `scipy.signal.sosfiltfilt` (odd extension, steady start, zero phase). One non-finite sample
     makes the whole output non-finite.
@@ -133,6 +135,8 @@ def _density(segments: Float[Array, "*batch length"], settings: SpectrumSettings
 def welch(signal: Real[Array | np.ndarray, "*batch times"], settings: SpectrumSettings) -> Float[Array, "*batch bins"]:
     """Welch estimate of the one-sided power spectral density in the selected bins, as `scipy.signal.welch`.
 
+        power = jm.spectra.welch(np.sin(np.arange(1000.0)), jm.SpectrumSettings())
+
     P_k = 2 / (K rate Σ w²) Σ_s Σ_t |Σ_m w_tm x_{s,m} e^{-2πikm/n}|², x_s being segment s of K after detrending, w_t one of
     the tapers; no factor 2 in bin 0 and at half the rate. Nothing is filtered here.
 
@@ -158,6 +162,8 @@ def periodogram(
 ) -> tuple[Float[np.ndarray, " frequencies"], Float[Array, "*batch frequencies"]]:
     """The spectrum of the whole signal as one segment ("FFT"), at all frequencies from 0 to half the rate.
 
+        frequency, power = jm.spectra.periodogram(np.sin(np.arange(1000.0)), jm.SpectrumSettings())
+
     As `scipy.signal.periodogram` with the window and detrend of `settings`; resolution `rate / samples`.
 
     **Arguments:** as for `welch`. **Returns:** frequency [Hz] and density [unit²/Hz].
@@ -180,6 +186,8 @@ def spectrum_of(
     unit: str = "N",
 ) -> Spectrum:
     """The procedure of the experiments: low-pass the whole signal, cut the analysed window, then Welch.
+
+        spectrum = jm.spectra.spectrum_of(np.sin(np.arange(1500.0)), jm.SpectrumSettings())
 
     **Arguments:** `signal` [unit], time along the last axis, sampled at `settings.rate`; `settings`; the
     analysed `window` (start, stop) in s from the start of the signal, or all of it; `unit` of the signal.

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxmuscle import plot
+from jaxmuscle._common.cards import Printed, Result
 from jaxmuscle._common.files import replacing, write_json
 from jaxmuscle._common.text import folded
 
@@ -22,7 +23,7 @@ SHOWN = 2.0  # times the even density: where a design moves the most
 OF_MUSCLE = tuple(BASE.values())
 
 
-class DesignedInput(eqx.Module):
+class DesignedInput(Printed, Result, eqx.Module):
     """A periodic motion of the insertion, made by `design_input`, and what one record of it is expected to tell.
 
     `quantity`, the names of what it was made for; `lengthening`, its lines; `even`, those of a flat motion: of even density

@@ -29,6 +29,8 @@ def identifiability(
 ) -> IdentifiabilityReport:
     """Which parameters the data of a fit determine, and which further measurements would determine the rest.
 
+        print(jm.identifiability(result))
+
     By the Fisher information of the data at the fit, `F = Jᵀ C⁻¹ J`, with the covariance C of the bins' logarithms, the
     unknown total of a proportional spectrum eliminated, the prior left out; a further measurement adds its own. A direction
     of θ is determined if its singular value, the root of the eigenvalue of F, is at least 3; a quantity with gradient g if
@@ -66,6 +68,9 @@ def identifiability(
 
 def standard_designs(result: FitResult, target: Target | None = None) -> tuple[Design, ...]:
     """The designs that `identifiability(result, target)` tries by default, to be extended or changed.
+
+        designs = jm.standard_designs(result)
+        print(jm.identifiability(result, designs=designs))
 
     The coefficient of variation and the mean (to 2 %) of the same recording, if the fit does not have them; of an
     `Isometric` fit the displacement under the load that the sensor had held (`PrescribedForce` at the same operating point,

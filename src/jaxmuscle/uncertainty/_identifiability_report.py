@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxmuscle import plot
+from jaxmuscle._common.cards import Printed, Result
 from jaxmuscle._common.files import write_json
 from jaxmuscle._common.tables import frame
 from jaxmuscle._common.text import WIDTH
@@ -57,7 +58,7 @@ class Known(eqx.Module):
         return f"{self.stderr:.2g} {self.unit}"
 
 
-class Outlook(eqx.Module):
+class Outlook(Printed, Result, eqx.Module):
     """What is known with the data of a design, or of several, added to the present ones.
 
     `task` and `data` in words; `separate`, the parameters that have other values there; `singular_values` in prior standard
@@ -99,7 +100,7 @@ class Outlook(eqx.Module):
         }  # fmt: skip
 
 
-class IdentifiabilityReport(eqx.Module):
+class IdentifiabilityReport(Printed, Result, eqx.Module):
     """What the data of a fit determine (`present`), and what they would with further `designs` or `pairs` of these.
 
     `target` and `free` name the data and the fitted parameters; the pairs are sorted, best first; `notices` of the fit.

@@ -52,6 +52,8 @@ def design_input(
 ) -> DesignedInput:
     """The motion of the insertion, within limits, whose record makes a quantity best known.
 
+        made = jm.design_input(result, "K_w0", rms=1e-3, band=(0.1, 5.0))
+
     The density S_x(f) of the displacement that minimises the sum of the relative variances of the quantities q,
 
         Σ_q g_qᵀ (I_0 + I[S_x])⁻¹ g_q / q²,    I[S_x] = 2T ∫ Re(∂H* ∂Hᵀ) S_x(f) / S(f) df,    ∫ S_x df <= rms²

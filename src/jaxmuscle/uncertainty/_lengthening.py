@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxmuscle._common.arrays import as_arrays
+from jaxmuscle._common.cards import Printed, Result
 from jaxmuscle._common.programs import kept
 from jaxmuscle.model._tasks import PrescribedLength
 from jaxmuscle.objective._coordinates import Coordinates, task_at
@@ -35,7 +36,7 @@ def lines_in(band: tuple[float, float], seconds: float) -> Float[np.ndarray, " l
     return np.arange(first, last + 1) / seconds
 
 
-class Lengthening(eqx.Module):
+class Lengthening(Printed, Result, eqx.Module):
     """A periodic lengthening of the muscle: `x(t) = Σ_k √(2 p_k) cos(2π f_k t + φ_k)`, recorded for one period.
 
     **Arguments:** `frequency` f_k [Hz] (lines,), multiples of 1 / `seconds`; `power` p_k, the mean square of each line

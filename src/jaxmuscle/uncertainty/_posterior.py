@@ -45,6 +45,8 @@ def posterior(
 ) -> Posterior:
     """Draw from the posterior of a fit's parameters in linear response, by NUTS from dispersed starts.
 
+        print(jm.posterior(result, target, key=jax.random.key(2)).summary())
+
         p(θ | data) ∝ L(θ) Π_j exp(-θ_j² / 2)
 
     L is the likelihood of `log_likelihood`: gamma-distributed, correlated Welch bins, their unknown total sampled along; or

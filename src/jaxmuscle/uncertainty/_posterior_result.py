@@ -8,11 +8,12 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxmuscle import plot
+from jaxmuscle._common.cards import Card, Shown
 from jaxmuscle._common.errors import NotMixedError
 from jaxmuscle._common.files import replacing, write_json
 from jaxmuscle._common.parts import of_only, only
 from jaxmuscle._common.tables import frame
-from jaxmuscle._common.text import folded
+from jaxmuscle._common.text import choices, folded
 from jaxmuscle.data._target import Target
 from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.objective._consequences import unit_of
@@ -45,7 +46,7 @@ class PosteriorPart(eqx.Module):
     names: dict[str, str]
 
 
-class Posterior(eqx.Module):
+class Posterior(Shown, eqx.Module):
     """Draws from the posterior of a fit, of one target or of several; arrays have leading axes (chain, draw).
 
     `success` and `message`: whether the chains mixed, or why not; `parts`, a `PosteriorPart` for each target by name;
@@ -112,7 +113,7 @@ class Posterior(eqx.Module):
         for name, draws in self.quantities.items():
             low, middle, high = np.quantile(draws, (CREDIBLE[0], 0.5, CREDIBLE[1]))
             rows[name] = (float(draws.mean()), float(draws.std(ddof=1)), float(middle), float(low), float(high))
-        return Summary(rows, self.diagnostics, self.determined, {n: self.unit(n) for n in rows}, str(self))
+        return Summary(rows, self.diagnostics, self.determined, {n: self.unit(n) for n in rows}, self._told())
 
     def unit(self, name: str) -> str:
         """Unit of a parameter or derived quantity."""
@@ -159,7 +160,14 @@ class Posterior(eqx.Module):
         """The target (of several, the named one) among the spectra that the posterior predicts. Returns the axes."""
         return plot.predictive(self, ax, target)
 
-    def __str__(self) -> str:
+    def _card(self) -> Card:
+        if not self.success:
+            return Card(self._told())
+        shown = self.summary()._card()
+        return shown._replace(text=self._told())
+
+    def _told(self) -> str:
+        """The posterior in a few lines."""
         count, draws = self.chains.log_density.shape
         lines = [f"{'posterior' if self.success else 'NO POSTERIOR'}: {self.title}, {self.model}", f"  {self.message}",
                  f"  {count} chains of {draws} draws, {self.divergences} divergences"]  # fmt: skip
@@ -174,7 +182,7 @@ class Posterior(eqx.Module):
         return folded(lines)
 
 
-class Summary(eqx.Module):
+class Summary(Shown, eqx.Module):
     """Table of a posterior: `rows` {name: (mean, sd, median, 2.5 %, 97.5 %)}; prints itself."""
 
     rows: dict[str, tuple[float, float, float, float, float]]
@@ -184,6 +192,9 @@ class Summary(eqx.Module):
     title: str
 
     def __getitem__(self, name: str) -> dict[str, float]:
+        """What is known of one quantity. Raises `ValueError` for an unknown name."""
+        if name not in self.rows:
+            raise ValueError(f"unknown quantity {name!r} of the posterior: {choices(name, self.rows)}")
         keys = ("mean", "sd", "median", "low", "high", "r_hat", "ess_bulk", "ess_tail")
         return dict(zip(keys, (*self.rows[name], *self.diagnostics[name]), strict=True))
 
@@ -192,17 +203,21 @@ class Summary(eqx.Module):
         return frame([{"quantity": n, **self[n], "unit": self.units[n], "determined": n in self.determined}
                       for n in self.rows])  # fmt: skip
 
-    def __str__(self) -> str:
-        lines = [self.title, f"  {'':<24}{'median':>10}{'2.5 %':>10}{'97.5 %':>10}{'R-hat':>7}{'ESS':>6}  unit"]
+    def _card(self) -> Card:
+        columns = ("quantity", "median", "2.5 %", "97.5 %", "R-hat", "ESS", "unit")
+        rows, lines = [], [self.title, f"  {'':<24}{'median':>10}{'2.5 %':>10}{'97.5 %':>10}{'R-hat':>7}{'ESS':>6}  unit"]
         for name, (_, _, middle, low, high) in self.rows.items():
             r_hat, bulk, tail = self.diagnostics[name]
             mark = "" if name in self.determined else "*"
             unit = "" if self.units[name] == "1" else self.units[name]
-            spread = f"{middle:>10.4g}{low:>10.4g}{high:>10.4g}"
-            lines.append(f"  {name + mark:<24}{spread}{r_hat:>7.3f}{min(bulk, tail):>6.0f}  {unit}")
-        if any(name not in self.determined for name in self.rows):
-            lines.append("  * the data do not determine it: the prior keeps it where it is")
-        return "\n".join(lines)
+            cells = (f"{middle:.4g}", f"{low:.4g}", f"{high:.4g}", f"{r_hat:.3f}", f"{min(bulk, tail):.0f}")
+            rows.append((name + mark, *cells, unit))
+            numbers = "".join(f"{cell:>{wide}}" for cell, wide in zip(cells, (10, 10, 10, 7, 6), strict=True))
+            lines.append(f"  {name + mark:<24}{numbers}  {unit}")
+        said = ("* the data do not determine it: the prior keeps it where it is",)
+        remarks = said * any(name not in self.determined for name in self.rows)
+        text = "\n".join([*lines, *(f"  {remark}" for remark in remarks)])
+        return Card(text, self.title.partition("\n")[0], columns, tuple(rows), remarks)
 
 
 KEYS = ("r_hat", "ess_bulk", "ess_tail")

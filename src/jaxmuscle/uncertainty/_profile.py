@@ -10,6 +10,7 @@ import scipy
 from jaxtyping import Float
 
 from jaxmuscle import plot
+from jaxmuscle._common.cards import Printed, Result
 from jaxmuscle._common.tables import frame
 from jaxmuscle._common.text import choices, folded
 from jaxmuscle.data._target import Target
@@ -35,7 +36,7 @@ MODES, COUNTS = 4, 8.0
 HELD = 0.02  # standard errors that a derived quantity is held to
 
 
-class Profile(eqx.Module):
+class Profile(Printed, Result, eqx.Module):
     """Twice the fall of the log likelihood (`rise`) with a quantity held at `values`, all else fitted anew.
 
     `value` at the maximum; `stderr`, by the curvature there; `intervals`, where `rise` is below the χ² quantile of `level`
@@ -110,6 +111,8 @@ def profile(
     bounds: Mapping[str, tuple[float, float]] | None = None,
 ) -> Profile:
     """Profile likelihood of a free parameter or a derived quantity, with its confidence interval.
+
+        print(jm.profile(result, "corner_frequency"))
 
     `rise(q) = 2 (max ln L - max_{θ: q(θ) = q} ln L)`, compared with a χ² quantile (Wilks 1938). The likelihood is that of
     `log_likelihood`, its maximum searched from the fit and from other frequencies of the harmonic. Without `with_priors` the

@@ -1,0 +1,94 @@
+"""What an object says of itself: as text where it is printed, as a table in a notebook."""
+
+import abc
+import html
+import textwrap
+from collections.abc import Iterable, Sequence
+from typing import NamedTuple
+
+from .text import WIDTH, folded
+
+LEAST = 24  # columns that are left to words
+
+
+class Card(NamedTuple):
+    """What an object says of itself.
+
+    `text` is the whole of it. A notebook shows `heading`, the table of `columns` and `rows`, and `remarks`; the text where
+    there is no table.
+    """
+
+    text: str
+    heading: str = ""
+    columns: tuple[str, ...] = ()
+    rows: tuple[tuple[str, ...], ...] = ()
+    remarks: tuple[str, ...] = ()
+
+    def __str__(self) -> str:
+        return self.text
+
+    def __repr__(self) -> str:
+        return self.text
+
+    def _repr_html_(self) -> str:
+        """As HTML: names and remarks may come from files, so that everything is escaped."""
+        if not self.columns:
+            return f"<pre>{html.escape(self.text)}</pre>"
+        head = _row("th", self.columns)
+        body = "\n".join(_row("td", row) for row in self.rows)
+        said = "".join(f"<p>{html.escape(remark)}</p>\n" for remark in self.remarks)
+        return (f'<div class="jaxmuscle">\n<p><b>{html.escape(self.heading)}</b></p>\n<table>\n<thead>{head}</thead>\n'
+                f"<tbody>\n{body}\n</tbody>\n</table>\n{said}</div>")  # fmt: skip
+
+
+def _row(tag: str, cells: Iterable[str]) -> str:
+    return "<tr>" + "".join(f'<{tag} style="text-align: left">{html.escape(cell)}</{tag}>' for cell in cells) + "</tr>"
+
+
+class Shown(abc.ABC):
+    """Shows itself as its card: the text where it is printed, with or without `print`, the table in a notebook."""
+
+    @abc.abstractmethod
+    def _card(self) -> Card:
+        """What it says of itself."""
+
+    def __repr__(self) -> str:
+        return self._card().text
+
+    def _repr_html_(self) -> str:
+        return self._card()._repr_html_()
+
+
+class Printed(Shown):
+    """Shows itself as the text of its `__str__`."""
+
+    @abc.abstractmethod
+    def __str__(self) -> str: ...
+
+    def _card(self) -> Card:
+        return Card(str(self))
+
+
+class Result(Shown):
+    """What is computed, with a `summary()`."""
+
+    def summary(self) -> Card:
+        """What it prints, as an object; a notebook shows it as a table where there is one."""
+        return self._card()
+
+
+def facts(heading: str, rows: Sequence[tuple[str, str]]) -> Card:
+    """A card of a heading and named facts, a line for each."""
+    return Card(folded([heading, *(f"  {name:<8}  {value}" for name, value in rows)]), heading, ("", ""), tuple(rows))
+
+
+def in_columns(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
+    """A table as lines of at most 80 columns; words of the last column that find no room go on below."""
+    widths = [max(len(row[i]) for row in [columns, *rows]) + 2 for i in range(len(columns) - 1)]
+    room = max(WIDTH - 2 - sum(widths), LEAST)
+    lines = []
+    for row in [columns, *rows]:
+        words = textwrap.wrap(row[-1], room) or [""]
+        lines.append("  " + "".join(f"{cell:<{wide}}" for cell, wide in zip(row, widths, strict=False)) + words[0])
+        lines += [" " * (2 + sum(widths)) + more for more in words[1:]]
+    return [line.rstrip() for line in lines]

@@ -1,0 +1,174 @@
+"""A fit as functions of numbers, for optimisers and samplers of one's own."""
+
+import dataclasses
+from collections.abc import Iterable, Mapping
+from typing import Any, Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxmuscle._common.cards import Card, Shown
+from jaxmuscle._common.text import choices
+from jaxmuscle._common.types import Scalar
+from jaxmuscle.data._as_target import as_target
+from jaxmuscle.model._noise import AbstractNoise
+from jaxmuscle.model._noises import with_noise
+from jaxmuscle.model._parameters import PARAMETERS, proper_values
+from jaxmuscle.model._tasks import AbstractTask
+from jaxmuscle.objective._arguments import FitOptions, at_mean, planned
+from jaxmuscle.objective._consequences import expand
+from jaxmuscle.objective._coordinates import task_at
+from jaxmuscle.objective._likelihood import Likelihood, require_spread
+from jaxmuscle.objective._problem import FitProblem
+from jaxmuscle.objective._residuals import Residuals
+from jaxmuscle.response._expected import Moments
+
+Theta = Float[Array | np.ndarray, " free"]
+
+
+@dataclasses.dataclass(frozen=True, eq=False, repr=False)
+class Problem(Shown):
+    """A fit as functions of numbers without bounds: give them to any optimiser or sampler. Made by `problem`.
+
+    `names` are the free parameters, `start` is θ at the task's own values, an array with a number for each name. A parameter
+    with two finite bounds is `v = low + (high - low) sigmoid(θ)` (in the log, if it is positive); another
+    `ln v = ln v0 + sd θ`, or `v = v0 + sd θ` where it may be negative: v0 the task's value, sd the prior's.
+
+    All methods are functions of θ that JAX compiles and differentiates. Turn on double precision first
+    (`jax.config.update("jax_enable_x64", True)`): in single precision a search ends early.
+
+    `fit_problem`, `objective` and `likelihood` are what the functions are made of, for the package itself.
+    """
+
+    names: tuple[str, ...]
+    start: Float[np.ndarray, " free"]
+    fit_problem: FitProblem
+    objective: Residuals
+    likelihood: Likelihood | None
+
+    @classmethod
+    def of(cls, given: FitProblem, shares: "list[np.ndarray] | None" = None) -> "Problem":
+        """Of the problem of a fit; `shares`, what the harmonic holds of each bin, if that is known."""
+        c = given.coordinates
+        targets = [part.target for part in given.parts]
+        known = all(t.segments is not None or t.sigma is not None or not len(t.bins) for t in targets)
+        likelihood = Likelihood.of(given) if known else None
+        return cls(c.names, c.from_theta(np.zeros(len(c.names))), given, given.linear(shares), likelihood)
+
+    def parameters(self, theta: Theta) -> dict[str, Scalar]:
+        """The parameters by name, in their units."""
+        return self.objective.coordinates.values(self.objective.theta(jnp.asarray(theta)))
+
+    def theta(self, parameters: Mapping[str, float]) -> Float[np.ndarray, " free"]:
+        """θ of parameters by name, in their units; those not named are at their start. The inverse of `parameters`.
+
+        Raises `ValueError` for a name that is not free and for a value outside the bounds of the fit.
+        """
+        c = self.fit_problem.coordinates
+        values = c.centre.copy()
+        for name, value in proper_values(parameters).items():
+            if name not in self.names:
+                raise ValueError(f"{name!r} is not free in this problem: {choices(name, self.names)}")
+            values[self.names.index(name)] = value
+        with np.errstate(invalid="ignore", divide="ignore"):
+            found = np.where(c.positive, np.log(values / c.centre), values - c.centre) / c.sd
+        for name, value, here, low, high in zip(self.names, values, found, c.low, c.high, strict=True):
+            if not low < here < high:
+                raise ValueError(f"{name} = {value} lies outside what this problem can reach: give one inside its bounds")
+        return c.from_theta(found)
+
+    def task(self, theta: Theta) -> AbstractTask:
+        """The task with these parameters."""
+        part = self.objective.parts[0]
+        return task_at(part.task, part.coordinates, self.objective.theta(jnp.asarray(theta)))
+
+    def residuals(self, theta: Theta) -> Float[Array, " residuals"]:
+        """What a fit makes small, `½ Σ r²`: those of the data in standard deviations, then those of the prior."""
+        scaled: Any = self.objective.theta(jnp.asarray(theta))
+        return self.objective.residuals(scaled, self._moments(scaled), self.objective.data)
+
+    def log_likelihood(self, theta: Theta) -> Scalar:
+        """Log likelihood of the target, as `jaxmuscle.log_likelihood`, up to a constant.
+
+        Raises `ValueError` for a target that states neither segments nor sigma.
+        """
+        if self.likelihood is None:
+            require_spread(self.fit_problem.parts[0].target)
+        assert self.likelihood is not None
+        return self.likelihood.marginal(self._moments(self.objective.theta(jnp.asarray(theta))))
+
+    def log_prior(self, theta: Theta) -> Scalar:
+        """Log density of the prior as one of θ, up to a constant. Flat, and then improper, where the prior is None."""
+        theta, c = jnp.asarray(theta), self.objective.coordinates
+        scaled = self.objective.theta(theta)
+        bounded = np.isfinite(c.low)
+        width = np.log(np.where(bounded, c.high - c.low, 1.0))
+        stretch = jnp.where(bounded, width + jax.nn.log_sigmoid(theta) + jax.nn.log_sigmoid(-theta), 0.0)
+        return jnp.sum(stretch) - 0.5 * jnp.sum(self.objective.prior * scaled**2)
+
+    def log_density(self, theta: Theta) -> Scalar:
+        """Log density of the posterior as one of θ, `log_likelihood + log_prior`: what a sampler asks for.
+
+        Raises `ValueError` as `log_likelihood` does.
+        """
+        return self.log_likelihood(theta) + self.log_prior(theta)
+
+    def scattering_as(self, theta: Theta) -> "Problem":
+        """The problem whose data scatter as the model at θ says.
+
+        A bin in which the harmonic holds a share ρ of the power scatters less, by 1 - ρ², and so does the coefficient of
+        variation. A fit goes on with this when it has come near its minimum: do the same for the same minimum.
+        """
+        with jax.enable_x64(True):
+            scaled = np.asarray(self.fit_problem.coordinates.theta(np.asarray(theta, dtype=float)))
+            seen = expand(self.fit_problem.linear(), scaled[None]).row(0)
+            shares = [np.clip(np.nan_to_num(m.line / m.power), 0.0, 1.0) for m in seen.moments]
+            return Problem.of(self.fit_problem.scattering_as(self.fit_problem.tasks_at(scaled)), shares)
+
+    def _moments(self, scaled: Any) -> tuple[Moments, ...]:
+        return tuple(part.moments(scaled) for part in self.objective.parts)
+
+    def _card(self) -> Card:
+        values = self.fit_problem.coordinates.centre
+        units = [PARAMETERS[name].unit if name in PARAMETERS else "" for name in self.names]
+        rows = tuple((name, f"{value:.5g}", "" if unit == "1" else unit)
+                     for name, value, unit in zip(self.names, values, units, strict=True))  # fmt: skip
+        heading = f"problem of {self.fit_problem.title} with {len(self.names)} free parameters"
+        text = "\n".join([heading, *(f"  {name:<24}{value:<12}{unit}".rstrip() for name, value, unit in rows)])
+        return Card(text, heading, ("name", "start", "unit"), rows)
+
+
+def problem(
+    task: AbstractTask,
+    target: Any,
+    *,
+    free: Iterable[str] | None = None,
+    fix: Mapping[str, float] | None = None,
+    noise: str | AbstractNoise | None = None,
+    residual: str = "log",
+    bounds: Mapping[str, tuple[float, float]] | None = None,
+    priors: Mapping[str, float | None] | None = None,
+    coefficient_of_variation: bool = True,
+    mean_force: tuple[float, float] | Literal[False] | None = None,
+) -> Problem:
+    """What `fit` minimises, for an optimiser or a sampler of your own: residuals, log density, names, start.
+
+        problem = jm.problem(task, target)
+        found = scipy.optimize.least_squares(jax.jit(problem.residuals), problem.start)
+        problem.parameters(found.x)
+
+    The model is that of the linear response; `task` is fitted as it is, without the richer models that `fit` may try.
+
+    **Arguments:** `task`; `target`, in any form that `fit` takes but a perturbed recording; `free`, `fix`, `noise`,
+    `residual`, `bounds`, `priors`, `coefficient_of_variation`, `mean_force` as in `fit`.
+
+    **Returns:** a `Problem`. **Raises:** `ValueError` as `fit` does.
+    """
+    target = as_target(target)
+    with jax.enable_x64(True):
+        options = FitOptions(free=free, fix=fix, residual=residual, bounds=bounds, priors=priors,
+                             coefficient_of_variation=coefficient_of_variation, mean_force=mean_force)  # fmt: skip
+        task, options = at_mean(with_noise(task, noise, options.fix), target, options)
+        return Problem.of(planned(task, target, options).problem)

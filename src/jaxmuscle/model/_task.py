@@ -1,0 +1,272 @@
+"""What every task has: muscle, perturbation, parameters by name, and what a task shows of itself."""
+
+import abc
+import dataclasses
+from collections.abc import Mapping
+from typing import Any, ClassVar, TypeVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxmuscle._common.arrays import _is_scalar, is_concrete, require
+from jaxmuscle._common.cards import Card, Shown, in_columns
+from jaxmuscle._common.types import Scalar
+from jaxmuscle.spectra._settings import SpectrumSettings
+
+from ._activation import ACTIVE, Activation
+from ._muscle import AbstractMuscle, Muscle, Perturbation
+from ._noise import AbstractNoise, NoiseSum
+from ._noise_names import named_noise
+from ._parameters import (
+    BASE,
+    CHANNELS,
+    INPUTS,
+    PARAMETERS,
+    assigned,
+    get_parameter,
+    paths_of,
+    set_parameters,
+    usually_free,
+    value_of,
+)
+from ._resonant_noise import ResonantNoise
+from ._signals import AbstractSignal, Harmonic
+from ._white_noise import BandLimitedNoise
+
+State = Float[Array, " states"]
+Task = TypeVar("Task", bound="AbstractTask")
+
+
+class AbstractTask(Shown, eqx.Module):
+    """What is simulated: `y' = vector_field(t, y, u)`, observed as `output(t, y, u, u')`.
+
+    `u = (ΔK_w, ΔK_z, ΔC_w, ΔC_z, ΔP_w / P_w)` [N/m, N s/m, 1] is the perturbation of coefficients and drive: noise and
+    harmonic, those of K_w, C_w and P_w through the `activation` if there is one. Common to all tasks are the `muscle`, the
+    `noise` (None in a field: the default), the `harmonic`, the `activation` (None: none), how the output's spectrum is
+    estimated (`settings`) and the initial state (`initial`, zero by default).
+
+    `task[name]` and `task.name` read a parameter by its name in the parameter table, `task.replace(name=value)` changes it;
+    the tasks of the package take it as an argument, too, and a noise by its name: `Isometric(k_w=4e5, noise="pink")`. A name
+    that is a field of the task (`P_w`, the signal) stays the field: `task["P_w"]` is its level. Printed, a task is a table.
+    """
+
+    muscle: AbstractMuscle = eqx.field(default_factory=Muscle, kw_only=True)
+    noise: AbstractNoise = eqx.field(
+        default_factory=BandLimitedNoise, kw_only=True, converter=lambda noise: noise.per_channel()
+    )
+    harmonic: Harmonic = eqx.field(default_factory=Harmonic, kw_only=True)
+    activation: Activation | None = eqx.field(default=None, kw_only=True)
+    settings: SpectrumSettings = eqx.field(static=True, default_factory=SpectrumSettings, kw_only=True)
+    initial: tuple[Scalar, ...] | None = eqx.field(default=None, kw_only=True)
+
+    state_names: ClassVar[tuple[str, ...]]
+    state_units: ClassVar[tuple[str, ...]]
+    output_name: ClassVar[str]
+    output_unit: ClassVar[str]
+    smoothness_needed: ClassVar[tuple[int, ...]]
+
+    @abc.abstractmethod
+    def vector_field(self, t: Scalar, y: State, u: Perturbation) -> State:
+        """Time derivative of the state."""
+
+    @abc.abstractmethod
+    def output(self, t: Scalar, y: State, u: Perturbation, du: Perturbation) -> Scalar:
+        """What is measured, given the state, the perturbation and its time derivative."""
+
+    def __getitem__(self, name: str) -> Scalar:
+        return get_parameter(self, name)
+
+    def __getattr__(self, name: str) -> Scalar:
+        """A parameter by its name. Raises `AttributeError` for what is neither a parameter nor anything else."""
+        if name[:1] == "_" or name in {field.name for field in dataclasses.fields(self)}:
+            raise AttributeError(f"{type(self).__name__} has no {name}", name=name, obj=self)
+        try:
+            return get_parameter(self, name)
+        except ValueError as error:
+            raise AttributeError(str(error), name=name, obj=self) from None
+
+    def __dir__(self) -> list[str]:
+        return [*object.__dir__(self), *self.parameter_names, *BASE]
+
+    def replace(self: Task, **values: Scalar) -> Task:
+        """A copy with the named parameters set. Raises `ValueError` for an unknown name or an impossible value.
+
+        task = jm.Isometric().replace(k_w=4e5, noise_K_w=0.1)
+        """
+        return set_parameters(self, values)
+
+    def with_parts(self: Task, **parts: Any) -> Task:
+        """A copy with whole parts exchanged: fields of the task, as `muscle`, `noise`, `harmonic`, `settings`, and inputs.
+
+            task = jm.Isometric().with_parts(noise=jm.PinkNoise())
+
+        Raises `TypeError` for what is no field of the task.
+        """
+        fields = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+        return type(self)(**(fields | parts))
+
+    def as_task(self, task: type[Task], **inputs: Any) -> Task:
+        """The same muscle, perturbation and settings in another task, with that task's default inputs unless given.
+
+        moving = jm.Isometric().as_task(jm.PrescribedForce, P_w=4.0)
+        """
+        return task(**self.common, **inputs)
+
+    @property
+    def common(self) -> dict[str, Any]:
+        """What all tasks have: muscle, noise, harmonic, activation and spectrum settings."""
+        return {n: getattr(self, n) for n in ("muscle", "noise", "harmonic", "activation", "settings")}
+
+    @property
+    def quantity(self) -> str:
+        """What the output is, by its unit: "force", "displacement" or "acceleration", as a `Target` calls it."""
+        return {"m": "displacement", "m/s^2": "acceleration"}.get(self.output_unit, "force")
+
+    def with_input(self, name: str) -> "AbstractTask":
+        """A copy with the activation (`activation_time`) or the drive's channel of the noise (`noise_P_w`) switched on."""
+        if name == "activation_time":
+            return self.with_parts(activation=Activation())
+        parts = list(self.noise.components)
+        which = next((i for i, part in enumerate(parts) if not isinstance(part, ResonantNoise)), None)
+        if which is None or len(parts[which].acts_on) != len(CHANNELS):
+            return self
+        amplitude = parts[which].amplitude
+        wider = jnp.append(amplitude, 0.0) if isinstance(amplitude, jax.Array) else np.append(np.asarray(amplitude), 0.0)
+        parts[which] = eqx.tree_at(lambda n: n.amplitude, parts[which], wider)
+        return self.with_parts(noise=NoiseSum(tuple(parts)) if len(parts) > 1 else parts[0])
+
+    def check_step(self, dt: float) -> None:
+        """Raise a `ValueError` if a grid of step dt [s] is too coarse for noise or activation."""
+        self.noise.check_step(dt)
+        if self.activation is not None:
+            self.activation.check_step(dt)
+
+    @property
+    def parameter_names(self) -> tuple[str, ...]:
+        """Names of all parameters of this task."""
+        return tuple(paths_of(self))
+
+    @property
+    def parameters(self) -> dict[str, Scalar]:
+        """All parameters by name."""
+        return {name: get_parameter(self, name) for name in self.parameter_names}
+
+    def initial_state(self) -> State:
+        """State at t = 0."""
+        size = len(self.state_names)
+        return jnp.zeros(size) if self.initial is None else jnp.stack([jnp.asarray(v) * 1.0 for v in self.initial])
+
+    def noise_scale(self, noise: AbstractNoise | None = None) -> Float[Array, " inputs"]:
+        """Amplitude of the noise, or of one of its components, in the units of the inputs that it acts on."""
+        noise = self.noise if noise is None else noise
+        amplitude = jnp.asarray(noise.amplitude)
+        if not noise.relative or len(noise.acts_on) == 1:
+            return amplitude
+        base = self.muscle.base()
+        return amplitude * (base if len(noise.acts_on) == len(base) else jnp.append(base, jnp.ones((), base.dtype)))
+
+    def _card(self) -> Card:
+        if not (isinstance(self.noise, AbstractNoise) and isinstance(self.muscle, AbstractMuscle)):
+            return Card(eqx.tree_pformat(self))  # a tree that JAX or Equinox took apart
+        free, noises = usually_free(self), " + ".join(type(part).__name__ for part in self.noise.components)
+        facts = [f"noise     {noises}", f"spectrum  {self.settings.name or 'settings of its own'}"]
+        facts += [] if isinstance(self.muscle, Muscle) else [f"muscle    {type(self.muscle).__name__}"]
+        facts += [f"{name:<8}  {type(value).__name__}" for name, value in self._inputs().items()]
+        rows = tuple(_shown_row(self, name, path, name in free) for name, path in paths_of(self).items())
+        heading = f"{type(self).__name__}, which gives {self.output_name} [{self.output_unit}]"
+        text = "\n".join([heading, *(f"  {fact}" for fact in facts), *in_columns(COLUMNS, rows)])
+        return Card(text, heading, COLUMNS, rows, tuple(" ".join(fact.split()) for fact in facts))
+
+    def _inputs(self) -> dict[str, Any]:
+        fields = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+        return {name: value for name, value in fields.items() if isinstance(value, AbstractSignal)}
+
+    def harmonic_base(self) -> Perturbation:
+        """What the harmonic is a fraction of: (K_w0, K_z0, 0, 0, 0)."""
+        base = self.muscle.base()
+        stiffness = np.array([1.0, 1.0, 0.0, 0.0, 0.0], dtype=jnp.result_type(float))
+        return jnp.append(base, jnp.zeros((), base.dtype)) * stiffness
+
+
+COLUMNS = ("name", "value", "unit", "fit", "what it is")
+
+
+def _shown_row(task: AbstractTask, name: str, path: tuple, free: bool) -> tuple[str, ...]:
+    row = PARAMETERS.get(name)
+    unit, meaning = ("", "") if row is None else ("" if row.unit == "1" else row.unit, row.meaning)
+    return name, in_numbers(value_of(task, path)), unit, "free" if free else "fixed", meaning.partition(";")[0]
+
+
+def in_numbers(value: Any) -> str:
+    """A number, the range of several, or of what is traced its kind."""
+    if not (_is_scalar(value) and is_concrete(value)):
+        return eqx.tree_pformat(value)
+    numbers = np.asarray(value)
+    if numbers.ndim == 0 or not numbers.size:
+        return f"{float(numbers):.5g}" if numbers.size else "none"
+    low, high = numbers.min(), numbers.max()
+    return f"{numbers.size} of {low:.4g}" if low == high else f"{low:.4g} to {high:.4g}"
+
+
+def fill(task: AbstractTask, fields: Mapping[str, Any], parameters: Mapping[str, Any]) -> None:
+    """Set the fields of a task that is being made, None to its default, a noise by its name; then parameters by theirs."""
+    empty = {"muscle": Muscle, "noise": BandLimitedNoise, "harmonic": Harmonic, "settings": SpectrumSettings}
+    for field in dataclasses.fields(task):
+        value = fields[field.name]
+        if value is None and field.name in empty:
+            value = empty[field.name]()
+        if field.name == "noise":
+            value = named_noise(value, task.smoothness_needed) if isinstance(value, str) else value
+        converter = field.metadata.get("converter")
+        object.__setattr__(task, field.name, value if converter is None else converter(value))
+    if parameters:
+        made = assigned(task, dict(parameters))
+        for field in dataclasses.fields(task):
+            object.__setattr__(task, field.name, getattr(made, field.name))
+
+
+def require_task(task: Any, example: str) -> None:
+    """Raise a `ValueError` for what is no task, where one is needed."""
+    require(
+        isinstance(task, AbstractTask),
+        f"task: a {type(task).__name__}; give a task first, as jaxmuscle.Isometric(): {example}",
+    )
+
+
+def check_task(task: AbstractTask) -> None:
+    if task.initial is not None and len(task.initial) != len(task.state_names):
+        raise ValueError(f"initial has {len(task.initial)} entries, {type(task).__name__} needs {task.state_names}")
+    _check_noise(task)
+
+
+def _check_noise(task: AbstractTask) -> None:
+    """Refuse noise rougher than the task can sample or differentiate, where its amplitude is not zero."""
+    what = {1: f"appears directly in the output {task.output_name}, where white noise has no value",
+            2: "must be differentiable in time"}  # fmt: skip
+    needed = (*task.smoothness_needed, 0)
+    for noise in task.noise.components:
+        if not is_concrete(noise.amplitude):
+            continue
+        for i, amplitude in zip(noise.acts_on, np.asarray(noise.amplitude), strict=True):
+            have = noise.smoothness + 2 * (task.activation is not None and i in ACTIVE)
+            if have < needed[i] and amplitude != 0:
+                raise ValueError(
+                    f"{type(noise).__name__} on {INPUTS[i]} cannot be used in {type(task).__name__}: there it "
+                    f"{what[needed[i]]}. Use BandLimitedNoise, or set noise_{INPUTS[i]} = 0"
+                )
+
+
+def check_smooth(task: AbstractTask, name: str, need: int) -> None:
+    signal = getattr(task, name)
+    if signal.smoothness < need:
+        raise ValueError(f"{name} is a {type(signal).__name__} with {signal.smoothness} continuous derivatives; "
+                         f"{type(task).__name__} needs {need}: use SmoothStep, RampHold or Sampled")  # fmt: skip
+
+
+def check_smooth_envelope(task: AbstractTask) -> None:
+    envelope = task.harmonic.envelope
+    if envelope.smoothness < 1:
+        raise ValueError(f"harmonic envelope {type(envelope).__name__} must have a continuous derivative")

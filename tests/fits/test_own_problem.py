@@ -1,0 +1,122 @@
+"""A fit as functions for optimisers and samplers of one's own, and a fit with another optimiser."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+import pytest
+import scipy
+
+import jaxmuscle as jm
+
+TARGET = jm.load_target("vastus-lateralis-26mvc")
+TASK = jm.task_for(TARGET)
+ALONE = {"rungs": 0, "seeds": 0, "check_seeds": 0, "starts": 16}
+
+
+@pytest.fixture(autouse=True)
+def x64():
+    with jax.enable_x64(True):
+        yield
+
+
+@pytest.fixture(scope="module")
+def problem():
+    return jm.problem(TASK, TARGET)
+
+
+@pytest.fixture(scope="module")
+def result():
+    return jm.fit(TASK, TARGET, **ALONE)
+
+
+def test_coordinates_and_parameters(problem):
+    start = problem.parameters(problem.start)
+    assert tuple(start) == problem.names == jm.fits.Problem.of(problem.fit_problem).names
+    for name, value in start.items():
+        assert float(value) == pytest.approx(float(TASK[name]), rel=1e-9)
+    values = {"k_w": 4e5, "harmonic_frequency": 7.0}
+    theta = problem.theta(values)
+    back = problem.parameters(theta)
+    assert {name: float(back[name]) for name in values} == pytest.approx(values, rel=1e-9)
+    assert float(problem.task(theta).k_w) == pytest.approx(4e5) and float(problem.task(theta).m_w) == TASK.m_w
+    with pytest.raises(ValueError, match="'m_w' is not free in this problem"):
+        problem.theta({"m_w": 1.0})
+    with pytest.raises(ValueError, match=r"harmonic_frequency = 99\.0 lies outside"):
+        problem.theta({"harmonic_frequency": 99.0})
+    assert str(problem).startswith("problem of vastus-lateralis-26mvc") and "<table>" in problem._repr_html_()
+
+
+def test_the_prior_is_a_density_of_the_coordinates(problem):
+    """`ln N(z) + ln |dz/dθ|` with z the distance from the prior's centre in its standard deviations, from the parameters."""
+    theta = problem.theta({"k_w": 3e5, "harmonic_frequency": 7.0, "noise_K_z": 0.02})
+    sds = np.array([jm.PARAMETERS[name].prior_sd for name in problem.names])
+
+    def z(theta):
+        values = problem.parameters(theta)
+        return jnp.stack([jnp.log(values[name] / TASK[name]) for name in problem.names]) / sds
+
+    def density(theta):
+        return -0.5 * np.sum(np.asarray(z(theta)) ** 2) + np.linalg.slogdet(np.asarray(jax.jacfwd(z)(theta)))[1]
+
+    difference = float(problem.log_prior(theta) - problem.log_prior(problem.start))
+    assert difference == pytest.approx(density(theta) - density(problem.start), abs=1e-9)
+
+
+@pytest.mark.slow
+def test_log_density_and_its_slope(problem):
+    """The likelihood is that of `log_likelihood` but for a constant; both halves are differentiable."""
+    theta = problem.theta({"c_w": 90.0, "harmonic_frequency": 7.0})
+    both = jax.jit(problem.log_density)
+    bare = jm.Target("spectrum alone", TARGET.proportional_power, segments=TARGET.segments)  # its law is the same everywhere
+    alone = jm.problem(TASK, bare)
+    ours = float(alone.log_likelihood(theta) - alone.log_likelihood(alone.start))
+    theirs = float(jm.log_likelihood(alone.task(theta), bare) - jm.log_likelihood(TASK, bare))
+    assert ours == pytest.approx(theirs, abs=1e-6)
+    assert float(both(theta)) == pytest.approx(float(problem.log_likelihood(theta) + problem.log_prior(theta)), abs=1e-9)
+    slope, step = np.asarray(jax.grad(problem.log_density)(theta)), 1e-5 * np.eye(len(theta))
+    differences = [(float(both(theta + e)) - float(both(theta - e))) / 2e-5 for e in step]
+    np.testing.assert_allclose(slope, differences, rtol=1e-4, atol=1e-5)  # second-order differences of a smooth function
+
+
+@pytest.mark.slow
+def test_scipy_finds_the_minimum_of_the_fit(problem, result):
+    """In the two descents that a fit makes: what the harmonic holds of the bins is unknown first, then known.
+
+    A fit ends when two steps in a row gain less than 1e-4 of the cost; the table of starts is that of the first descent.
+    """
+    near = problem.theta({name: result[name].value for name in problem.names})
+    for turn, used in enumerate((problem, problem.scattering_as(near))):
+        given = jax.jit(used.residuals), near + 0.05 * (-1.0) ** np.arange(len(near)), jax.jit(jax.jacfwd(used.residuals))
+        found = scipy.optimize.least_squares(*given, ftol=1e-12, xtol=1e-12)
+        ours = 0.5 * float(jnp.sum(given[0](near) ** 2)) if turn else min(start.cost for start in result.starts)
+        assert found.success and found.cost == pytest.approx(ours, rel=1e-3)
+
+
+@pytest.mark.slow
+def test_another_optimiser_finds_the_same(result):
+    other = jm.fit(TASK, TARGET, **ALONE, optimiser=optx.Dogleg(rtol=1e-9, atol=1e-9))
+    assert other.success and other.settings["optimiser"] == "Dogleg" and "optimiser" not in result.settings
+    best, mine = (min(start.cost for start in each.starts) for each in (other, result))
+    assert best == pytest.approx(mine, rel=1e-3)
+
+
+def test_what_is_no_least_squares_solver_is_refused():
+    for wrong in (optx.BFGS(1e-3, 1e-3), "dogleg", optx.LevenbergMarquardt):
+        with pytest.raises(ValueError, match=r"^optimiser: this is .*jaxmuscle\.problem\(task, target\)"):
+            jm.fit(TASK, TARGET, optimiser=wrong)
+
+
+def test_a_target_without_scatter_has_residuals_but_no_density():
+    bare = jm.problem(TASK, jm.Target("bare", TARGET.proportional_power))
+    assert np.all(np.isfinite(bare.residuals(bare.start)))
+    with pytest.raises(ValueError, match="states neither segments nor sigma"):
+        bare.log_density(bare.start)
+
+
+def test_results_summarise_themselves(result):
+    summary = result.summary()
+    assert str(summary) == repr(summary) == str(result) == repr(result)
+    html = summary._repr_html_()
+    shown = (result.found | result.parameters).keys() - {"mean"}  # the other rows are per newton of it
+    assert html.count("<tr>") == 1 + len(shown) and ">determined<" in html
