@@ -249,6 +249,7 @@ class Direct(eqx.Module):
     model: None = None
     data: None = None
     linear: bool = eqx.field(static=True, default=False)
+    optimiser: None = None
 
     @property
     def parts(self):
