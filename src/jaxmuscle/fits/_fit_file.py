@@ -103,6 +103,7 @@ class SettingsTable(Table, kw_only=True):
     carried: Annotated[float | None, _told("By which the task was multiplied to come to the mean force")]
     spectrum: Annotated[dict[str, Any], _told("Spectrum settings; of several targets by name")]
     steps_per_sample: Annotated[Count, _told("Steps of dt between samples")]
+    optimiser: Annotated[str | None, _told("Solver, where another than Levenberg-Marquardt was asked for")] = None
     separate: Annotated[tuple[str, ...], _told("Of several targets only: parameters with a value for each")] = ()
     proportional: Annotated[tuple[str, ...], _told("Of several targets only: parameters whose ratio was kept")] = ()
 
