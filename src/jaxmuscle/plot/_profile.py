@@ -58,7 +58,7 @@ def profiles(profiles: Sequence[Any], ax: Axes | None = None) -> Figure | SubFig
     for number, found in enumerate(profiles, start=1):
         panel = profile(found, fig.add_subplot(rows, columns, number))
         panel.set_title("")
-        panel.set_ylabel("Rise of -2 ln L" if (number - 1) % columns == 0 else "")
+        panel.set_ylabel("Rise of -2 ln L")
         handles, labels = panel.get_legend_handles_labels()
         legend = panel.get_legend()
         if legend is not None:
