@@ -18,6 +18,7 @@ SRC = Path(__file__).parents[2] / "src"
 BEGIN = """
 import os, signal, socket, sys, time
 signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs ignore it
+signal.signal(signal.SIGHUP, signal.SIG_DFL)  # and what `nohup` started that one
 from jaxmuscle.commands import signals
 from jaxmuscle.__main__ import main
 def send(number):
