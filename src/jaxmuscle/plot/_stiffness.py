@@ -64,7 +64,7 @@ def stiffness_residuals(ax: Axes, part: Any) -> None:
     ax.axhline(0, color=BLACK, lw=0.6, zorder=2)
     log_axis(ax)
     ax.set(xlabel="Frequency (Hz)", ylabel="Residual (SE)", ylim=(-reach, reach))
-    ax.set_title("Stiffness: measured less fitted")
+    ax.set_title("Stiffness")
     legend(ax, "above")
 
 
