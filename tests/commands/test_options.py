@@ -24,7 +24,7 @@ VALID = {
 NUMBERS = ("nan", "inf", "-inf", "1e400", "-1", "9" * 40, "", "text", "1,5", "1e300", "0")
 WHOLE = (*NUMBERS, "1.5", "0x10")
 TEXTS = ("", "text", "..", "\x01", "a\nb")
-PATHS = ("missing.csv", "folder", "..", "r\n.csv", "x\0y.csv")
+PATHS = ("missing.csv", "folder", "..", "r\n.csv", "x\1y.csv")  # no argument holds a NUL
 # Zero is one of these; a number below 0 one of the others.
 ZERO = {"seed", "skip_rows", "max_gap", "rungs", "delay", "spread", "process_id", "rung", "alpha"}
 SIGNED = {"delay"}
