@@ -630,7 +630,7 @@ def test_an_interruption_before_the_first_step_writes_nothing(tmp_path, monkeypa
 
     monkeypatch.setattr(jm, "fit", interrupted)
     outcome = run("fit", csv_file(tmp_path), "--out", tmp_path / "out")
-    assert outcome.exit_code == 130 and "interrupted" in outcome.stderr
+    assert outcome.exit_code == 130 and "interrupted: nothing was written, the fit had no table yet" in outcome.stderr
     assert list((tmp_path / "out").iterdir()) == []
 
 

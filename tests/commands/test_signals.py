@@ -117,6 +117,7 @@ def test_while_a_compiled_program_runs():
 import jax
 signals.LIMIT = 0.5
 with signals.heard():
+    signals.stays("nothing was written")
     program = jax.jit(lambda x: jax.lax.while_loop(lambda x: x < 2, jax.numpy.cos, x)).lower(0.0).compile()
     print("begun", flush=True)
     program(0.0).block_until_ready()"""
@@ -124,7 +125,7 @@ with signals.heard():
     assert process.stdout is not None and process.stdout.readline() == "begun\n"
     time.sleep(0.5)
     process.send_signal(signal.SIGTERM)
-    ended(process, 143)
+    assert ended(process, 143) == "interrupted: nothing was written\n"
 
 
 @pytest.mark.slow

@@ -333,6 +333,7 @@ BAD_CSV = {
     "infinite power": (HEADER + "0.4,0.1\n0.8,inf\n", "line 3: proportional_power inf must"),
     "negative frequency": (HEADER + "-0.4,0.1\n0.8,0.2\n", "line 2: frequency -0.4 must"),
     "nan frequency": ("nan,0.1\n0.8,0.2\n", "line 1: frequency nan must"),
+    "no force has it": (HEADER + "0.4,0.1\n0.8,0.2\n4294967296,0.2\n", "line 4: frequency 4.29497e+09 Hz is above 5e+08 Hz"),
     "unsorted": (HEADER + "0.4,0.1\n1.2,0.2\n0.8,0.2\n", "line 4: frequency 0.8 Hz is out of order"),
     "duplicate": (HEADER + "0.4,0.1\n0.4,0.2\n", "line 3: frequency 0.4 Hz appears twice"),
     "sigma": ("frequency_hz,proportional_power,sigma\n0.4,0.1,0\n", "line 2: sigma 0 must"),
@@ -389,6 +390,10 @@ BAD_TOML = {
     "no reason": (dict(provenance='"reconstructed"'), "a reconstructed target needs a reason"),
     "settings": (dict(settings="3"), "settings must be a table"),
     "unknown setting": (dict(settings="{windw = 'hann'}"), "did you mean 'window'?"),
+    "above half the rate": (
+        dict(frequency_hz="[0.390625, 0.78125, 50.390625]", settings="{rate = 100.0}"),
+        "entry 3: frequency 50.3906 Hz is above 50 Hz, half of the rate in [settings]",
+    ),
     "wrong setting": (dict(settings="{overlap = 2.0}"), "[settings]: overlap=2.0"),
 }
 

@@ -78,6 +78,25 @@ def test_two_threads_fit():
     assert pairs(fitted, [0, 1, 1, 0]) == [alone[0], alone[1], alone[1], alone[0]]
 
 
+@pytest.mark.slow
+def test_two_threads_draw():
+    """Two posteriors of one fit, in threads that both miss the program."""
+    options = {"free": ("c_w", "noise_K_w"), "starts": 2, "seeds": 8, "check_seeds": 0, "rungs": 0}
+    result = jm.fit(jm.Isometric(), jm.load_target("vastus-lateralis-26mvc"), key=0, **options)
+
+    def drawn(key):
+        return jm.posterior(result, key=key, chains=2, draws=100, warmup=20).samples
+
+    together = pairs(drawn, [0, 1, 1, 0])
+    for key, found in zip([0, 1, 1, 0], together, strict=True):
+        assert found.keys() == together[key].keys() >= {"c_w", "noise_K_w"}
+        for name, draws in found.items():
+            np.testing.assert_array_equal(draws, together[key][name], name)
+    programs.forget()
+    np.testing.assert_array_equal(drawn(0)["c_w"], together[0]["c_w"])
+    assert np.any(together[0]["c_w"] != together[1]["c_w"])
+
+
 def test_files_written_by_threads_leave_the_umask(tmp_path):
     before = os.umask(0o027)
     try:

@@ -42,7 +42,9 @@ from .options import (
     names_in,
 )
 from .recordings import read_recordings, reads_perturbed, unused
-from .signals import interrupted
+from .signals import STAYS, interrupted, stays
+
+NOTHING = "nothing was written, the fit had no table yet"
 
 
 @reads_perturbed
@@ -200,7 +202,9 @@ def _fit_one(target: Any, model: Any, folder: Path, options: dict[str, Any], for
     def answer(result: Any) -> None:
         table(result)
         write_fit(result, folder)  # a program of the checks may run longer than a signal can wait
+        stays(STAYS)
 
+    stays(NOTHING)
     try:
         with told(True, f"fitting {target[0].name if isinstance(target, list) else target.name}") as tell:
             result = jm.fit(model, target, progress=tell, answer=answer, **options)
@@ -210,6 +214,11 @@ def _fit_one(target: Any, model: Any, folder: Path, options: dict[str, Any], for
         write_fit(stop.result, folder)
         record(folder / "fit.json")
         err.print(f"interrupted: what had been reached is in {folder}")
+        raise typer.Exit(interrupted()) from None
+    except KeyboardInterrupt:
+        if printed:
+            raise
+        err.print(f"interrupted: {NOTHING}")
         raise typer.Exit(interrupted()) from None
     record(folder / "fit.json")
     if not printed:

@@ -25,6 +25,7 @@ ENDING = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if h
 LATER = getattr(signal, "SIGALRM", None)
 OURS = [number for number in (*ENDING, LATER) if number is not None]
 IMPORTS = "<frozen importlib"
+STAYS = "what had been written before stays"
 SHOW_CURSOR = "\x1b[?25h"  # a bar of rich has hidden it
 
 
@@ -33,6 +34,7 @@ class Ear:
 
     def __init__(self) -> None:
         self.code = 0
+        self.stays = STAYS
         self.raised = False
         self.working = True
         self.wakes, self.woken = socket.socketpair()
@@ -86,7 +88,7 @@ class Ear:
                 break
         with contextlib.suppress(OSError):
             cursor = SHOW_CURSOR if os.isatty(2) else ""
-            os.write(2, f"{cursor}interrupted: what had been written before stays\n".encode())
+            os.write(2, f"{cursor}interrupted: {self.stays}\n".encode())
         leave(self.code)
 
 
@@ -113,10 +115,20 @@ def importing(frame: FrameType | None) -> bool:
     return False
 
 
+def ears() -> list[Ear]:
+    """Who listens now; the same one for several signals."""
+    return [handler for number in ENDING if isinstance(handler := signal.getsignal(number), Ear)]
+
+
 def interrupted() -> int:
     """Exit code of a command that was interrupted: 130, after a SIGTERM 143."""
-    ears = [handler for number in ENDING if isinstance(handler := signal.getsignal(number), Ear)]
-    return next((ear.code for ear in ears if ear.code), 128 + signal.SIGINT)
+    return next((ear.code for ear in ears() if ear.code), 128 + signal.SIGINT)
+
+
+def stays(said: str) -> None:
+    """What is told from now on of what is written, should the process have to be ended."""
+    for ear in ears():
+        ear.stays = said
 
 
 def leave(code: int) -> NoReturn:

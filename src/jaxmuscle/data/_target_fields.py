@@ -10,7 +10,7 @@ from jaxtyping import Float, Int
 
 from jaxmuscle._common.errors import TargetError
 from jaxmuscle._common.text import choices, listed
-from jaxmuscle.spectra._settings import SpectrumSettings
+from jaxmuscle.spectra._settings import FASTEST, SpectrumSettings
 
 Quantity = Literal["force", "torque", "displacement", "acceleration"]
 Provenance = Literal["measured", "digitised", "reconstructed", "user"]
@@ -43,6 +43,10 @@ def check_columns(columns: Columns, file: str, *, ordered: bool) -> None:
         where = f"{file}, {place}"
         if not (math.isfinite(frequency[i]) and frequency[i] >= 0):
             raise TargetError(f"{where}: frequency {frequency[i]:g} must be finite and not negative [Hz]")
+        if frequency[i] > FASTEST / 2:
+            raise TargetError(
+                f"{where}: frequency {frequency[i]:g} Hz is above {FASTEST / 2:g} Hz, half of the fastest rate"
+            )
         if not _usable(power[i]):
             problem = f"{where}: proportional_power {power[i]:g} must be finite and larger than 0"
             raise TargetError(f"{problem}; leave the row out if the power is not known")

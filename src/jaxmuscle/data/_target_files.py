@@ -144,7 +144,11 @@ def _parse_toml(text: str, file: str, axis: str) -> Raw:
     places = tuple(f"entry {i}" for i in range(1, lists[0].size + 1))
     columns = Columns(lists[0], lists[1], lists[2] if len(lists) > 2 else None, places)
     check_columns(columns, file, ordered=True)
-    fields["settings"] = settings_of(fields.get("settings", {}), f"{file}: [settings]")
+    stated = fields.get("settings", {})
+    settings = fields["settings"] = settings_of(stated, f"{file}: [settings]")
+    if "rate" in stated and columns.frequency.size and columns.frequency[-1] > settings.rate / 2:
+        said = f"{file}, {places[-1]}: frequency {columns.frequency[-1]:g} Hz is above {settings.rate / 2:g} Hz"
+        raise TargetError(f"{said}, half of the rate in [settings]; make one of both right")
     return Raw(file, fields, columns, [])
 
 
@@ -238,7 +242,7 @@ def on_grid(raw: Raw) -> tuple[OnBins, list[str]]:
     """
     columns, settings, trials = raw.columns, raw.fields["settings"], raw.fields.get("trial_power")
     with np.errstate(over="ignore"):
-        position = np.minimum(columns.frequency / settings.resolution, 1e9)
+        position = np.minimum(columns.frequency / settings.resolution, 2.0**53)
     tolerance = np.full(position.size, PIXEL_TOLERANCE if raw.digitised else GRID_TOLERANCE)
     if raw.log_frequency:
         tolerance = np.maximum(tolerance, PIXEL_OF_LOG * position)
