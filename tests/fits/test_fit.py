@@ -706,6 +706,9 @@ def test_an_interrupted_fit_holds_what_had_been_reached(stage):
         jm.fit(jm.Isometric(), simple_target(), free=FEW, progress=interrupt, **QUICK)
     result = caught.value.result
     assert not result.success and "interrupted after 2 steps" in result.message
+    (task,) = caught.value.tasks
+    assert {name: task[name] for name in FEW} == {name: result.task[name] for name in FEW}
+    assert any(task[name] != jm.Isometric()[name] for name in FEW)
     assert np.all(np.isfinite(result.fitted)) and result.chi2_per_bin is not None
     assert all(start.steps <= (2 if stage == "trying starts" else 12) for start in result.starts)
 

@@ -17,13 +17,14 @@ from rich.console import Console
 import jaxmuscle as jm
 
 from .options import SAME_NAME, Observed, TaskName
-from .signals import interrupted
+from .signals import interrupted, stays
 
 if TYPE_CHECKING:
-    from jaxmuscle.fits import FitResult
+    from jaxmuscle.fits import FitInterrupted, FitResult
 
 
 CONVERGED, NOT_CONVERGED, BAD_INPUT = 0, 1, 2
+REACHED = "reached.toml"
 
 out = Console(soft_wrap=False)
 err = Console(stderr=True, soft_wrap=not sys.stderr.isatty())  # a message is one line of a log
@@ -151,13 +152,19 @@ def _field(value: Any) -> str:
     return f"{value:.8g}"
 
 
+def write_reached(stop: "FitInterrupted", folder: Path) -> None:
+    """Where an interrupted fit stood, a preset: to report the fit may take longer than a signal can wait."""
+    jm.save_preset(folder / REACHED, stop.tasks[0], description="where a fit stood when it was interrupted")
+    stays(f"the best parameters so far are in {folder / REACHED}")
+
+
 def write_fit(result: "FitResult", folder: Path, formats: Iterable[str] = ()) -> list[str]:
     """fit.json, fit in each of the formats, and the tables of what was fitted, each whole or not there; their names."""
     from jaxmuscle._common.figures import remove_figures, write_figure
     from jaxmuscle._common.files import remove, write_text
 
     tables = fit_tables(result)
-    remove(folder, *tables)
+    remove(folder, *tables, REACHED)
     remove_figures(folder, "fit")
     result.save(folder / "fit.json")
     for name, columns in tables.items():

@@ -21,6 +21,7 @@ from .console import (
     show,
     writable,
     write_fit,
+    write_reached,
 )
 from .options import (
     Fix,
@@ -211,6 +212,8 @@ def _fit_one(target: Any, model: Any, folder: Path, options: dict[str, Any], for
             tell("writing", 1.0)
             files = write_fit(result, folder, formats)
     except jm.fits.FitInterrupted as stop:
+        if not printed:
+            write_reached(stop, folder)
         write_fit(stop.result, folder)
         record(folder / "fit.json")
         err.print(f"interrupted: what had been reached is in {folder}")

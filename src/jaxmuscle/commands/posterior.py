@@ -8,7 +8,20 @@ import typer
 import jaxmuscle as jm
 from jaxmuscle._common.progress import told
 
-from .console import CONVERGED, NOT_CONVERGED, aim_of, err, out, plain, record, reporting, show, writable
+from .console import (
+    CONVERGED,
+    NOT_CONVERGED,
+    REACHED,
+    aim_of,
+    err,
+    out,
+    plain,
+    record,
+    reporting,
+    show,
+    writable,
+    write_reached,
+)
 from .options import (
     Fix,
     Force,
@@ -64,6 +77,7 @@ def posterior(
     """
     with reporting(as_json):
         from jaxmuscle._common.environment import keep_compiled_programs
+        from jaxmuscle._common.files import remove
 
         keep_compiled_programs()
         taken_up = Path(target).resolve() == (output / "fit.json").resolve()
@@ -72,13 +86,16 @@ def posterior(
         try:
             result = _fitted(target, {"segments": segments, "quantity": quantity}, asked, seed)
         except jm.fits.FitInterrupted as stop:
+            write_reached(stop, output)
             stop.result.save(output / "fit.json")
+            remove(output, REACHED)
             err.print(f"what the fit had reached is in {output}/fit.json")
             raise
         if not result.success:
             err.print(f"[bold red]failed:[/] the fit did not converge: {plain(result.message)}", highlight=False)
             raise typer.Exit(NOT_CONVERGED)
         result.save(output / "fit.json")
+        remove(output, REACHED)
         try:
             with told(True, f"posterior of {result.target.name}") as tell:
                 found = jm.posterior(result, key=seed, chains=chains, draws=draws, warmup=warmup, progress=tell)

@@ -1,6 +1,7 @@
 """The search of a fit: many starts, the best minima polished, whatever was reached when interrupted."""
 
 import dataclasses
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -35,11 +36,20 @@ STILL = 2e-3
 
 
 class FitInterrupted(KeyboardInterrupt):
-    """A fit was interrupted; `result` holds what had been reached."""
+    """A fit was interrupted; `tasks`, one for each target, are the best that had been reached, `result` is the fit at these.
 
-    def __init__(self, result: FitResult):
+    `report` makes the result when it is asked for. Programs may have to be compiled for that.
+    """
+
+    def __init__(self, tasks: tuple[AbstractTask, ...], report: Callable[[], FitResult]):
         super().__init__("fit interrupted")
-        self.result = result
+        self.tasks = tasks
+        self.report = report
+
+    @functools.cached_property
+    def result(self) -> FitResult:
+        with jax.enable_x64(True):
+            return self.report()
 
 
 def search(plan: Plan, answer: Callable[[FitResult], None] | None = None, models: Models | None = None) -> FitResult:
@@ -74,7 +84,7 @@ def search(plan: Plan, answer: Callable[[FitResult], None] | None = None, models
     if not stages:
         raise KeyboardInterrupt("fit interrupted before its first step")
     if interrupted:
-        raise FitInterrupted(_unchecked(plan, stages, ladder, interrupted=True))
+        raise _stopped(plan, stages, ladder, interrupted=True)
     problem, ended = plan.problem, Endpoint.of(plan.problem, stages[-1])
     if answer is not None:
         found = _unchecked(plan, stages, ladder, ended)
@@ -87,9 +97,16 @@ def search(plan: Plan, answer: Callable[[FitResult], None] | None = None, models
             said = line_or_resonance(plan, result.task, ladder, models, _descended)
             result = dataclasses.replace(result, notices=(*result.notices, *said))
     except KeyboardInterrupt:
-        raise FitInterrupted(_unchecked(plan, stages, ladder, ended)) from None
+        raise _stopped(plan, stages, ladder, ended) from None
     problem.tell("done", 1.0)
     return result
+
+
+def _stopped(plan: Plan, stages: list[Stage], *reached: Any, **how: Any) -> FitInterrupted:
+    """Where the search stands, and what reports it."""
+    found = stages[-1].minima
+    tasks = plan.problem.tasks_at(np.asarray(plan.problem.coordinates.theta(found.s[found.best])))
+    return FitInterrupted(tasks, lambda: _unchecked(plan, stages, *reached, **how))
 
 
 def _unchecked(
