@@ -191,10 +191,9 @@ def packed_mat(path):
 
 
 def declared_tar(path):
-    with tarfile.open(path, "w") as archive:
-        entry = tarfile.TarInfo("wpd.json")
-        entry.size = 10**12
-        archive.addfile(entry)
+    entry = tarfile.TarInfo("wpd.json")
+    entry.size = 10**12
+    path.write_bytes(entry.tobuf() + bytes(2 * tarfile.BLOCKSIZE))
 
 
 BOMBS = {

@@ -113,16 +113,23 @@ class Body:
         stream = io.BytesIO(self.data)
         stream.seek(self.start)
         comma = self.delimiter != "," and any("," in cell for cell in self.sample)
+        # Before pandas 3.1 the last bit may be wrong unless it is asked for; from then on to ask is deprecated.
+        older = tuple(map(int, pandas.__version__.split(".")[:2])) < (3, 1)
         parts = pandas.read_csv(
             stream, sep=self.delimiter or r"\s+", header=None, names=range(self.width + self.trailing), usecols=[index],
             index_col=False, dtype=float, na_values=_WRITTEN, keep_default_na=False, skipinitialspace=True,
             decimal="," if comma else ".", chunksize=_ROWS, encoding_errors="replace",
+            float_precision="round_trip" if older else None,
         )  # fmt: skip
         return np.concatenate([part[index].to_numpy() for part in parts])
 
     def _slowly(self, index: int, name: str) -> Float[np.ndarray, " rows"]:
         values, value = array.array("d"), _moment if index in self.moments else number_in
         for number, cells in self.rows():
+            if len(cells) <= index:  # a quotation mark that is not closed hides the delimiters behind it
+                raise ValueError(
+                    f'{self.file}, line {number}: {len(cells)} of {self.width} columns found; look for a stray "'
+                )
             cell = cells[index]
             try:
                 values.append(float("nan") if cell.casefold() in MISSING else value(cell, self.delimiter))

@@ -86,6 +86,7 @@ def _rounded(rate: float) -> float:
     return float(round(rate)) if abs(rate - round(rate)) < 1e-6 * rate else rate
 
 
+@np.errstate(over="ignore", invalid="ignore")  # of times that no recording has: they are refused
 def _rate(table: Table, clock: Clock, rows: int) -> tuple[float, float, float] | None:
     """Rate [Hz], first time [s] and relative uncertainty of the rate from the time column; `None` for another length.
 
