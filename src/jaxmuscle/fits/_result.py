@@ -135,7 +135,7 @@ class FitResult(Result, eqx.Module):
         if not self.success:
             return f"not fitted: {self.message}"
         if self.adequacy is None:
-            return "cannot be judged: the target does not say how much its powers scatter (segments or sigma)"
+            return "cannot be judged: the target does not say how much its powers scatter (give segments or sigma)"
         data = sum(part.data for part in self.parts.values())
         each = "bin" if all(part.stiffness is None for part in self.parts.values()) else "datum"
         found = f"chi2 per {each} {self.adequacy.chi2 / data:.2g}, {probability(self.adequacy.p)}"

@@ -40,8 +40,10 @@ def card_of(result: "FitResult") -> Card:
 
 def _heading(result: "FitResult") -> str:
     """The verdict as a sentence of its own."""
-    said = result.verdict
-    return f"The model {said}" if result.adequate is not None and result.success else said[0].upper() + said[1:]
+    if not result.success:
+        return result.verdict[0].upper() + result.verdict[1:]
+    subject = "The model" if result.adequate is not None else "Whether the model describes the data"
+    return f"{subject} {result.verdict}"
 
 
 def text_of(result: "FitResult") -> str:
