@@ -409,7 +409,7 @@ def test_several_targets_have_a_folder_each(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("result", "code", "word"),
     [
-        (made_result(), 0, "Describes the data: "),
+        (made_result(), 0, "The model describes the data: "),
         (made_result(success=False), 1, "Not fitted: "),
         (failed_result(), 1, "Not fitted: "),
     ],

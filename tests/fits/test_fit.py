@@ -36,8 +36,8 @@ from jaxmuscle.simulation._grid import Grid
 from jaxmuscle.spectra._bin_law import bin_statistics
 from jaxmuscle.spectra._settings import WINDOW
 
-PERTURBATION = "all noise amplitudes and the harmonic's can be scaled together"
-MECHANICS = "stiffness and damping can be scaled together"
+PERTURBATION = "all noise amplitudes and the harmonic's can be multiplied by one number"
+MECHANICS = "stiffness and damping can all be multiplied by one number"
 HALF_BIN = 0.390625 / 2
 VASTUS = jm.load_target("vastus-lateralis-26mvc")
 QUICK: dict[str, Any] = {"starts": 2, "seeds": 8, "check_seeds": 16}
