@@ -136,7 +136,7 @@ def ensemble(  # pyright: ignore[reportInconsistentOverload]
     if chunk is not None:
         count("chunk", chunk, 1)
     if resume and overwrite:
-        raise ValueError("resume continues a store, overwrite replaces it: give one of the two")
+        raise ValueError("resume (--resume) continues a store, overwrite (--force) replaces it: give one of the two")
     if (resume or states) and store is None:
         raise ValueError(f"{'resume' if resume else 'states'} = True belongs to a store: give store=")
     levels, draws = _levels(reduce), Draws.of(generator, increments)
