@@ -44,8 +44,8 @@ hide: [navigation]
 # Gallery
 
 Use this page to find a figure by its looks. It shows every figure that jaxmuscle draws, with the code below it. Each section
-begins with a block of code. Run the blocks one after another: the figures of a section use its names. Click on a figure to see
-it whole.
+begins with a block of code. Run the blocks one after another: the figures of a section use its names. Click on a figure to
+see it whole.
 
 Every figure is a function of [`jm.plot`](reference/figures.md), and can also be drawn into axes of yours. `docs/gallery.py`
 makes this page and its figures.
@@ -53,8 +53,8 @@ makes this page and its figures.
 TAIL = """
 ## A Hill-type muscle
 
-You can use a [muscle of your own](own-muscle.md). `python docs/hill_muscle.py` draws one, and its spectrum with two colours of
-noise.
+You can use a [muscle of your own](own-muscle.md). `python docs/hill_muscle.py` draws one, and its spectrum with two colours
+of noise.
 
 [![Force-length, force-velocity and tendon curves; isometric force spectrum](hill.png)](hill.png)
 """
@@ -134,13 +134,17 @@ SECTIONS = (
     )),
     Section("Simulations", SIMULATED, (
         Shown("gallery/simulation.png", "jm.plot.simulation(runs)", "Output, its analysed window, spectra", "model.md"),
-        Shown("gallery/trajectory.png", "runs.plot(window=(10.0, 15.0))", "200 seeds: their mean, their 90 % band, and three of them", "model.md"),
-        Shown("gallery/spectrum.png", "runs.spectrum().plot(log=True, proportional=False)", "The spectra of these 200 seeds", "model.md"),
-        Shown("gallery/estimate.png", "runs.mean_spectrum().plot(log=True)", "Their mean spectrum, with and without control variate",
+        Shown("gallery/trajectory.png", "runs.plot(window=(10.0, 15.0))",
+              "200 seeds: their mean, their 90 % band, and three of them", "model.md"),
+        Shown("gallery/spectrum.png", "runs.spectrum().plot(log=True, proportional=False)",
+              "The spectra of these 200 seeds", "model.md"),
+        Shown("gallery/estimate.png", "runs.mean_spectrum().plot(log=True)",
+              "Their mean spectrum, with and without control variate",
               "model.md"),
         Shown("gallery/moments.png", "summary.plot()", "Mean and band of 2000 seeds, of which none is kept", "ensembles.md"),
         Shown("gallery/sweep.png", "ax", "A sweep: three dampings with the same noise", "ensembles.md"),
-        Shown("gallery/sensitivity.png", "jm.sensitivity(result.task).plot()", "How much each parameter changes each bin", "model.md"),
+        Shown("gallery/sensitivity.png", "jm.sensitivity(result.task).plot()",
+              "How much each parameter changes each bin", "model.md"),
         Shown("gallery/static.png", "jm.static_characteristics(result.task).plot()",
               "Stiffness, damping and force against displacement and velocity", "scaling.md"),
     )),
@@ -155,9 +159,12 @@ SECTIONS = (
               "identifiability.md"),
         Shown("gallery/designed_input.png", "jm.design_input(result).plot()", "A motion made to measure stiffness",
               "perturbed-design.md"),
-        Shown("gallery/goodness.png", "jm.goodness(result).plot()", "Is the model right? Residuals against what is usual", "goodness.md"),
-        Shown("gallery/bootstrap.png", "jm.bootstrap(result).plot()", "Are the stated errors right? Refits of simulated data", "goodness.md"),
-        Shown("gallery/comparison.png", "jm.compare_noise(jm.Isometric(), target).plot()", "Which noise? Models compared", "noise-colour.md"),
+        Shown("gallery/goodness.png", "jm.goodness(result).plot()",
+              "Is the model right? Residuals against what is usual", "goodness.md"),
+        Shown("gallery/bootstrap.png", "jm.bootstrap(result).plot()",
+              "Are the stated errors right? Refits of simulated data", "goodness.md"),
+        Shown("gallery/comparison.png", "jm.compare_noise(jm.Isometric(), target).plot()",
+              "Which noise? Models compared", "noise-colour.md"),
     )),
     Section("Recordings, people, several measurements", PEOPLE, (
         Shown("gallery/recording.png", "recording.steady().plot()", "A recording and its steady window", "recordings.md"),
@@ -167,7 +174,8 @@ SECTIONS = (
               "recordings.md#steadiness"),
         Shown("gallery/cohort.png", "cohort.plot()", "What six people's spectra determine", "fitting.md#many-targets"),
         Shown("gallery/groups.png", 'cohort.plot(by="group")', "The same six people by group", "fitting.md#many-targets"),
-        Shown("gallery/levels.png", 'cohort.plot(by="level")', "The same six people by level of contraction", "fitting.md#many-targets"),
+        Shown("gallery/levels.png", 'cohort.plot(by="level")',
+              "The same six people by level of contraction", "fitting.md#many-targets"),
         Shown("gallery/joint.png", "jm.fit_joint({name: people[name] for name in pair}, tasks=pair).plot()",
               "Two measurements fitted together", "identifiability.md#a-joint-fit"),
     )),
@@ -176,7 +184,8 @@ SECTIONS = (
               "perturbed.md"),
         Shown("gallery/fitted_stiffness.png", "jm.fit(jm.PrescribedLength(), minute).plot()",
               "A muscle fitted to such a minute: its stiffness and its fluctuations", "perturbed.md#fit-it"),
-        Shown("gallery/frequency_response.png", "perturbed.frequency_response().plot()", "The dynamic stiffness with its errors",
+        Shown("gallery/frequency_response.png", "perturbed.frequency_response().plot()",
+              "The dynamic stiffness with its errors",
               "perturbed.md"),
     )),
     Section("A study", STUDY, (

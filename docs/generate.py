@@ -53,8 +53,8 @@ FIT = """
 ## In a fit
 
 A fit has a prior for every free parameter. It is centred on the value that the parameter has in the task which you pass in.
-*prior sd* is its standard deviation. A positive parameter is fitted in *log space*: there *prior sd* is that of the logarithm.
-For the others it is in the parameter's own unit. *Reached by a fit* are the bounds of the search.
+*prior sd* is its standard deviation. A positive parameter is fitted in *log space*: there *prior sd* is that of the
+logarithm. For the others it is in the parameter's own unit. *Reached by a fit* are the bounds of the search.
 
 | name | log space | prior sd | reached by a fit | source of the default |
 |---|---|---|---|---|
@@ -63,8 +63,8 @@ TAIL = """
 ## Units
 
 All units are SI: masses in kg, lengths in m, forces in N, times in s, frequencies in Hz, angles in rad. `k` [N/m³] times a
-squared length is a stiffness [N/m]. `c` [N s³/m³] times a squared velocity is a damping coefficient [N s/m]. The unit 1 means
-a ratio: amplitudes of noise and harmonic are fractions of the coefficient at rest.
+squared length is a stiffness [N/m]. `c` [N s³/m³] times a squared velocity is a damping coefficient [N s/m]. The unit 1
+means a ratio: amplitudes of noise and harmonic are fractions of the coefficient at rest.
 
 ::: jaxmuscle.PARAMETERS
 
@@ -75,20 +75,20 @@ The table by name, a dictionary of `Parameter`.
 FILES = Path(__file__).parent / "reference" / "files.md"
 FILES_HEAD = """# Files, key by key
 
-Look here if you write one of these files by hand, or read one with a program of yours. For each kind of file there is a table
-of all its keys. *Since* is the first version of the format that has the key. A later version of jaxmuscle reads earlier
+Look here if you write one of these files by hand, or read one with a program of yours. For each kind of file there is a
+table of all its keys. *Since* is the first version of the format that has the key. A later version of jaxmuscle reads earlier
 formats.
 
-Files are checked when they are read. A key that is unknown, missing, there twice, of a wrong type or out of range is an error
-that names the file and the key. No missing key is replaced by a default without a word. Numbers must be finite. `true` is not
-1, and `1.0` is not a whole number. `docs/generate.py` writes this page from the code that checks the files.
+Files are checked when they are read. A key that is unknown, missing, there twice, of a wrong type or out of range is an
+error that names the file and the key. No missing key is replaced by a default without a word. Numbers must be finite.
+`true` is not 1, and `1.0` is not a whole number. `docs/generate.py` writes this page from the code that checks the files.
 """
 FIT_FILE = """JSON, format 3. `FitResult.save` writes it and `load_result` reads it. `load_preset` reads its `task_table`
-alone. A fit of one target has the keys of the first two tables side by side. In a fit of several targets the keys of the second
-table stand under `parts`, by the name of the target. Keys must agree: the value of a parameter with its `task_table`, the
+alone. A fit of one target has the keys of the first two tables side by side. In a fit of several targets the keys of the
+second table stand under `parts`, by the name of the target. Keys must agree: the value of a parameter with its `task_table`, the
 spectrum with its `target_table`. In format 2 keys may be missing that task and target do not have."""
-PRESET = """TOML, format 2. `save_preset` writes it and `load_preset` reads it. The `task_table` has every field of the task and
-of its parts. `type` is the class of a part. What a task does not have (`activation`, `initial`, a low-pass) is `"none"`. In
+PRESET = """TOML, format 2. `save_preset` writes it and `load_preset` reads it. The `task_table` has every field of the task
+and of its parts. `type` is the class of a part. What a task does not have (`activation`, `initial`, a low-pass) is `"none"`. In
 format 1, which has no key `format`, these may be missing."""
 TARGET = """TOML, format 1. `Target.save` writes it and `load_target` reads it. The `target_table` of a fit.json has the same
 keys without `format`, and `null` for what is not stated."""

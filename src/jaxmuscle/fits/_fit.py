@@ -117,6 +117,6 @@ def _top(task: AbstractTask, target: Target, options: FitOptions, *, chosen: boo
     if options.rungs >= len(RUNGS):
         raise ValueError(f"rungs = {options.rungs}: the highest is {len(RUNGS) - 1}")
     if options.rungs and not possible:
-        raise ValueError("rungs: richer models can be tried only if the method is 'linear', the residual is 'log', the target "
+        raise ValueError("rungs: richer models can be tried only if the method is 'linear', the residual 'log', the target "
                          "states segments or sigma, and the task has no activation or resonance yet")  # fmt: skip
     return options.rungs
