@@ -75,23 +75,25 @@ The table by name, a dictionary of `Parameter`.
 FILES = Path(__file__).parent / "reference" / "files.md"
 FILES_HEAD = """# Files, key by key
 
-Look here if you write one of these files by hand, or read one with a program of yours. For each kind of file there is a
-table of all its keys. *Since* is the first version of the format that has the key. A later version of jaxmuscle reads earlier
-formats.
+Look here if you write one of these files by hand, or read one with a program of yours. For each kind of file there is
+a table of all its keys. *Since* is the first version of the format that has the key. A later version of jaxmuscle
+reads earlier formats.
 
-Files are checked when they are read. A key that is unknown, missing, there twice, of a wrong type or out of range is an
-error that names the file and the key. No missing key is replaced by a default without a word. Numbers must be finite.
-`true` is not 1, and `1.0` is not a whole number. `docs/generate.py` writes this page from the code that checks the files.
+Files are checked when they are read. A key that is unknown, missing, there twice, of a wrong type or out of range is
+an error that names the file and the key. No missing key is replaced by a default without a word. Numbers must be
+finite. `true` is not 1, and `1.0` is not a whole number. `docs/generate.py` writes this page from the code that
+checks the files.
 """
-FIT_FILE = """JSON, format 3. `FitResult.save` writes it and `load_result` reads it. `load_preset` reads its `task_table`
-alone. A fit of one target has the keys of the first two tables side by side. In a fit of several targets the keys of the
-second table stand under `parts`, by the name of the target. Keys must agree: the value of a parameter with its `task_table`, the
-spectrum with its `target_table`. In format 2 keys may be missing that task and target do not have."""
-PRESET = """TOML, format 2. `save_preset` writes it and `load_preset` reads it. The `task_table` has every field of the task
-and of its parts. `type` is the class of a part. What a task does not have (`activation`, `initial`, a low-pass) is `"none"`. In
-format 1, which has no key `format`, these may be missing."""
-TARGET = """TOML, format 1. `Target.save` writes it and `load_target` reads it. The `target_table` of a fit.json has the same
-keys without `format`, and `null` for what is not stated."""
+FIT_FILE = """JSON, format 3. `FitResult.save` writes it and `load_result` reads it. `load_preset` reads its
+`task_table` alone. A fit of one target has the keys of the first two tables side by side. In a fit of several targets
+the keys of the second table stand under `parts`, by the name of the target. Keys must agree: the value of a parameter
+with its `task_table`, the spectrum with its `target_table`. In format 2 keys may be missing that task and target do
+not have."""
+PRESET = """TOML, format 2. `save_preset` writes it and `load_preset` reads it. The `task_table` has every field of
+the task and of its parts. `type` is the class of a part. What a task does not have (`activation`, `initial`, a low-
+pass) is `"none"`. In format 1, which has no key `format`, these may be missing."""
+TARGET = """TOML, format 1. `Target.save` writes it and `load_target` reads it. The `target_table` of a fit.json has
+the same keys without `format`, and `null` for what is not stated."""
 STUDY = """TOML. `run_study` reads it. The second table has the columns of a study.csv."""
 F = _fit_file
 SECTIONS = (
