@@ -90,8 +90,8 @@ the keys of the second table stand under `parts`, by the name of the target. Key
 with its `task_table`, the spectrum with its `target_table`. In format 2 keys may be missing that task and target do
 not have."""
 PRESET = """TOML, format 2. `save_preset` writes it and `load_preset` reads it. The `task_table` has every field of
-the task and of its parts. `type` is the class of a part. What a task does not have (`activation`, `initial`, a low-
-pass) is `"none"`. In format 1, which has no key `format`, these may be missing."""
+the task and of its parts. `type` is the class of a part. What a task does not have (`activation`, `initial`, a
+low-pass) is `"none"`. In format 1, which has no key `format`, these may be missing."""
 TARGET = """TOML, format 1. `Target.save` writes it and `load_target` reads it. The `target_table` of a fit.json has
 the same keys without `format`, and `null` for what is not stated."""
 STUDY = """TOML. `run_study` reads it. The second table has the columns of a study.csv."""
@@ -170,7 +170,8 @@ def files_page() -> str:
             text += f"\n### {(table.__doc__ or '').strip().rstrip('.')}\n\n"
             text += "| key | type and range | required | since | meaning |\n|---|---|---|---|---|\n"
             for field in msgspec.structs.fields(table):
-                given, about = typing.get_args(hints[field.name])[:2]
+                given, *limits, about = typing.get_args(hints[field.name])
+                given = typing.Annotated[given, *limits] if limits else given  # an Annotated within one is flattened
                 told = about.extra["type"] if about.extra else kind(given)
                 needed = "yes" if field.required else "no"
                 text += f"| `{field.name}` | {told} | {needed} | {since} | {about.description} |\n"
