@@ -135,9 +135,7 @@ def absent(*results: Path, force: bool) -> None:
     """Raise a `ValueError` for a result that is there already, unless it may be overwritten."""
     for path in results:
         if path.exists() and not force:
-            raise ValueError(
-                f"{path}: is there already, from an earlier run; overwrite it with --force, or give another name"
-            )
+            raise ValueError(f"{path}: is there already; overwrite it with --force, or give another name")
 
 
 def csv_text(columns: dict[str, Any]) -> str:
