@@ -285,7 +285,7 @@ BAD = {
     "time not uniform": (GAP, {}, "is not uniform: after 0.019 s (line 21) comes 0.021 s"),
     "time beyond all": (H + "1e400,1\n0.001,2\n0.002,3\n", {}, "line 2: time column 'time' holds no number"),
     "time nearly so": (H + "0,1\n0.001,2\n1e308,3\n", {}, "is not uniform: after 0.001 s (line 3) comes 1e+308 s"),
-    "open quotation": (H + '0,1\n"0.001,2\n0.002,3\n', {}, "line 3: 1 of 2 columns found; a quotation mark"),
+    "open quotation": (H + ROWS + '"0.040,1\n', {}, "line 42: 1 of 2 columns found; a quotation mark"),
     "time backwards": (H + "0,1\n0.002,2\n0.001,3\n", {}, "line 4: time column 'time' runs backwards"),
     "time missing": (H + "0,1\n,2\n0.002,3\n", {}, "line 3: time column 'time' holds no number"),
     "time stands": (H + "1,1\n1,2\n", {}, "time column 'time' stands still at 1"),

@@ -127,9 +127,8 @@ class Body:
         values, value = array.array("d"), _moment if index in self.moments else number_in
         for number, cells in self.rows():
             if len(cells) <= index:  # a quotation mark that is not closed hides the delimiters behind it
-                raise ValueError(
-                    f'{self.file}, line {number}: {len(cells)} of {self.width} columns found; look for a stray "'
-                )
+                found = f"{len(cells)} of {self.width} columns found"
+                raise ValueError(f'{self.file}, line {number}: {found}; a quotation mark (") may be open')
             cell = cells[index]
             try:
                 values.append(float("nan") if cell.casefold() in MISSING else value(cell, self.delimiter))
