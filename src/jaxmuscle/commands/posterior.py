@@ -25,6 +25,7 @@ from .options import (
     formats_of,
     names_in,
 )
+from .reports import posterior_report
 
 if TYPE_CHECKING:
     from jaxmuscle.fits import FitResult
@@ -51,7 +52,7 @@ def posterior(
     """Draw from the posterior of the muscle's parameters: how sure is the fit.
 
     Fits first (unless given a fit.json), then runs NUTS chains with the likelihood of the Welch bins. Writes DIR/fit.json,
-    DIR/posterior.nc (for ArviZ), DIR/posterior.json, corner.png, predictive.png and chains.png. Exit code 1 if the fit
+    DIR/posterior.nc (for ArviZ), DIR/posterior.json, corner.png, predictive.png, chains.png and report.html. Exit code 1 if the fit
     failed or the chains did not mix: then there is no summary.
 
     Examples:
@@ -117,10 +118,12 @@ def _write(found: "Posterior", folder: Path, formats: list[str]) -> None:
     remove_figures(folder, "corner", "predictive")
     found.save(folder / "posterior.nc")
     found.save(folder / "posterior.json")
-    write_figure(found.plot_chains(), folder, "chains", formats)
+    figures: dict[str, Any] = {"chains": found.plot_chains()}
     if found.success:
-        write_figure(found.plot(), folder, "corner", formats)
-        write_figure(found.plot_predictive().figure, folder, "predictive", formats)
+        figures |= {"corner": found.plot(), "predictive": found.plot_predictive().figure}
+    posterior_report(found, figures, folder)
+    for name, figure in figures.items():
+        write_figure(figure, folder, name, formats)
 
 
 def _show(found: "Posterior", folder: Path) -> None:

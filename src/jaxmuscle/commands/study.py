@@ -10,6 +10,7 @@ import jaxmuscle as jm
 from .console import CONVERGED, NOT_CONVERGED, err, out, plain, record, reporting, show, writable
 from .options import READING, Force, Formats, Json, NoiseName, Output, Seed, SpectrumName, Window, formats_of, names_in
 from .recordings import edges_of, reads_recordings
+from .reports import study_report
 
 
 @reads_recordings
@@ -34,8 +35,8 @@ def study(
 
     The table has a line for each recording, with the columns file and person; also group, condition and trial, if you have
     these. The trials of a person in a condition are averaged. Options such as --column say how files are read where the
-    table does not say it. Writes DIR/people.csv, differences.csv, study.json, spectra.png, quantities.png and methods.txt,
-    all at the end.
+    table does not say it. Writes DIR/people.csv, differences.csv, study.json, spectra.png, quantities.png, methods.txt and
+    report.html, all at the end.
 
     Examples:
 
@@ -70,6 +71,7 @@ def study(
             said = "all" if len(names) == len(found.cells) else "; ".join(names)
             err.print(f"[yellow]notice:[/] {plain(said)}: {plain(notice)}", highlight=False)
         found.save(output, formats_of(formats))
+        study_report(found, output)
         record(output / "study.json")
         show(found, success=found.success)
         files = ", ".join(sorted(path.name for path in output.iterdir()))
