@@ -27,14 +27,15 @@ h1{font-size:1.5rem;line-height:1.25;overflow-wrap:anywhere}h2{font-size:1.2rem;
 figure{margin:1rem 0}figcaption{font-size:.9rem;color:var(--soft)}
 img{max-width:100%;height:auto;display:block;background:#fff;border-radius:4px}
 table{border-collapse:collapse;width:100%;font-size:.9rem}th,td{text-align:left;vertical-align:top;padding:.4rem .6rem;
-border-bottom:1px solid var(--line);overflow-wrap:anywhere}thead th{border-bottom:2px solid var(--strong)}
+border-bottom:1px solid var(--line)}thead th{border-bottom:2px solid var(--strong)}
 p,li{overflow-wrap:anywhere}.scroll{overflow-x:auto}
 pre,code{font-family:ui-monospace,monospace;font-size:.85rem}
 pre{white-space:pre-wrap;overflow-wrap:anywhere;background:var(--box);padding:.6rem .8rem;border-radius:4px}
 .verdict{font-weight:600}.yes{color:var(--yes)}.grid{color:var(--link)}.no{color:var(--no)}.open{color:var(--soft)}
 @media screen and (max-width:46rem){table.stack thead{position:absolute;left:-999rem}table.stack tr{display:block;
-padding:.5rem 0;border-bottom:2px solid var(--line)}table.stack td{display:block;border:0;padding:.1rem 0}
-table.stack td:empty{display:none}table.stack td::before{content:attr(data-label);display:block;font-size:.75rem;
+padding:.5rem 0;border-bottom:2px solid var(--line)}table.stack td{display:block;border:0;padding:.1rem 0;
+overflow-wrap:anywhere}
+table.stack td:empty{display:none}table.stack td::before{content:attr(data-label) ": ";font-size:.8rem;
 color:var(--soft)}table.stack td:first-child{font-weight:600}table.stack td:first-child::before{display:none}}
 @media print{body{max-width:none;padding:0;font-size:10pt}h2{break-after:avoid}tr,figure,pre{break-inside:avoid}
 figure img{max-height:22cm;width:auto}a{color:inherit}@page{margin:16mm}}
@@ -82,7 +83,10 @@ def code(text: str) -> Html:
 
 
 def table(columns: Sequence[str], rows: Iterable[Sequence[str]]) -> Html:
-    """A table; on a narrow screen each row becomes a block with the columns' names in it."""
+    """A table, without columns that hold nothing; on a narrow screen each row becomes a block with the columns' names."""
+    rows = list(rows)
+    held = [i for i in range(len(columns)) if any(row[i] for row in rows)]
+    columns, rows = [columns[i] for i in held], [[row[i] for i in held] for row in rows]
     head = "".join(f"<th scope='col'>{escape(column)}</th>" for column in columns)
     body = (
         "<tr>"
@@ -90,7 +94,8 @@ def table(columns: Sequence[str], rows: Iterable[Sequence[str]]) -> Html:
         + "</tr>"
         for row in rows
     )
-    return Html(f"<table class='stack'><thead><tr>{head}</tr></thead><tbody>{''.join(body)}</tbody></table>")
+    whole = f"<table class='stack'><thead><tr>{head}</tr></thead><tbody>{''.join(body)}</tbody></table>"
+    return Html(f"<div class='scroll'>{whole}</div>")
 
 
 def settings_table(values: Mapping[str, Any]) -> Html:

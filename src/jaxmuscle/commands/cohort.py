@@ -105,8 +105,7 @@ def _write(cohort: "CohortResult", folder: Path, places: dict[str, Path], format
     if differences:
         write_text(folder / "differences.csv", csv_text(_columns(differences)))
     if any(row["stderr"] is not None for row in cohort.table()):
-        by = "group" if len(set(cohort.groups.values())) > 1 else "person"
-        figure = cohort.plot(by)
+        figure = jm.plot.groups(cohort) if len(set(cohort.groups.values())) > 1 else cohort.plot()
         cohort_report(cohort, figure, folder, places)
         write_figure(figure, folder, "cohort", formats)
     else:

@@ -52,8 +52,8 @@ def posterior(
     """Draw from the posterior of the muscle's parameters: how sure is the fit.
 
     Fits first (unless given a fit.json), then runs NUTS chains with the likelihood of the Welch bins. Writes DIR/fit.json,
-    DIR/posterior.nc (for ArviZ), DIR/posterior.json, corner.png, predictive.png, chains.png and report.html. Exit code 1 if the fit
-    failed or the chains did not mix: then there is no summary.
+    DIR/posterior.nc (for ArviZ), DIR/posterior.json, corner.png, predictive.png, chains.png and report.html. Exit
+    code 1 if the fit failed or the chains did not mix: then there is no summary.
 
     Examples:
 
