@@ -79,10 +79,10 @@ of range is an error that names the file and the key. Nothing gets a silent defa
 
 *Since* is the version of the format that has the key. A later version of jaxmuscle reads earlier formats.
 """
-FIT_FILE = """JSON, format 3. Written by `FitResult.save`, read by `load_result`; `load_preset` takes its `task_table`. Of
+FIT_FILE = """JSON, format 4. Written by `FitResult.save`, read by `load_result`; `load_preset` takes its `task_table`. Of
 one target it has the keys of both tables, of several those of the second stand under `parts`, by name. Keys must agree: the
-value of a parameter with its `task_table`, the spectrum with its `target_table`. Format 2 may leave out what task and target
-do not have."""
+value of a parameter with its `task_table`, the spectrum with its `target_table`. Format 3 does not say where starts
+ended (`values`). Format 2 may also leave out what task and target do not have."""
 PRESET = """TOML, format 2. Written by `save_preset`, read by `load_preset`. The `task_table` has every field of the task and
 of its parts, each part with its class as `type`. What a task does not have (`activation`, `initial`, a low-pass) is
 `"none"`. Format 1, without the key `format`, may leave these out."""

@@ -58,8 +58,9 @@ def page(notebook: dict[str, Any], stem: str) -> tuple[str, dict[str, bytes]]:
                 text = "```text\n" + (text or "".join(data.get("text/plain", ""))).rstrip() + "\n```"
             parts.append(text)
     where = (
-        f"[Download this notebook]({stem}.ipynb){{ .md-button download }}\n\nThis is `notebooks/{stem}.ipynb` with its outputs. "
-        "`make notebooks` opens all of them in JupyterLab, where you can run and change them."
+        f'[Download this notebook]({stem}.ipynb){{ .md-button download="{stem}.ipynb" }}\n\n'
+        f"This is `notebooks/{stem}.ipynb` with its outputs. `make notebooks` opens all of them in JupyterLab, where you "
+        "can run and change them."
     )
     title, *rest = parts[0].split("\n", 1)
     return "\n\n".join([title, where, *rest, *parts[1:]]) + "\n", pictures
