@@ -555,7 +555,7 @@ def test_groups_have_a_mean_spectrum_and_their_numbers():
     edges = [[f(last[np.isclose(last[:, 0], x), 1]) for x in F] for f in (np.min, np.max)]
     np.testing.assert_allclose(edges, mean.get_ydata() * np.exp([[-1], [1]] * error), rtol=1e-9)
     assert corner.get_ylabel() == "corner frequency\n(Hz)" and share.get_ylabel().replace("\n", " ") == (
-        "power, 0.5 to 1 Hz (ratio)"
+        "power, 0.5 to 1\N{NO-BREAK SPACE}Hz (ratio)"
     )
     values = [line.get_ydata() for container in corner.containers for line in container.lines[:1]]
     np.testing.assert_array_equal(values, [[1, 3, 5], [2, 4, 6]])

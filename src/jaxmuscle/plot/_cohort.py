@@ -10,10 +10,10 @@ from matplotlib.figure import Figure, SubFigure
 
 from ._numbers import in_words
 from ._study import group_spectra
-from ._style import BLUE, COLUMN, GREY, PALETTE, canvas, frequency_axis, key, styled
+from ._style import BLUE, COLUMN, GREY, PALETTE, canvas, fitted_to, frequency_axis, key, styled
 
 WAYS = ("person", "group", "level")
-HEIGHT, ACROSS, SPECTRA = 1.5, 2, 2.3  # inches, panels, inches
+HEIGHT, ACROSS, SPECTRA = 1.6, 2, 2.3  # inches, panels, inches
 LABELLED = 12  # people who get a name on the axis
 SHARE = 0.5  # of the targets that must determine a quantity for it to be drawn
 
@@ -33,10 +33,11 @@ def cohort(
     names = _drawn(cohort, quantities)
     if by == "level" and all(result.target.mvc_fraction is None for result in cohort.results.values()):
         raise ValueError("by = 'level': no target states its mvc_fraction")
-    fig = canvas(ax, (COLUMN, HEIGHT * -(-len(names) // ACROSS)))
+    height = HEIGHT * -(-len(names) // ACROSS)
+    fig = canvas(ax, (COLUMN, height))
     _panels(fig, cohort, names, by)
     if len(_groups(cohort)) > 1 and by != "group":
-        key(fig, ACROSS)
+        fitted_to(fig, height, key(fig, ACROSS))
     return fig
 
 
@@ -108,7 +109,7 @@ def _panel(ax: Axes, rows: list[dict[str, Any]], people: list[str], groups: list
             if len(here):
                 ax.hlines(value.mean(), number - 0.35, number + 0.35, color=GREY, linewidth=1)
         ax.errorbar(place, value, error, fmt="o", markersize=3.5, capsize=2, linewidth=1, color=colour, label=group or None)
-    ax.set_ylabel(textwrap.fill(in_words(rows[0]["quantity"], rows[0]["unit"]), 20))
+    ax.set_ylabel(textwrap.fill(in_words(rows[0]["quantity"], rows[0]["unit"]), 18))
     if by == "group":
         ax.set_xticks(range(len(groups)), [group or "all" for group in groups])
         ax.set_xlim(-0.6, len(groups) - 0.4)

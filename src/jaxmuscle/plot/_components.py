@@ -63,5 +63,5 @@ def components(result: Any, ax: Axes | None = None, target: str | None = None, *
         seen = np.concatenate([fitted, part.target.proportional_power])
         ax.set_ylim(seen[seen > 0].min() / DECADE, 1.5 * seen.max())
     ax.set_title(part.target.name, parse_math=False)
-    ax.legend(loc="lower left" if log else "upper right")
+    ax.legend(loc="upper right")
     return ax

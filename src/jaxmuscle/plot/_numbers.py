@@ -36,5 +36,5 @@ def in_words(name: str, unit: str) -> str:
     base, at, target = name.partition("@")
     low, _, high = base.removeprefix("band_").partition("_")
     words = base if base[1:2] == "_" else base.replace("_", " ")
-    words = f"power, {low} to {high} Hz" if base.startswith("band_") else words
+    words = f"power, {low} to {high}\N{NO-BREAK SPACE}Hz" if base.startswith("band_") else words
     return f"{words}{at}{target} ({'ratio' if unit in ('', '1') else unit_in_print(unit)})"

@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure, SubFigure
 
 from ._stiffness import POINTS, Curve, gain, phase
-from ._style import BLUE, COLUMN, GREY, ORANGE, VERMILLION, canvas, fitted_to, heading, legend, styled
+from ._style import BLUE, COLUMN, GREY, ORANGE, VERMILLION, canvas, fitted_to, heading, key, legend, styled
 
 SHOWN = 4.0  # seconds of the window that are drawn larger
 CHANCE = 0.05
@@ -38,7 +38,7 @@ def perturbed(recording: Any, settings: Any = None, ax: Axes | None = None) -> F
     heights = (1.2, 1.3, 1.5, 1.1, 1.2)
     fig = canvas(ax, (COLUMN, sum(heights)))
     upper, lower = fig.subfigures(2, 1, height_ratios=(sum(heights[:2]), sum(heights[2:])))
-    traces, closer = upper.subplots(2, 2, sharex="col", width_ratios=(1.6, 1)).T
+    traces, closer = upper.subplots(2, 2, sharex="col", sharey="row", width_ratios=(1.6, 1)).T
     channels = ((recording.force, 1.0, "Force (N)", BLUE), (recording.displacement, 1e3, "Lengthening (mm)", VERMILLION))
     for whole, near, (channel, scale, label, colour) in zip(traces, closer, channels, strict=True):
         time = channel.start + np.arange(channel.whole.size) / channel.rate
@@ -61,7 +61,7 @@ def perturbed(recording: Any, settings: Any = None, ax: Axes | None = None) -> F
     _response(panels, response, ("spring, damper, mass", line))
     upper.align_ylabels(traces)
     lower.align_ylabels(panels)
-    fitted_to(fig, sum(heights), heading(fig, recording.name))
+    fitted_to(fig, sum(heights), heading(fig, recording.name) + key(fig))
     return fig
 
 

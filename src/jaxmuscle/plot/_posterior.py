@@ -56,7 +56,8 @@ def posterior(found: Any, ax: Axes | None = None) -> Figure | SubFigure:
     count = len(names)
     draws = [found.quantities[name].ravel() for name in names]
     limits = [np.quantile(x, CUT) for x in draws]
-    fig = canvas(ax, (COLUMN, COLUMN), w_pad=0.02, h_pad=0.02, wspace=0.02, hspace=0.02)
+    size = COLUMN if count > 2 else 3.0
+    fig = canvas(ax, (size, size), w_pad=0.02, h_pad=0.02, wspace=0.02, hspace=0.02)
     axes = fig.subplots(count, count, squeeze=False)
     for i in range(count):
         for j in range(count):
