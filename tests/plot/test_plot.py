@@ -493,7 +493,7 @@ def test_end_values_of_starts_are_drawn_over_those_of_the_best():
     assert [tick.get_text() for tick in ax.get_yticklabels()] == ["k_w", "c_w"]  # a negative value has no logarithm
     assert ax.get_xscale() == "log" and ax.lines[-1].get_color() == "#000000"
     bar = ax.figure.axes[1]
-    assert bar.get_ylabel() == "Rise of χ²" and bar.get_ylim() == (0.0, 10.0)
+    assert bar.get_ylabel() == "Rise of χ²" and bar.get_ylim() == pytest.approx((0.0, 10.0))
     assert ax.lines[0].get_color() == plt.get_cmap("viridis")(1.0)
     with pytest.raises(ValueError, match="saved by an earlier version"):
         plot.start_values(types.SimpleNamespace(starts=(), settings={"free": []}))

@@ -18,6 +18,7 @@ PARAMETERS = ("name", "value", "95 % interval", "unit", "what it is")
 FIGURES = {
     "fit": "Points: target, with the range of one standard deviation. Blue line: fit. Bars: residuals, up where the target "
     "lies above the fit; the grey bands are one and two standard deviations.",
+    "stiffness": "Points: measured dynamic stiffness with two standard errors either way. Blue line: fit.",
     "cohort": "What the data of at least half of the targets determine, with standard errors.",
     "spectra": "Spectra of all people (thin), and the geometric mean of each group with its standard error (thick).",
     "corner": "What the data determine. Diagonal: density, median and 95 % interval. Below it: regions of 50, 80 and 95 %.",
@@ -35,7 +36,7 @@ def fit_report(result: "FitResult", figure: Any, folder: Path) -> None:
         _verdict(card.heading, good=False if not result.success else result.adequate),
         pages.heading("What the data determine"),
         pages.table(PARAMETERS, rows["determined"]) if rows["determined"] else pages.paragraph("Nothing."),
-        pages.picture(figure, FIGURES["fit"]),
+        pages.picture(figure, FIGURES["fit" if result.only.fitted.size else "stiffness"]),
         pages.heading("What it means"),
         pages.items(card.remarks),
         *([pages.paragraph("The data do not notice if:"), pages.items(result.undetermined)] if result.undetermined else []),
