@@ -534,8 +534,9 @@ def cohort_of(people=6, bins=30):
     rng = np.random.default_rng(4)
     results, rows = {}, []
     for i in range(people):
-        name, power = f"p{i}", np.exp(0.2 * rng.standard_normal(30 if i < people - 1 else bins))
-        results[name] = types.SimpleNamespace(target=Target(name, power, segments=[6]))
+        count = 30 if i < people - 1 else bins
+        name, power = f"p{i}", np.exp(0.2 * rng.standard_normal(count))
+        results[name] = types.SimpleNamespace(target=Target(name, power, bins=range(1, count + 1), segments=[6]))
         about = {"target": name, "group": "ab"[i % 2], "mvc_fraction": None}
         rows += [about | {"quantity": "corner_frequency", "value": 1.0 + i, "stderr": 0.1, "unit": "Hz"},
                  about | {"quantity": "band_0.5_1", "value": 0.1 * i, "stderr": 0.01, "unit": "1"},
@@ -568,26 +569,27 @@ def test_groups_have_a_mean_spectrum_and_their_numbers():
         plot.groups(found, quantities=["k_w"])
 
 
+def words_of(figure):
+    """Every text that is drawn: labels of ticks outside the axes are not."""
+    yield from (text for each in (figure, *figure.subfigs) for text in each.texts)
+    yield from (text for legend in figure.findobj(matplotlib.legend.Legend) for text in legend.get_texts())
+    for ax in figure.axes:
+        yield from (ax.title, ax._left_title, ax._right_title, ax.xaxis.label, ax.yaxis.label, *ax.texts)
+        for axis in (ax.xaxis, ax.yaxis):
+            low, high = sorted(axis.get_view_interval())
+            yield from (tick.label1 for tick in axis.get_major_ticks() if low <= tick.get_loc() <= high)
+
+
 def small_words(figure):
-    """What is smaller than 6 points where the figure is 85 mm wide, and words that overlap or leave the figure."""
+    """What is smaller than 6 points where the figure is 85 mm wide, leaves the figure, or overlaps something else."""
     figure.canvas.draw()
     width, height = figure.canvas.get_width_height()
-    texts = [t for t in figure.findobj(matplotlib.text.Text) if t.get_text().strip() and t.get_visible()]
-    boxes = [(t.get_text(), t.get_window_extent().shrunk(0.98, 0.8)) for t in texts if shown(t)]
-    small = [t.get_text() for t in texts if t.get_fontsize() * 85 / 25.4 / figure.get_figwidth() < 6.0]
+    texts = [text for text in words_of(figure) if text.get_text().strip() and text.get_visible()]
+    boxes = [(text.get_text(), text.get_window_extent().shrunk(0.98, 0.8)) for text in texts]
+    small = [text.get_text() for text in texts if text.get_fontsize() * 85 / 25.4 / figure.get_figwidth() < 6.0]
     out = [word for word, box in boxes if box.x0 < -1 or box.x1 > width + 1 or box.y0 < -1 or box.y1 > height + 1]
     touch = [(a, b) for i, (a, one) in enumerate(boxes) for b, other in boxes[:i] if one.overlaps(other)]
     return small, out, touch
-
-
-def shown(text):
-    """Whether a text is drawn: labels of ticks outside the axes are not."""
-    ax = text.axes
-    if ax is None or text not in [*ax.get_xticklabels(), *ax.get_yticklabels()]:
-        return True
-    x, y = text.get_position()
-    low, high = sorted(ax.get_xlim() if text in ax.get_xticklabels() else ax.get_ylim())
-    return low <= (x if text in ax.get_xticklabels() else y) <= high
 
 
 @pytest.mark.parametrize(

@@ -118,9 +118,10 @@ def _write(found: "Posterior", folder: Path, formats: list[str]) -> None:
     remove_figures(folder, "corner", "predictive")
     found.save(folder / "posterior.nc")
     found.save(folder / "posterior.json")
-    figures: dict[str, Any] = {"chains": found.plot_chains()}
+    figures: dict[str, Any] = {}
     if found.success:
         figures |= {"corner": found.plot(), "predictive": found.plot_predictive().figure}
+    figures["chains"] = found.plot_chains()
     posterior_report(found, figures, folder)
     for name, figure in figures.items():
         write_figure(figure, folder, name, formats)

@@ -19,7 +19,8 @@ FIGURES = {
     "fit": "Points: target, with the range of one standard deviation. Blue line: fit. Bars: residuals, up where the target "
     "lies above the fit; the grey bands are one and two standard deviations.",
     "stiffness": "Points: measured dynamic stiffness with two standard errors either way. Blue line: fit.",
-    "cohort": "What the data of at least half of the targets determine, with standard errors.",
+    "cohort": "What the data of at least half of the targets determine, with standard errors. Spectra: every target (thin), "
+    "the geometric mean of each group with its standard error (thick).",
     "spectra": "Spectra of all people (thin), and the geometric mean of each group with its standard error (thick).",
     "corner": "What the data determine. Diagonal: density, median and 95 % interval. Below it: regions of 50, 80 and 95 %.",
     "predictive": "The target among spectra that the posterior predicts.",
@@ -105,7 +106,7 @@ def study_report(study: "StudyResult", folder: Path) -> None:
     fits += [(name, f"not fitted: {why}") for name, why in study.cohort.failed.items()]
     body = [
         _verdict(study.cohort.verdict, good=study.success),
-        pages.code(str(study)),
+        pages.items(line.strip() for line in str(study).splitlines()[:3]),
         shown,
         pages.heading("What differs"),
         pages.table(columns, rows) if rows else pages.paragraph("Nothing could be compared."),

@@ -63,5 +63,5 @@ def components(result: Any, ax: Axes | None = None, target: str | None = None, *
         seen = np.concatenate([fitted, part.target.proportional_power])
         ax.set_ylim(seen[seen > 0].min() / DECADE, 1.5 * seen.max())
     ax.set_title(part.target.name, parse_math=False)
-    ax.legend(loc="upper right")
+    ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.2), ncols=2, frameon=False, columnspacing=1.2)
     return ax
