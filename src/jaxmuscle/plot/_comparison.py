@@ -7,7 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure, SubFigure
 
 from ._spectra import target
-from ._style import BLACK, COLUMN, GREY, PALETTE, canvas, fitted_to, heading, styled
+from ._style import BLACK, COLUMN, GREY, PALETTE, canvas, fitted_to, heading, key, styled, without_legend
 
 SPECTRA, ROW = 2.4, 0.24  # inches
 MARK: dict[str, Any] = {"ms": 5.5, "zorder": 3}
@@ -29,7 +29,7 @@ def comparison(comparison: Any, ax: Axes | None = None) -> Figure | SubFigure:
     _spectra(fig.add_subplot(grid[0, :]), comparison, colours)
     _criterion(fig.add_subplot(grid[1, 0]), rows, colours)
     _scores(fig.add_subplot(grid[1, 1]), rows, colours)
-    fitted_to(fig, sum(heights), heading(fig, comparison.target.name))
+    fitted_to(fig, sum(heights), heading(fig, comparison.target.name) + key(fig))
     return fig
 
 
@@ -44,8 +44,7 @@ def _spectra(ax: Axes, comparison: Any, colours: dict[str, str]) -> None:
         style = {"color": colours[noise], "ls": DASHES[number % len(DASHES)], "lw": 1.3, "zorder": 5 - 0.1 * number}
         ax.plot(frequency, comparison.fitted[noise, best.harmonic], label=best.label, **style)
     ax.set(title="Best fit of each noise", ylim=(0.5 * power.min(), 2 * power.max()))
-    ax.legend(loc="lower left")
-    ax.set_ylabel("Power (fraction per bin)")
+    without_legend(ax).set_ylabel("Power (fraction per bin)")
 
 
 def _criterion(ax: Axes, rows: list[Any], colours: dict[str, str]) -> None:

@@ -26,7 +26,7 @@ from ._style import (
 )
 
 ORDER = ("corner_frequency", "harmonic_frequency", "harmonic_share", "high_frequency_floor", "coefficient_of_variation")
-MOST = 6  # quantities
+MOST, PAIRS = 6, 4  # quantities that are drawn; those of which all pairs have room in a column
 CUT = (0.002, 0.998)
 BANDS = ((0.025, 0.975, 0.18), (0.25, 0.75, 0.35))
 MASS = (0.95, 0.8, 0.5)
@@ -46,11 +46,13 @@ def chosen(found: Any) -> list[str]:
 def posterior(found: Any, ax: Axes | None = None) -> Figure | SubFigure:
     """Draws the posterior `found` of what the data determine: densities, and 50, 80 and 95 % regions of pairs.
 
+    Of four quantities at most, so that it is legible in a column of 85 mm. `found.summary()` has all.
+
     **Raises:** `NotMixedError` if the chains did not mix; `ValueError` if the data determine nothing.
     """
     if not found.success:
         raise NotMixedError(f"{found.title}: {found.message}")
-    names = chosen(found)
+    names = chosen(found)[:PAIRS]
     if not names:
         raise ValueError(f"{found.title}: the data determine no quantity, so there is nothing to draw")
     count = len(names)
