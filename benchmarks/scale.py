@@ -114,13 +114,12 @@ def reduced(repetitions: int) -> list[Row]:
 
 WORKER = """
 import json, os, sys, time
-cores, devices, seeds = json.loads(sys.argv[1])
+cores, threads, seeds = json.loads(sys.argv[1])
 os.sched_setaffinity(0, cores)
 import jax
-jax.config.update("jax_num_cpu_devices", devices)
 import jaxmuscle as jm
 task, key = jm.PrescribedForce(noise=jm.WhiteNoise()), jax.random.key(0)
-run = lambda: jm.ensemble(task, key, seeds=seeds, duration=1.0, control=False, reduce=True)
+run = lambda: jm.ensemble(task, key, seeds=seeds, duration=1.0, control=False, reduce=True, threads=threads)
 run()
 print("ready", flush=True)
 for line in sys.stdin:
@@ -130,8 +129,8 @@ for line in sys.stdin:
 """
 
 
-def _worker(cores: list[int], devices: int, seeds: int) -> subprocess.Popen:
-    program = [sys.executable, "-c", WORKER, json.dumps([cores, devices, seeds])]
+def _worker(cores: list[int], threads: int, seeds: int) -> subprocess.Popen:
+    program = [sys.executable, "-c", WORKER, json.dumps([cores, threads, seeds])]
     worker = subprocess.Popen(program, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
     assert worker.stdout is not None and worker.stdout.readline().strip() == "ready"
     return worker
@@ -146,7 +145,7 @@ def _ask(workers: list[subprocess.Popen]) -> float:
 
 
 def threads(repetitions: int) -> list[Row]:
-    """A reduced ensemble on two devices of one process, on two processes of one, against one core; turn by turn."""
+    """A reduced ensemble on two threads of one process, on two processes of one, against one core; turn by turn."""
     cores = sorted(os.sched_getaffinity(0))
     if len(cores) < 2:
         return []
@@ -231,7 +230,7 @@ def _command(each: list[list[str]], cores: list[int] | None, seeds: int) -> tupl
     with tempfile.TemporaryDirectory() as folder:
         store = f"{folder}/a.zarr"
         command = [sys.executable, "-m", "jaxmuscle", "ensemble", "zagrodny-slifkin", "--seeds", str(seeds), "--reduce",
-                   "--duration", "1", "--devices", "1", "--out", store]  # fmt: skip
+                   "--duration", "1", "--threads", "1", "--out", store]  # fmt: skip
         quiet: Any = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
         begun, before = time.perf_counter(), resource.getrusage(resource.RUSAGE_CHILDREN)
         workers = []
@@ -251,11 +250,10 @@ def _command(each: list[list[str]], cores: list[int] | None, seeds: int) -> tupl
 MEMORY = """
 import sys, threading, time, jax, jaxmuscle as jm
 from jaxmuscle.ensembles._speed import peak_memory
-jax.config.update("jax_num_cpu_devices", 2)
 jm.ensemble, jm.WhiteNoise
 before = peak_memory()
 found = jm.ensemble(jm.PrescribedForce(noise=jm.WhiteNoise()), jax.random.key(0), seeds=int(sys.argv[1]), duration=1.0,
-                    control=False, reduce=True)
+                    control=False, reduce=True, threads=2)
 assert found.success
 print((peak_memory() - before) / 2**20)
 """

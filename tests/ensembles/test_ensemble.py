@@ -9,6 +9,7 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 from typing import Any
@@ -24,10 +25,11 @@ from typer.testing import CliRunner
 
 import jaxmuscle as jm
 from jaxmuscle.commands.main import app
+from jaxmuscle.ensembles import _layout as layouts
 from jaxmuscle.ensembles import _run as _ensemble_run
 from jaxmuscle.ensembles import _settings
 from jaxmuscle.ensembles._processes import join
-from jaxmuscle.ensembles._running_moments import CELLS, add, count_cells, empty, merged, quantiles, set_cells
+from jaxmuscle.ensembles._running_moments import CELLS, add, count_cells, empty, merged, moments, quantiles, set_cells
 from jaxmuscle.ensembles._store import differences
 
 KEY = jax.random.key(5)
@@ -62,7 +64,7 @@ def test_merged_moments_are_those_of_the_whole(pieces):
     whole = empty(1, 5, 5, 1, whole=True)
     for part in np.array_split(rows, pieces):
         piece = empty(1, 5, 5, 1, whole=True)
-        add(piece, 0, part)
+        add(piece, 0, moments(part))
         whole = merged(whole, piece)
     assert whole.seeds.tolist() == [400]
     np.testing.assert_allclose(whole.mean[0], rows.mean(axis=0), rtol=1e-14)
@@ -74,10 +76,9 @@ def test_counted_quantiles_are_within_a_cell_of_the_exact_ones():
     output = np.stack([rng.normal(3, 0.1, 5000), rng.exponential(size=5000), np.full(5000, 7.0), rng.uniform(size=5000)], 1)
     levels = (0.01, 0.3, 0.5, 0.95, 0.999)
     tally = empty(1, 4, 4, len(levels), whole=False)
-    add(tally, 0, output)
     set_cells(tally, 0, output[:256])
     for part in np.array_split(output, 7):
-        count_cells(tally, 0, part)
+        add(tally, 0, moments(part)._replace(cells=count_cells(tally.low[0], tally.high[0], part)))
     found = quantiles(tally, levels)[0]
     exact = np.quantile(output, levels, axis=0, method="inverted_cdf")
     assert np.all(np.abs(found - exact) <= (tally.high - tally.low)[0] / CELLS)
@@ -87,8 +88,7 @@ def test_a_quantile_beyond_the_cells_is_not_made_up():
     tally = empty(1, 1, 1, 2, whole=False)
     set_cells(tally, 0, np.random.default_rng(0).normal(size=(100, 1)))
     output = np.concatenate([np.random.default_rng(1).normal(size=(80, 1)), np.full((20, 1), 1e3)])
-    add(tally, 0, output)
-    count_cells(tally, 0, output)
+    add(tally, 0, moments(output)._replace(cells=count_cells(tally.low[0], tally.high[0], output)))
     middle, far = quantiles(tally, (0.4, 0.9))[0, :, 0]
     assert np.isfinite(middle) and np.isnan(far)
 
@@ -453,7 +453,60 @@ def test_a_folder_that_cannot_be_written(read_only):
         jm.ensemble(TASK, KEY, seeds=8, store=read_only / "a.zarr", **SHORT)
 
 
-# Devices and processes
+# Threads, devices and processes
+
+
+class Slow:
+    """Chunks of which the earlier ones take longer, so that they end in another order than they began."""
+
+    def __init__(self, monkeypatch, chunks):
+        self.simulate, self.left, self.busy, self.most, self.lock = layouts._finish, chunks, 0, 0, threading.Lock()
+        monkeypatch.setattr(layouts, "_finish", self)
+
+    def __call__(self, chunk, found):
+        with self.lock:
+            self.busy += 1
+            self.most = max(self.most, self.busy)
+        time.sleep(0.02 * max(0, self.left - chunk.number))
+        with self.lock:
+            self.busy -= 1
+        return self.simulate(chunk, found)
+
+
+@pytest.mark.parametrize("threads", [1, 3])
+def test_threads_change_nothing(tmp_path, monkeypatch, threads):
+    """To the last bit, in whatever order they end: in memory, reduced, stored, swept, with cells and in double precision."""
+    given = {"seeds": 45, **SHORT}
+    sweep = {"seeds": 11, "duration": 1.0, "chunk": 8}
+    points = jm.Sweep.grid(TASK, k_w=[4e5, 5e5])
+    whole, alone = jm.ensemble(TASK, KEY, threads=1, **given), jm.ensemble(TASK, KEY, reduce=True, threads=1, **given)
+    swept = jm.ensemble(points, KEY, reduce=True, threads=1, **sweep)
+    slow = Slow(monkeypatch, 6)
+    np.testing.assert_array_equal(jm.ensemble(TASK, KEY, threads=threads, **given).output, whole.output)
+    assert slow.most == threads
+    for given_store in ({}, {"store": tmp_path / "a.zarr"}):
+        found = jm.ensemble(TASK, KEY, reduce=True, threads=threads, **given, **given_store)
+        for name, (_, values, _) in found.arrays().items():
+            np.testing.assert_array_equal(values, alone.arrays()[name][1])
+    stored = jm.ensemble(TASK, KEY, store=tmp_path / "b.zarr", threads=threads, **given)
+    np.testing.assert_array_equal(stored["F_ext"], whole.output)
+    np.testing.assert_array_equal(jm.ensemble(points, KEY, reduce=True, threads=threads, **sweep).quantile, swept.quantile)
+    with jax.enable_x64(True):
+        assert jm.ensemble(TASK, KEY, threads=threads, **given).output.dtype == np.float64
+
+
+def test_what_a_thread_raises_ends_the_ensemble(monkeypatch):
+    def broken(chunk, found):
+        raise MemoryError("no room")
+
+    monkeypatch.setattr(layouts, "_finish", broken)
+    with pytest.raises(MemoryError, match="no room"):
+        jm.ensemble(TASK, KEY, seeds=45, threads=3, **SHORT)
+
+
+def test_threads_must_be_a_number():
+    with pytest.raises(ValueError, match="threads = 0"):
+        jm.ensemble(TASK, KEY, seeds=8, threads=0, **SHORT)
 
 
 def environment():
@@ -462,13 +515,15 @@ def environment():
 
 @pytest.mark.slow
 def test_seeds_are_shared_by_devices_and_need_not_divide(tmp_path):
-    """Three devices: 20 seeds, 5 points, and a store begun with one device."""
+    """Three devices: 20 seeds, 5 points, and a store begun with one device. As GPUs are, which are cores here."""
     program = f"""
 import jax
 jax.config.update("jax_num_cpu_devices", 3)
 import numpy as np, jaxmuscle as jm
+from jaxmuscle.simulation import _batch
+_batch.THREADED = ()
 key, task = jax.random.key(5), jm.Isometric()
-assert len(jax.local_devices()) == 3
+assert _batch.local_mesh().size == 3
 runs = jm.ensemble(task, key, seeds=20, duration=1.0)
 sweep = jm.ensemble(jm.Sweep.grid(task, k_w=[4e5, 5e5, 6e5, 7e5, 8e5]), key, seeds=2, duration=1.0)
 store = jm.ensemble(task, key, seeds=45, store={str(tmp_path / "a.zarr")!r}, resume=True, duration=1.0)
@@ -701,7 +756,7 @@ def test_the_command_speaks_json(tmp_path):
         (["--seeds", "8", "--reduce", "--states"], "--states belongs to a store of trajectories"),
         (["--seeds", "8", "--processes", "2"], "belong together"),
         (["--seeds", "8", "--duration", "0.0031"], "duration = 0.0031 s is not a whole number"),
-        (["--seeds", "8", "--devices", "7"], "--devices 7: JAX runs in this process already"),
+        (["--seeds", "8", "--threads", "0"], "greater than or equal to 1"),
     ],
 )
 def test_the_command_refuses_bad_input(tmp_path, arguments, message):

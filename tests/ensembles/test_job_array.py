@@ -259,7 +259,7 @@ def test_parts_killed_at_random_end_as_one_run(tmp_path, monkeypatch, reduce):
 
 
 def started(part, out, *more):
-    arguments = ["--seeds", "60", "--duration", "1", "--chunk", "8", "--devices", "1", "--out", out, "--part", part]
+    arguments = ["--seeds", "60", "--duration", "1", "--chunk", "8", "--threads", "1", "--out", out, "--part", part]
     pipes: Any = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
     return subprocess.Popen([*COMMAND, "ensemble", "zagrodny-slifkin", *arguments, *more], env=environment(), **pipes)
 

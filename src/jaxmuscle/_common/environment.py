@@ -54,6 +54,11 @@ def program_folder() -> Path | None:
     return None if known is None else known / "jaxmuscle"
 
 
+def usable_cores() -> int:
+    """How many cores of the CPU this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
 @functools.cache
 def versions() -> dict[str, str]:
     """Versions of what computed a result."""

@@ -1,7 +1,6 @@
 """`jaxmuscle ensemble`."""
 
 import json
-import os
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -21,7 +20,7 @@ if TYPE_CHECKING:
     from jaxmuscle.model import AbstractTask
 
 
-Devices = Annotated[int | None, typer.Option(min=1, help="Cores of a CPU to use, each as a device; all by default.")]
+Threads = Annotated[int | None, typer.Option(min=1, max=1024, help="How many cores of a CPU to use; all by default.")]
 
 
 class Precision(StrEnum):
@@ -63,7 +62,7 @@ def ensemble(
     ] = Increments.gaussian,
     generator: Annotated[Generator, typer.Option(help="Of random numbers; threefry is JAX's, slower.")] = Generator.hash,
     chunk: Annotated[int | None, typer.Option(min=1, max=2**32, help="Seeds (times points) simulated at once.")] = None,
-    devices: Devices = None,
+    threads: Threads = None,
     coordinator: Annotated[str | None, typer.Option(metavar="HOST:PORT", help="Process 0 of several.")] = None,
     processes: Annotated[int | None, typer.Option(min=1, help="How many processes.")] = None,
     process_id: Annotated[int | None, typer.Option(help="Which of them this is, from 0.")] = None,
@@ -92,13 +91,14 @@ def ensemble(
         together = any(given is not None for given in (coordinator, processes, process_id))
         if part is not None and together:
             raise ValueError(f"--part {part}: a part is a process of its own: leave out --coordinator and its companions")
-        use(precision, devices, cores(coordinator, processes))
+        use(precision)
         if part is None and (together or jm.ensembles.launched()):
             jm.ensembles.join(coordinator, processes, process_id)
         keep_compiled_programs()
         model = task_of(preset, task, observe)
         settings = {"duration": duration, "dt": dt, "chunk": chunk, "resume": resume, "overwrite": force, "states": states,
                     "increments": increments.value, "generator": generator.value,
+                    "threads": cores(coordinator, processes) if threads is None else threads,
                     **({} if part is None else {"part": numbers_of(part)})}  # fmt: skip
         if not run(model, swept(model, vary or []), seeds, seed, output, settings, reduce=reduce):
             raise typer.Exit(NOT_CONVERGED)
@@ -241,22 +241,18 @@ def swept(model: "AbstractTask", vary: list[str]) -> Any:
     return jm.Sweep.grid(model, **values) if values else None
 
 
-def cores(coordinator: str | None, processes: int | None) -> int:
-    """How many cores of a CPU become devices: all that this process may use, shared by processes of one machine."""
-    usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+def cores(coordinator: str | None, processes: int | None) -> int | None:
+    """How many cores of a CPU are used: None for all that this process may, which processes of one machine share."""
+    from jaxmuscle._common.environment import usable_cores
+
     host = (coordinator or "").partition(":")[0]
-    return max(1, usable // processes) if host in ("127.0.0.1", "localhost") and processes else usable
+    if host not in ("127.0.0.1", "localhost") or not processes:
+        return None
+    return max(1, usable_cores() // processes)
 
 
-def use(precision: Precision, devices: int | None, usable: int) -> None:
-    """Set JAX up before it starts: precision, and as many devices as asked for, or as are usable."""
+def use(precision: Precision) -> None:
+    """Set the precision before JAX starts."""
     import jax
 
     jax.config.update("jax_enable_x64", precision is Precision.double)
-    try:
-        jax.config.update("jax_num_cpu_devices", usable if devices is None else devices)
-    except RuntimeError:
-        if devices not in (None, jax.local_device_count()):
-            raise ValueError(
-                f"--devices {devices}: JAX runs in this process already, with {jax.local_device_count()}"
-            ) from None

@@ -85,14 +85,15 @@ def ensemble(  # pyright: ignore[reportInconsistentOverload]
     part: tuple[int, int] | None = None,
     increments: str = "gaussian",
     generator: str = "hash",
+    threads: int | None = None,
 ) -> Any:
     """Simulate many seeds (0 to seeds - 1, or those given) of one task, or of every point of a sweep.
 
         runs = jm.ensemble(jm.Isometric(), jax.random.key(0), seeds=100)
         runs.spectrum().plot()
 
-    Seed i is `simulate(..., seed=i)`, whatever the chunk, the devices or the number of processes. Chunks run on all local
-    devices (`jax.config.update("jax_num_cpu_devices", n)` before anything else makes n of a CPU's cores).
+    Seed i is `simulate(..., seed=i)`, whatever the chunk, the devices or the number of processes. Chunks run on all GPUs of
+    this process. Without a GPU they run on all cores of the CPU that the process may use, or on so many as `threads` says.
 
     **Arguments:** `task`, or a `Sweep`, or tasks that differ in numbers only; `key`, `duration` [s], `dt` [s], `rate` [Hz],
     `substeps`, `sampling` as in `simulate`; `chunk`, how many seeds (points times seeds) run at once; `progress`, True for
@@ -135,6 +136,8 @@ def ensemble(  # pyright: ignore[reportInconsistentOverload]
     key, numbers = key_of(key), seeds_of(seeds)
     if chunk is not None:
         count("chunk", chunk, 1)
+    if threads is not None:
+        count("threads", threads, 1, 1024)
     if resume and overwrite:
         raise ValueError("resume continues a store, overwrite replaces it: give one of the two")
     if (resume or states) and store is None:
@@ -160,7 +163,8 @@ def ensemble(  # pyright: ignore[reportInconsistentOverload]
     cut = begun_with(place) if place is not None and again else None
     if cut is None:
         cut = cut_of(task, len(numbers), plan, chunk, shared=place is not None, parts=None if mine is None else mine.of)
-    layout = laid_out(task, key, numbers, plan, linear, cut=cut, states=whole, spectrum=spectrum, draws=draws)
+    layout = laid_out(task, key, numbers, plan, linear, cut=cut, states=whole, spectrum=spectrum, draws=draws,
+                      threads=threads)  # fmt: skip
     begin = "part" if mine is not None else "resume" if resume else "overwrite" if overwrite else "new"
     with telling(progress, layout) as tell:
         if levels is not None:

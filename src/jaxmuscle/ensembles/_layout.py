@@ -1,9 +1,13 @@
-"""How an ensemble is cut into chunks, and what runs one of them."""
+"""How an ensemble is cut into chunks, and what runs them."""
 
+import contextlib
 import dataclasses
 import math
+import threading
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections import deque
+from collections.abc import Callable, Generator, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -17,7 +21,7 @@ from jaxmuscle._common.arrays import as_arrays
 from jaxmuscle.model._stream import Draws
 from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.response._linearised import LinearTask
-from jaxmuscle.simulation._batch import LANES, Recipe, blocks, local_mesh, run_points, run_seeds
+from jaxmuscle.simulation._batch import LANES, Recipe, blocks, local_mesh, run_points, run_seeds, threads_of
 from jaxmuscle.simulation._simulate import Schedule, companion, schedule
 from jaxmuscle.spectra._settings import WINDOW
 
@@ -27,6 +31,8 @@ from ._sweep import Sweep
 BLOCKS = 4
 STEPS_AT_ONCE = 4_000_000
 EIGHT = 8
+
+Found = dict[str, np.ndarray]
 
 
 class Chunk(NamedTuple):
@@ -79,6 +85,7 @@ class Layout(NamedTuple):
     together: int
     width: int
     mesh: Mesh | None
+    threads: int
 
     @property
     def points(self) -> int:
@@ -133,14 +140,18 @@ def laid_out(
     states: bool,
     spectrum: bool,
     draws: Draws,
+    threads: int | None,
 ) -> Layout:
-    """The layout; with `spectrum` the Welch power of every seed is computed, with `states` they are kept."""
+    """The layout; with `spectrum` the Welch power of every seed is computed, with `states` they are kept.
+
+    `threads`: on how many cores of a CPU; None for all that this process may use.
+    """
     settings = _one_of(task).settings
     recipe = Recipe(plan.grid, plan.sampling, states, settings, lanes_of(plan), draws=draws)
     if spectrum:
         edges = (round(WINDOW[0] * settings.rate), round(WINDOW[1] * settings.rate))
         recipe = dataclasses.replace(recipe, every=round(plan.rate / settings.rate), edges=edges)
-    return Layout(task, key, seeds, plan, linear, recipe, *cut, local_mesh())
+    return Layout(task, key, seeds, plan, linear, recipe, *cut, local_mesh(), threads_of(threads))
 
 
 def _one_of(task: AbstractTask | Sweep) -> AbstractTask:
@@ -159,7 +170,7 @@ def cut_of(
     if chunk is not None:
         lanes, most, parts = chunk, chunk, None
     else:
-        lanes = lanes_of(plan) * (jax.local_device_count() if parts is None else 1)
+        lanes = lanes_of(plan) * (mesh.size if parts is None and (mesh := local_mesh()) is not None else 1)
         lanes = int(agreed(str(lanes))) if shared else lanes
         most = lanes * BLOCKS
     points = len(task) if isinstance(task, Sweep) else 1
@@ -202,11 +213,24 @@ def companions(task: AbstractTask | Sweep, duration: float, control: bool | None
     return tuple(found)
 
 
-def _start(layout: Layout, chunk: Chunk, ready: dict[int, Any]) -> dict[str, Any]:
-    """Dispatch a chunk, filled up with its last seed and point to its full size and equal parts for all devices.
+class _Ready:
+    """The arrays of the single task that was needed last, on its devices."""
 
-    `ready` keeps the arrays of the last single task, which are made once.
-    """
+    def __init__(self, layout: Layout):
+        self.layout, self.lock, self.point, self.arrays = layout, threading.Lock(), -1, None
+
+    def of(self, point: int) -> Any:
+        layout = self.layout
+        with self.lock:
+            if point != self.point:
+                arrays = as_arrays((layout.task_of(point), None if layout.linear is None else layout.linear[point]))
+                self.arrays = arrays if layout.mesh is None else eqx.filter_shard(arrays, NamedSharding(layout.mesh, P()))
+                self.point = point
+            return self.arrays
+
+
+def _start(layout: Layout, chunk: Chunk, ready: _Ready) -> dict[str, Any]:
+    """Dispatch a chunk, filled up with its last seed and point to its full size and equal parts for all devices."""
     devices = 1 if layout.mesh is None else layout.mesh.size
     single = layout.together == 1
     width, step = layout.width, EIGHT * devices * blocks(math.ceil(layout.width / devices), layout.recipe.lanes)
@@ -215,12 +239,7 @@ def _start(layout: Layout, chunk: Chunk, ready: dict[int, Any]) -> dict[str, Any
     seeds = np.asarray(layout.seeds)[columns] if not isinstance(layout.seeds, range) else layout.seeds.start + columns
     linear = layout.linear
     if single:
-        point = chunk.points.start
-        if point not in ready:
-            ready.clear()
-            arrays = as_arrays((layout.task_of(point), None if linear is None else linear[point]))
-            ready[point] = arrays if layout.mesh is None else eqx.filter_shard(arrays, NamedSharding(layout.mesh, P()))
-        task, beside = ready[point]
+        task, beside = ready.of(chunk.points.start)
         return run_seeds(task, beside, layout.key, seeds, layout.recipe, layout.mesh)
     assert isinstance(layout.task, Sweep)
     together = devices * math.ceil(layout.together / devices)
@@ -230,7 +249,7 @@ def _start(layout: Layout, chunk: Chunk, ready: dict[int, Any]) -> dict[str, Any
     return run_points(as_arrays(tasks), as_arrays(beside), layout.key, seeds, layout.recipe, layout.mesh)
 
 
-def _finish(chunk: Chunk, found: dict[str, Any]) -> dict[str, np.ndarray]:
+def _finish(chunk: Chunk, found: dict[str, Any]) -> Found:
     """Results on the host with leading axes (points, seeds), without what filled the chunk up."""
     host = {name: np.asarray(values) for name, values in found.items() if values is not None}
     if host["finite"].ndim == 1:
@@ -239,18 +258,49 @@ def _finish(chunk: Chunk, found: dict[str, Any]) -> dict[str, np.ndarray]:
 
 
 def run_chunks(
-    layout: Layout, numbers: Iterable[int], tell: Callable[[Pace], None]
-) -> Iterator[tuple[Chunk, dict[str, np.ndarray]]]:
-    """Results of the chunks in turn; the next one is computed while the caller deals with the last."""
+    layout: Layout, numbers: Iterable[int], tell: Callable[[Pace], None], work: Callable[[Chunk, Found], Any] | None = None
+) -> Generator[tuple[Chunk, Any], None, None]:
+    """Results of the chunks in turn, or what `work` makes of them; others are computed while the caller deals with one.
+
+    XLA runs such a program on one core. So as many chunks run at once as there are cores, each dispatched from a thread of
+    its own (XLA works off one thread's programs one after the other). There are half as many threads more, so that no core
+    waits while the `work` is done.
+    """
     chunks = [layout.chunk(number) for number in numbers]
     total = sum(len(chunk.points) * len(chunk.seeds) for chunk in chunks)
-    done, begun, waiting, ready = 0, 0.0, None, {}
-    for chunk in [*chunks, None]:
-        started = None if chunk is None else (chunk, _start(layout, chunk, ready))
-        begun = begun or time.monotonic()  # once the first has been compiled
-        if waiting is not None:
-            yield waiting[0], _finish(*waiting)
-            done += len(waiting[0].points) * len(waiting[0].seeds)
-            speed = done / max(time.monotonic() - begun, 1e-9)
-            tell(Pace(done, total, speed, speed * layout.duration, (total - done) / speed))
-        waiting = started
+    done, begun, waiting, ready, here = 0, 0.0, deque(), _Ready(layout), _settings_of_this_thread()
+
+    def run(chunk: Chunk, started: dict[str, Any] | None = None) -> Any:
+        with here():
+            with cores:
+                found = _finish(chunk, _start(layout, chunk, ready) if started is None else started)
+            return found if work is None else work(chunk, found)
+
+    cores, ahead = threading.Semaphore(layout.threads), layout.threads + layout.threads // 2 if layout.threads > 1 else 1
+    pool = ThreadPoolExecutor(ahead, thread_name_prefix="jaxmuscle")
+    try:
+        for chunk in [*chunks, *[None] * ahead]:
+            if chunk is not None:
+                first = None if begun else _start(layout, chunk, ready)  # compiled once, here
+                begun = begun or time.monotonic()
+                waiting.append((chunk, pool.submit(run, chunk, first)))
+            if len(waiting) > ahead or (chunk is None and waiting):
+                chunk, future = waiting.popleft()
+                yield chunk, future.result()
+                done += len(chunk.points) * len(chunk.seeds)
+                speed = done / max(time.monotonic() - begun, 1e-9)
+                tell(Pace(done, total, speed, speed * layout.duration, (total - done) / speed))
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+def _settings_of_this_thread() -> Callable[[], contextlib.AbstractContextManager[Any]]:
+    """JAX's precision and device may be set for one thread (`with jax.enable_x64(True)`): the same for another one."""
+    double, device = bool(jax.config.jax_enable_x64), jax.config.jax_default_device  # pyright: ignore[reportAttributeAccessIssue]
+
+    @contextlib.contextmanager
+    def here() -> Iterator[None]:
+        with jax.enable_x64(double), jax.default_device(device):
+            yield
+
+    return here

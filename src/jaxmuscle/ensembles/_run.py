@@ -1,8 +1,9 @@
 """Ensembles that outlive their process: reduced while they run, or streamed to a store, by one process or many."""
 
+import contextlib
 import time
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Int
@@ -17,7 +18,7 @@ from ._opening import opened
 from ._parts import Part, PartReport, failed_in, finish
 from ._places import AbstractPlace
 from ._processes import meet, rank_and_count
-from ._running_moments import CELLS, RunningMoments, add, count_cells, empty, set_cells
+from ._running_moments import CELLS, ChunkMoments, RunningMoments, add, count_cells, empty, moments, set_cells
 from ._settings import about, identity
 from ._store import PARTS, Begin, Variable, chunk_log, ensemble_at, logged, write_region
 from ._summary import EnsembleSummary, summarised
@@ -128,14 +129,24 @@ def _reduce(
 ) -> Reduced:
     """Chunks into a tally, which starts as `found`; saved from time to time, and when interrupted."""
     tally, chunks, failed = found.tally, set(found.chunks), list(found.failed)
+    known = np.flatnonzero(~np.isnan(tally.low).any(axis=1))
+    edges: dict[int, Edges] = {int(point): (tally.low[point], tally.high[point]) for point in known}
     keep, adding = _keeper(save), False
+
+    def condensed(chunk: Chunk, result: dict[str, np.ndarray]) -> Condensed:
+        """On the thread that has simulated the chunk."""
+        each = [_moments(layout, levels, result, row, edges.get(point)) for row, point in enumerate(chunk.points)]
+        return Condensed(each, _failed(layout, chunk, result), result["output"], result["finite"])
+
     try:
-        for chunk, result in run_chunks(layout, numbers, tell):
-            adding = True
-            failed += _add_chunk(layout, levels, tally, chunk, result)
-            chunks.add(chunk.number)
-            adding = False
-            keep(Reduced(tally, frozenset(chunks), failed))
+        with contextlib.closing(run_chunks(layout, numbers, tell, condensed)) as results:
+            for chunk, more in results:
+                adding = True
+                _add_chunk(layout, tally, edges, chunk, more)
+                failed += more.failed
+                chunks.add(chunk.number)
+                adding = False
+                keep(Reduced(tally, frozenset(chunks), failed))
     except KeyboardInterrupt:
         if not adding:  # else the tally holds a part of a chunk: what was saved last stays
             save(Reduced(tally, frozenset(chunks), failed))
@@ -143,22 +154,47 @@ def _reduce(
     return Reduced(tally, frozenset(chunks), failed)
 
 
-def _add_chunk(
-    layout: Layout, levels: tuple[float, ...], tally: RunningMoments, chunk: Chunk, result: dict[str, np.ndarray]
-) -> list[list[int]]:
-    """One chunk into the tally; what of it failed."""
+Edges = tuple[np.ndarray, np.ndarray]
+
+
+def _add_chunk(layout: Layout, tally: RunningMoments, edges: dict[int, Edges], chunk: Chunk, more: "Condensed") -> None:
+    """One chunk into the tally. The first one of a point says where the cells of the point lie."""
     for row, point in enumerate(chunk.points):
-        finite = result["finite"][row]
-        output = result["output"][row][finite]
-        add(tally, point, _rows(layout, result, row)[finite])
-        if layout.whole:
-            if len(output):
-                tally.exact[point] = np.quantile(output, levels, axis=0)
-            continue
-        if np.isnan(tally.low[point]).any():
-            set_cells(tally, point, _cell_sample(layout, chunk, point, output))
-        count_cells(tally, point, output)
-    return _failed(layout, chunk, result)
+        part = more.moments[row]
+        if part.cells is None and not layout.whole:  # the thread did not know yet where they lie
+            output = more.output[row][more.finite[row]]
+            if point not in edges:
+                set_cells(tally, point, _cell_sample(layout, chunk, point, output))
+                edges[point] = tally.low[point], tally.high[point]
+            part = part._replace(cells=count_cells(*edges[point], output))
+        add(tally, point, part)
+
+
+class Condensed(NamedTuple):
+    """What is left of a chunk: moments of every point, (point, seed) of what failed, and the output, whose cells may have
+    to be counted yet."""
+
+    moments: list[ChunkMoments]
+    failed: list[list[int]]
+    output: np.ndarray
+    finite: np.ndarray
+
+
+def _moments(
+    layout: Layout,
+    levels: tuple[float, ...],
+    result: dict[str, np.ndarray],
+    row: int,
+    edges: Edges | None,
+) -> ChunkMoments:
+    """Of one point of a chunk; its cells are counted if their `edges` are known."""
+    finite = result["finite"][row]
+    stayed = slice(None) if finite.all() else finite  # a slice copies nothing
+    output = result["output"][row][stayed]
+    found = moments(_rows(layout, result, row)[stayed])
+    if layout.whole:
+        return found._replace(exact=np.quantile(output, levels, axis=0) if len(output) else None)
+    return found if edges is None else found._replace(cells=count_cells(*edges, output))
 
 
 def _failed(layout: Layout, chunk: Chunk, found: dict[str, np.ndarray]) -> list[list[int]]:
@@ -230,8 +266,9 @@ def _write_chunks(layout: Layout, place: AbstractPlace, own: range, tell: Tell, 
     meet()
     done = logged(place, own)
     meet()  # all know what is left before anybody adds to it
-    with chunk_log(place) as log:
-        for chunk, found in run_chunks(layout, [n for n in own if n not in done][rank::count], tell):
+    todo = [n for n in own if n not in done][rank::count]
+    with chunk_log(place) as log, contextlib.closing(run_chunks(layout, todo, tell)) as results:
+        for chunk, found in results:
             region, parts = region_of(layout, chunk, found, states=states)
             write_region(place, region, parts)
             log(chunk.number, _failed(layout, chunk, found))

@@ -7,6 +7,7 @@ from jaxtyping import Bool, Float, Int
 
 LEVELS = (0.05, 0.25, 0.5, 0.75, 0.95)
 CELLS = 512
+AT_ONCE = 2**18  # numbers of the output that are counted at once
 REACH = 8.0  # standard deviations of the first chunk
 
 
@@ -37,13 +38,35 @@ def empty(points: int, values: int, samples: int, levels: int, *, whole: bool) -
                  np.zeros((points, samples, cells), np.int32))  # fmt: skip
 
 
-def add(kept: RunningMoments, point: int, rows: Float[np.ndarray, "seeds values"]) -> None:
-    """Take the finite seeds of a chunk of one point into what is kept, in place."""
-    if len(rows):
-        mean = rows.mean(axis=0, dtype=float)
-        squares = np.square(rows - mean).sum(axis=0)
-        moments = _merged((kept.seeds[point], kept.mean[point], kept.squares[point]), (len(rows), mean, squares))
-        kept.seeds[point], kept.mean[point], kept.squares[point] = moments
+class ChunkMoments(NamedTuple):
+    """What a chunk adds to one point: finite `seeds`, `mean` and `squares` of their values, `cells` of their output, and
+    its `exact` quantiles where all seeds of the point came together."""
+
+    seeds: int
+    mean: Float[np.ndarray, " values"]
+    squares: Float[np.ndarray, " values"]
+    cells: Int[np.ndarray, "samples cells"] | None = None
+    exact: Float[np.ndarray, "levels samples"] | None = None
+
+
+def moments(rows: Float[np.ndarray, "seeds values"]) -> ChunkMoments:
+    """Of the finite seeds of a chunk of one point."""
+    if not len(rows):
+        nothing = np.zeros(rows.shape[1])
+        return ChunkMoments(0, nothing, nothing)
+    mean = rows.mean(axis=0, dtype=float)
+    return ChunkMoments(len(rows), mean, np.square(rows - mean).sum(axis=0))
+
+
+def add(kept: RunningMoments, point: int, more: ChunkMoments) -> None:
+    """Take a chunk of one point into what is kept, in place."""
+    if more.seeds:
+        found = _merged((kept.seeds[point], kept.mean[point], kept.squares[point]), (more.seeds, more.mean, more.squares))
+        kept.seeds[point], kept.mean[point], kept.squares[point] = found
+        if more.exact is not None:
+            kept.exact[point] = more.exact
+        if more.cells is not None:
+            kept.cells[point] += more.cells
 
 
 def _merged(a: tuple, b: tuple) -> tuple:
@@ -62,12 +85,23 @@ def set_cells(kept: RunningMoments, point: int, output: Float[np.ndarray, "seeds
     kept.low[point], kept.high[point] = mean - reach, mean + reach
 
 
-def count_cells(kept: RunningMoments, point: int, output: Float[np.ndarray, "seeds samples"]) -> None:
-    """Count the output of a chunk in the cells of its point."""
-    low, high = (edge[point].astype(output.dtype) for edge in (kept.low, kept.high))
-    place = np.clip((output - low) * (CELLS / (high - low)), 0, CELLS - 1)
-    cell = place.astype(np.int32) + CELLS * np.arange(output.shape[1], dtype=np.int32)
-    kept.cells[point] += np.bincount(cell.ravel(), minlength=kept.cells[point].size).reshape(-1, CELLS).astype(np.int32)
+def count_cells(
+    low: Float[np.ndarray, " samples"], high: Float[np.ndarray, " samples"], output: Float[np.ndarray, "seeds samples"]
+) -> Int[np.ndarray, "samples cells"]:
+    """How much of the output of a chunk lies in each cell of its point; few seeds at a time, which stay in the cache."""
+    samples = output.shape[1]
+    below, above = low.astype(output.dtype), high.astype(output.dtype)
+    scale, first = CELLS / (above - below), CELLS * np.arange(samples, dtype=np.int32)
+    found = np.zeros(samples * CELLS, np.int32)
+    together = max(1, AT_ONCE // samples)
+    for begin in range(0, len(output), together):
+        place = output[begin : begin + together] - below
+        place *= scale
+        np.clip(place, 0, CELLS - 1, out=place)
+        cell = place.astype(np.int32)
+        cell += first
+        found += np.bincount(cell.ravel(), minlength=found.size).astype(np.int32)
+    return found.reshape(samples, CELLS)
 
 
 def merged(first: RunningMoments, second: RunningMoments) -> RunningMoments:

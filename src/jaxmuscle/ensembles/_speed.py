@@ -9,6 +9,7 @@ import jax
 import numpy as np
 
 from jaxmuscle.model._tasks import AbstractTask
+from jaxmuscle.simulation._batch import threads_of
 from jaxmuscle.simulation._simulate import DT, schedule
 
 from ._ensemble import ensemble
@@ -30,24 +31,28 @@ def peak_memory() -> int:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
 
 
-def measure(task: AbstractTask, seeds: int, duration: float) -> dict[str, Any]:
+def measure(task: AbstractTask, seeds: int, duration: float, threads: int | None = None) -> dict[str, Any]:
     """Compile time [s], speed and memory of a reduced ensemble: the first call, then the median of three.
 
-    **Arguments:** `task`; `seeds`; `duration` [s]. **Returns:** a table of numbers and names.
+    **Arguments:** `task`; `seeds`; `duration` [s]; `threads`, how many cores of a CPU (None: all).
+
+    **Returns:** a table of numbers and names.
     """
     before = peak_memory()
     jax.config.update("jax_compilation_cache_dir", None)
     taken = []
     for turn in range(1 + REPETITIONS):
         begun = time.perf_counter()
-        ensemble(task, jax.random.key(turn), seeds=seeds, duration=duration, reduce=True, control=False)
+        ensemble(task, jax.random.key(turn), seeds=seeds, duration=duration, reduce=True, control=False,
+                 threads=threads)  # fmt: skip
         taken.append(time.perf_counter() - begun)
     warm = float(np.median(taken[1:]))
     plan = schedule(task, duration, DT, None, None, None)
     devices = jax.local_devices()
     found = {
         "task": type(task).__name__, "noise": type(task.noise).__name__, "precision": str(jax.numpy.result_type(float)),
-        "device": f"{len(devices)} x {devices[0].device_kind}", "seeds": seeds, "duration_s": duration,
+        "device": f"{len(devices)} x {devices[0].device_kind}", "threads": threads_of(threads), "seeds": seeds,
+        "duration_s": duration,
         "substeps": plan.grid.substeps, "compile_s": taken[0] - warm, "warm_s": warm, "seeds_per_s": seeds / warm,
         "million_steps_per_s": seeds * plan.grid.steps * plan.grid.substeps / warm / 1e6,
         "real_time_factor": seeds * duration / warm, "memory_above_start_mib": (peak_memory() - before) / 2**20,

@@ -10,6 +10,7 @@ from jax.sharding import Mesh
 from jax.sharding import PartitionSpec as P
 from jaxtyping import Array, Integer, PRNGKeyArray
 
+from jaxmuscle._common.environment import usable_cores
 from jaxmuscle._common.programs import kept
 from jaxmuscle.model._noise import AbstractNoise, Realisation
 from jaxmuscle.model._stream import Draws, Stream
@@ -23,6 +24,7 @@ from ._grid import Grid
 
 DRAWN = 8
 LANES = 1024
+THREADED = ("cpu",)  # backends whose devices are cores
 
 
 class Recipe(eqx.Module):
@@ -44,9 +46,16 @@ class Recipe(eqx.Module):
 
 
 def local_mesh() -> Mesh | None:
-    """The devices of this process as one axis; None if there is one."""
+    """The GPUs of this process as one axis; None if there is one device. Cores of a CPU are shared by threads."""
     devices = jax.local_devices()
-    return Mesh(np.array(devices), ("lanes",)) if len(devices) > 1 else None
+    return Mesh(np.array(devices), ("lanes",)) if len(devices) > 1 and jax.default_backend() not in THREADED else None
+
+
+def threads_of(wanted: int | None) -> int:
+    """How many chunks run at the same time: one on each core of a CPU, or as many as wanted; two on other devices."""
+    if jax.default_backend() not in THREADED:
+        return 2
+    return usable_cores() if wanted is None else wanted
 
 
 def draw(noise: AbstractNoise, key: PRNGKeyArray, seeds: Integer[Array, " seeds"], steps: int) -> Any:
