@@ -58,7 +58,7 @@ def fit_report(result: "FitResult", figure: Any, folder: Path) -> None:
 def cohort_report(cohort: "CohortResult", figure: Any | None, folder: Path, places: dict[str, Path]) -> None:
     """Write report.html of a cohort."""
     numbers = [
-        (row["target"], row["group"], row["quantity"], f"{row['value']:.3g} ± {row['stderr']:.2g}", row["unit"])
+        (row["target"], row["group"], row["quantity"], f"{row['value']:.3g} ± {row['stderr']:.2g}", _unit(row["unit"]))
         for row in cohort.table()
         if row["stderr"] is not None
     ]
@@ -69,7 +69,7 @@ def cohort_report(cohort: "CohortResult", figure: Any | None, folder: Path, plac
         *([pages.picture(figure, FIGURES["cohort"])] if figure is not None else []),
     ]
     differences = [
-        (d.quantity, f"{d.b} - {d.a}", f"{d.difference:.3g}", f"{d.low:.3g} to {d.high:.3g}", d.unit)
+        (d.quantity, f"{d.b} - {d.a}", f"{d.difference:.3g}", f"{d.low:.3g} to {d.high:.3g}", _unit(d.unit))
         for d in cohort.differences()
     ]
     if differences:
@@ -99,7 +99,7 @@ def study_report(study: "StudyResult", folder: Path) -> None:
     shown = pages.picture(figure, FIGURES["spectra"])
     plt.close(figure)
     differences = sorted(study.differences(), key=lambda d: (d.p_corrected, d.p))
-    rows = [(d.quantity, d.where, f"{d.b} - {d.a}", f"{d.difference:.3g}", f"{d.low:.3g} to {d.high:.3g}", d.unit,
+    rows = [(d.quantity, d.where, f"{d.b} - {d.a}", f"{d.difference:.3g}", f"{d.low:.3g} to {d.high:.3g}", _unit(d.unit),
              f"{d.p:.2g}", "" if d.p_corrected is None else f"{d.p_corrected:.2g}") for d in differences]  # fmt: skip
     columns = ("quantity", "condition", "comparison", "difference", "interval", "unit", "p", "p corrected")
     fits = [(name, result.verdict) for name, result in study.cohort.results.items()]
@@ -134,9 +134,9 @@ def posterior_report(found: "Posterior", figures: dict[str, Any], folder: Path) 
         rows: dict[bool, list[tuple[str, ...]]] = {True: [], False: []}
         for name in summary.rows:
             told = summary[name]
-            unit, size = summary.units[name], min(told["ess_bulk"], told["ess_tail"])
+            unit, size = _unit(summary.units[name]), min(told["ess_bulk"], told["ess_tail"])
             rows[name in found.determined].append(
-                (name, f"{told['median']:.4g}", f"{told['low']:.4g} to {told['high']:.4g}", "" if unit == "1" else unit,
+                (name, f"{told['median']:.4g}", f"{told['low']:.4g} to {told['high']:.4g}", unit,
                  f"{told['r_hat']:.3f}", f"{size:.0f}")
             )  # fmt: skip
         body += [pages.heading("What the data determine"), pages.table(columns, rows[True])]
@@ -159,6 +159,10 @@ def posterior_report(found: "Posterior", figures: dict[str, Any], folder: Path) 
     body += _data({name: part.target for name, part in found.parts.items()})
     body += _how(found.settings | {"seed": found.seed}, found.versions)
     pages.write_page(folder / REPORT, f"Posterior of {found.title}", body)
+
+
+def _unit(unit: str) -> str:
+    return "" if unit == "1" else unit
 
 
 def _pictures(figures: dict[str, Any]) -> list[Html]:
