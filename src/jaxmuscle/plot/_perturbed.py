@@ -37,7 +37,8 @@ def perturbed(recording: Any, settings: Any = None, ax: Axes | None = None) -> F
     """
     heights = (1.2, 1.3, 1.5, 1.1, 1.2)
     fig = canvas(ax, (COLUMN, sum(heights)))
-    upper, lower = fig.subfigures(2, 1, height_ratios=(sum(heights[:2]), sum(heights[2:])))
+    halves = sum(heights[:2]), sum(heights[2:])
+    upper, lower = fig.subfigures(2, 1, squeeze=False, height_ratios=halves)[:, 0]
     traces, closer = upper.subplots(2, 2, sharex="col", sharey="row", width_ratios=(1.6, 1)).T
     channels = ((recording.force, 1.0, "Force (N)", BLUE), (recording.displacement, 1e3, "Lengthening (mm)", VERMILLION))
     for whole, near, (channel, scale, label, colour) in zip(traces, closer, channels, strict=True):
