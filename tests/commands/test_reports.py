@@ -81,7 +81,8 @@ def test_of_a_study(tmp_path):
     study_report(study, tmp_path)
     text, _ = told(tmp_path)
     smallest = min(study.differences(), key=lambda d: (d.p_corrected, d.p))
-    assert f"p corrected | {smallest.quantity} | {smallest.where} | " in text  # the clearest first
+    cells = ("p corrected", smallest.quantity, smallest.where, f"{smallest.b} - {smallest.a}")
+    assert " | ".join(filter(None, cells)) in text  # the clearest first
     assert study.methods() in text and "people.csv and differences.csv" in text
 
 
