@@ -95,7 +95,7 @@ def study_report(study: "StudyResult", folder: Path) -> None:
     """Write report.html of a study."""
     import matplotlib.pyplot as plt
 
-    figure = study.plot()
+    figure: Any = study.plot()
     shown = pages.picture(figure, FIGURES["spectra"])
     plt.close(figure)
     differences = sorted(study.differences(), key=lambda d: (d.p_corrected, d.p))

@@ -50,7 +50,7 @@ def start_values(result: Any, ax: Axes | None = None) -> Axes:
         raise ValueError("the fit does not say where its starts ended: it was saved by an earlier version; fit again")
     rise = 2 * (np.array([cost for cost, _ in ended]) - ended[0][0])
     values = np.array([row for _, row in ended])
-    positive = (values > 0).all(axis=0)
+    positive = np.atleast_1d((values > 0).all(axis=0))
     names = [name for name, shown in zip(result.settings["free"], positive, strict=True) if shown]
     ratio, rows = (values / values[0])[:, positive], np.arange(len(names))
     if ax is None:
