@@ -17,7 +17,6 @@ from rich.console import Console
 import jaxmuscle as jm
 
 from .options import SAME_NAME, Observed, TaskName
-from .reports import REPORT, fit_report
 from .signals import interrupted
 
 if TYPE_CHECKING:
@@ -156,6 +155,8 @@ def write_fit(result: "FitResult", folder: Path, formats: Iterable[str] = (), *,
     """fit.json, fit in each of the formats, tables, a report if it is wanted, each whole or not there; their names."""
     from jaxmuscle._common.figures import remove_figures, write_figure
     from jaxmuscle._common.files import remove, write_text
+
+    from .reports import REPORT, fit_report
 
     tables = fit_tables(result)
     remove(folder, *tables, REPORT)

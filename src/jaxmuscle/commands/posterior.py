@@ -25,7 +25,6 @@ from .options import (
     formats_of,
     names_in,
 )
-from .reports import posterior_report
 
 if TYPE_CHECKING:
     from jaxmuscle.fits import FitResult
@@ -114,6 +113,8 @@ def _fitted(target: str, read: dict[str, Any], asked: dict[str, Any], seed: int)
 
 def _write(found: "Posterior", folder: Path, formats: list[str]) -> None:
     from jaxmuscle._common.figures import remove_figures, write_figure
+
+    from .reports import posterior_report
 
     remove_figures(folder, "corner", "predictive")
     found.save(folder / "posterior.nc")

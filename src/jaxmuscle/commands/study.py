@@ -10,7 +10,6 @@ import jaxmuscle as jm
 from .console import CONVERGED, NOT_CONVERGED, err, out, plain, record, reporting, show, writable
 from .options import READING, Force, Formats, Json, NoiseName, Output, Seed, SpectrumName, Window, formats_of, names_in
 from .recordings import edges_of, reads_recordings
-from .reports import study_report
 
 
 @reads_recordings
@@ -46,6 +45,8 @@ def study(
     """
     with reporting(as_json):
         from jaxmuscle._common.environment import keep_compiled_programs
+
+        from .reports import study_report
 
         keep_compiled_programs()
         span = edges_of(window)

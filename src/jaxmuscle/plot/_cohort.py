@@ -8,6 +8,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure, SubFigure
 
+from jaxmuscle._common.text import printable
+
 from ._numbers import in_words
 from ._study import group_spectra
 from ._style import BLUE, COLUMN, GREY, PALETTE, canvas, fitted_to, frequency_axis, key, styled
@@ -111,7 +113,7 @@ def _panel(ax: Axes, rows: list[dict[str, Any]], people: list[str], groups: list
         ax.errorbar(place, value, error, fmt="o", markersize=3.5, capsize=2, linewidth=1, color=colour, label=group or None)
     ax.set_ylabel(textwrap.fill(in_words(rows[0]["quantity"], rows[0]["unit"]), 18))
     if by == "group":
-        ax.set_xticks(range(len(groups)), [group or "all" for group in groups])
+        ax.set_xticks(range(len(groups)), [printable(group) or "all" for group in groups])
         ax.set_xlim(-0.6, len(groups) - 0.4)
     elif by == "level":
         ax.set_xlabel("Level (% MVC)")
@@ -119,6 +121,8 @@ def _panel(ax: Axes, rows: list[dict[str, Any]], people: list[str], groups: list
         ax.set_xlim(-0.5, len(people) - 0.5)
         if len(people) <= LABELLED:
             turned = 35 if len(people) <= 6 else 60
-            ax.set_xticks(range(len(people)), people, rotation=turned, ha="right", rotation_mode="anchor")
+            ax.set_xticks(
+                range(len(people)), [printable(name) for name in people], rotation=turned, ha="right", rotation_mode="anchor"
+            )
         else:
             ax.set_xlabel("Target number")

@@ -11,6 +11,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure, SubFigure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
+from jaxmuscle._common.text import printable
+
 # Okabe & Ito 2008, Color Universal Design: told apart with any common form of colour vision.
 BLUE, VERMILLION, GREEN, PURPLE = "#0072B2", "#D55E00", "#009E73", "#CC79A7"
 ORANGE, SKY, BLACK, GREY = "#E69F00", "#56B4E9", "#000000", "#767676"
@@ -91,7 +93,7 @@ def density_unit(unit: str) -> str:
 
 def heading(fig: Figure | SubFigure, words: str, *, bad: str = "") -> int:
     """What is drawn, and below it in red what forbids to believe it; how many lines."""
-    text = "\n".join(filter(None, (words if len(words) <= 50 else f"{words[:49]}…", bad)))
+    text = "\n".join(filter(None, (printable(words if len(words) <= 50 else f"{words[:49]}…"), bad)))
     color = VERMILLION if bad else matplotlib.rcParams["text.color"]
     fig.suptitle(text, x=0.02, ha="left", size=9, weight="bold", color=color, parse_math=False)
     return 1 + bool(bad)
