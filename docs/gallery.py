@@ -43,15 +43,18 @@ hide: [navigation]
 
 # Gallery
 
-Every figure of jaxmuscle with the code that draws it, the blocks being run one after another; `docs/gallery.py` makes this
-page and its figures. Each is a function of [`jm.plot`](reference/figures.md) that draws into axes of yours as well. Click on
-one to see it whole.
+Use this page to find a figure by its looks. It shows every figure that jaxmuscle draws, with the code below it. Each section
+begins with a block of code. Run the blocks one after another: the figures of a section use its names. Click on a figure to
+see it whole.
+
+Every figure is a function of [`jm.plot`](reference/figures.md), and can also be drawn into axes of yours. `docs/gallery.py`
+makes this page and its figures.
 """
 TAIL = """
 ## A Hill-type muscle
 
-`python docs/hill_muscle.py` draws a muscle written outside the package, and its spectrum with two colours of noise:
-[your own muscle](own-muscle.md).
+You can use a [muscle of your own](own-muscle.md). `python docs/hill_muscle.py` draws one, and its spectrum with two colours
+of noise.
 
 [![Force-length, force-velocity and tendon curves; isometric force spectrum](hill.png)](hill.png)
 """
@@ -126,37 +129,49 @@ SECTIONS = (
     Section("A fit", FIT, (
         Shown("fit.png", "result.plot()", "A fit: spectra, residuals, output", "tutorial.md#4-read-it"),
         Shown("gallery/schematic.png", "jm.plot.schematic(result)", "The model with its numbers", "model.md#muscle"),
+<<<<<<< HEAD
         Shown("gallery/components.png", "jm.plot.components(result)", "What the power is made of", "fitting.md"),
         Shown("gallery/starts.png", "jm.plot.starts(result)", "Whether its starts agree", "fitting.md"),
         Shown("gallery/start_values.png", "jm.plot.start_values(result)", "In which parameters they agree", "fitting.md"),
         Shown("gallery/target.png", "target.plot(log=True)", "A target, the sampling error of its bins", "digitise.md"),
+=======
+        Shown("gallery/starts.png", "jm.plot.starts(result)", "Did all starts end at the same minimum?", "fitting.md"),
+        Shown("gallery/target.png", "target.plot(log=True)", "A target with the sampling error of its bins", "digitise.md"),
+>>>>>>> main
     )),
     Section("Simulations", SIMULATED, (
         Shown("gallery/simulation.png", "jm.plot.simulation(runs)", "Output, its analysed window, spectra", "model.md"),
-        Shown("gallery/trajectory.png", "runs.plot(window=(10.0, 15.0))", "200 seeds: mean, 90 % band, three", "model.md"),
-        Shown("gallery/spectrum.png", "runs.spectrum().plot(log=True, proportional=False)", "Their spectra", "model.md"),
-        Shown("gallery/estimate.png", "runs.mean_spectrum().plot(log=True)", "Their mean, with and without control variate",
+        Shown("gallery/trajectory.png", "runs.plot(window=(10.0, 15.0))",
+              "200 seeds: their mean, their 90 % band, and three of them", "model.md"),
+        Shown("gallery/spectrum.png", "runs.spectrum().plot(log=True, proportional=False)",
+              "The spectra of these 200 seeds", "model.md"),
+        Shown("gallery/estimate.png", "runs.mean_spectrum().plot(log=True)",
+              "Their mean spectrum, with and without control variate",
               "model.md"),
-        Shown("gallery/moments.png", "summary.plot()", "Moments of 2000 seeds, none of them kept", "ensembles.md"),
-        Shown("gallery/sweep.png", "ax", "A sweep: three dampings, the same noise", "ensembles.md"),
-        Shown("gallery/sensitivity.png", "jm.sensitivity(result.task).plot()", "Every bin, every parameter", "model.md"),
+        Shown("gallery/moments.png", "summary.plot()", "Mean and band of 2000 seeds, of which none is kept", "ensembles.md"),
+        Shown("gallery/sweep.png", "ax", "A sweep: three dampings with the same noise", "ensembles.md"),
+        Shown("gallery/sensitivity.png", "jm.sensitivity(result.task).plot()",
+              "How much each parameter changes each bin", "model.md"),
         Shown("gallery/static.png", "jm.static_characteristics(result.task).plot()",
-              "Stiffness, damping, force at rest", "scaling.md"),
+              "Stiffness, damping and force against displacement and velocity", "scaling.md"),
     )),
-    Section("How sure is it, and is it right", SURE, (
-        Shown("gallery/profile.png", "corner.plot()", "A profile", "uncertainty.md"),
+    Section("How sure is it, and is it right?", SURE, (
+        Shown("gallery/profile.png", "corner.plot()", "A profile: how far one quantity can move", "uncertainty.md"),
         Shown("gallery/profiles.png", 'jm.plot.profiles([corner, jm.profile(result, "high_frequency_floor")])',
               "Several profiles", "uncertainty.md"),
         Shown("gallery/posterior.png", "found.plot()", "The posterior of what the data determine", "uncertainty.md"),
-        Shown("gallery/chains.png", "found.plot_chains()", "Its chains", "uncertainty.md"),
+        Shown("gallery/chains.png", "found.plot_chains()", "The chains of the posterior", "uncertainty.md"),
         Shown("gallery/predictive.png", "found.plot_predictive()", "The spectra that it predicts", "uncertainty.md"),
         Shown("identifiability.png", "jm.identifiability(result).plot()", "What further measurements would determine",
               "identifiability.md"),
         Shown("gallery/designed_input.png", "jm.design_input(result).plot()", "A motion made to measure stiffness",
               "perturbed-design.md"),
-        Shown("gallery/goodness.png", "jm.goodness(result).plot()", "Residuals, and what is usual", "goodness.md"),
-        Shown("gallery/bootstrap.png", "jm.bootstrap(result).plot()", "Refits against the stated errors", "goodness.md"),
-        Shown("gallery/comparison.png", "jm.compare_noise(jm.Isometric(), target).plot()", "Which noise", "noise-colour.md"),
+        Shown("gallery/goodness.png", "jm.goodness(result).plot()",
+              "Is the model right? Residuals against what is usual", "goodness.md"),
+        Shown("gallery/bootstrap.png", "jm.bootstrap(result).plot()",
+              "Are the stated errors right? Refits of simulated data", "goodness.md"),
+        Shown("gallery/comparison.png", "jm.compare_noise(jm.Isometric(), target).plot()",
+              "Which noise? Models compared", "noise-colour.md"),
     )),
     Section("Recordings, people, several measurements", PEOPLE, (
         Shown("gallery/recording.png", "recording.steady().plot()", "A recording and its steady window", "recordings.md"),
@@ -165,8 +180,14 @@ SECTIONS = (
         Shown("gallery/steadiness.png", "jm.steadiness(trials).plot()", "How steady five trials are",
               "recordings.md#steadiness"),
         Shown("gallery/cohort.png", "cohort.plot()", "What six people's spectra determine", "fitting.md#many-targets"),
+<<<<<<< HEAD
         Shown("gallery/groups.png", "jm.plot.groups(cohort)", "Spectra and numbers by group", "fitting.md#many-targets"),
         Shown("gallery/levels.png", 'cohort.plot(by="level")', "The same by level", "fitting.md#many-targets"),
+=======
+        Shown("gallery/groups.png", 'cohort.plot(by="group")', "The same six people by group", "fitting.md#many-targets"),
+        Shown("gallery/levels.png", 'cohort.plot(by="level")',
+              "The same six people by level of contraction", "fitting.md#many-targets"),
+>>>>>>> main
         Shown("gallery/joint.png", "jm.fit_joint({name: people[name] for name in pair}, tasks=pair).plot()",
               "Two measurements fitted together", "identifiability.md#a-joint-fit"),
     )),
@@ -175,11 +196,12 @@ SECTIONS = (
               "perturbed.md"),
         Shown("gallery/fitted_stiffness.png", "jm.fit(jm.PrescribedLength(), minute).plot()",
               "A muscle fitted to such a minute: its stiffness and its fluctuations", "perturbed.md#fit-it"),
-        Shown("gallery/frequency_response.png", "perturbed.frequency_response().plot()", "That stiffness with its errors",
+        Shown("gallery/frequency_response.png", "perturbed.frequency_response().plot()",
+              "The dynamic stiffness with its errors",
               "perturbed.md"),
     )),
     Section("A study", STUDY, (
-        Shown("gallery/study.png", "study.plot()", "Spectra of people and of groups", "study.md"),
+        Shown("gallery/study.png", "study.plot()", "A study: spectra of people and of groups", "study.md"),
     )),
     Section("The paper's figures", '\njm.reproduce("paper")\n', tuple(
         Shown(f"gallery/paper-{name}.png", "", words, "reproduce.md") for name, words in PAPER.items()

@@ -17,7 +17,8 @@ from jaxmuscle.response._presets import PresetFile
 PAGE = Path(__file__).parent / "reference" / "parameters.md"
 HEAD = """# Parameters and units
 
-One table holds every parameter: `jm.PARAMETERS[name]` is its row. `docs/generate.py` writes this page from it.
+Look here for the name, unit, default and limits of a parameter. In Python `jm.PARAMETERS[name]` is the same row.
+`docs/generate.py` writes this page from the code.
 
 ## One name everywhere
 
@@ -31,14 +32,14 @@ A parameter has the name of this table wherever you write it:
 | say how it is fitted | `free=("k_w",)`, `fix={"k_w": 4e5}`, `priors={"k_w": 0.5}`, `bounds={"k_w": (1e5, 1e6)}` |
 | do so from a shell | `--free k_w`, `--fix k_w=4e5` |
 
-- Two tissues, one letter: `_w` is the active tissue, `_z` the passive one. Small letters are factors (`k_w`, `c_w`). What
-  begins with `noise_` is the noise on a coefficient (`noise_K_w`).
-- Results call three parameters by the name that people use. Both names work everywhere: `tremor_frequency` is
+- The letter at the end says which tissue is meant: `_w` the active one, `_z` the passive one. A small letter is a factor
+  (`k_w`, `c_w`), a capital the stiffness or damping itself (`K_w0`). `noise_K_w` is the noise on the stiffness K_w.
+- Three parameters have a second name, from the field. Both names work everywhere: `tremor_frequency` is
   `resonance_frequency`, `tremor_width` is `resonance_width`, `contraction_time` is `activation_time`.
 - `K_w0`, `K_z0`, `C_w0` and `C_z0`, stiffness and damping at rest, follow from parameters. You can read them
   (`task["K_w0"]`, `result["K_w0"]`), but not set or fit them.
 - `P_w`, `F_ext` and `x_z` are inputs over time. `task["P_w"]` is the level that is held, `task.P_w` the whole signal.
-- In a joint fit `c_w@high` is that of the target "high" alone.
+- In a joint fit `c_w@high` is the `c_w` of the target "high" alone.
 - A wrong name is an error that says which one you may have meant.
 
 ## Values
@@ -51,8 +52,9 @@ A parameter has the name of this table wherever you write it:
 FIT = """
 ## In a fit
 
-A positive parameter is fitted in log space, and *prior sd* is the standard deviation of its logarithm about the value of the
-task that is passed in; of the others it is in the parameter's own unit.
+A fit has a prior for every free parameter. It is centred on the value that the parameter has in the task which you pass in.
+*prior sd* is its standard deviation. A positive parameter is fitted in *log space*: there *prior sd* is that of the
+logarithm. For the others it is in the parameter's own unit. *Reached by a fit* are the bounds of the search.
 
 | name | log space | prior sd | reached by a fit | source of the default |
 |---|---|---|---|---|
@@ -60,9 +62,9 @@ task that is passed in; of the others it is in the parameter's own unit.
 TAIL = """
 ## Units
 
-SI throughout: masses in kg, lengths in m, forces in N, times in s, frequencies in Hz, angles in rad. `k` [N/m³] times a
-squared length is a stiffness [N/m], `c` [N s³/m³] times a squared velocity a damping coefficient [N s/m]. A unit of 1 is a
-ratio: noise and harmonic amplitudes are fractions of the coefficient at rest.
+All units are SI: masses in kg, lengths in m, forces in N, times in s, frequencies in Hz, angles in rad. `k` [N/m³] times a
+squared length is a stiffness [N/m]. `c` [N s³/m³] times a squared velocity is a damping coefficient [N s/m]. The unit 1
+means a ratio: amplitudes of noise and harmonic are fractions of the coefficient at rest.
 
 ::: jaxmuscle.PARAMETERS
 
@@ -73,12 +75,16 @@ The table by name, a dictionary of `Parameter`.
 FILES = Path(__file__).parent / "reference" / "files.md"
 FILES_HEAD = """# Files, key by key
 
-Every file that jaxmuscle reads as a table has a schema. A key that is unknown, missing, there twice, of a wrong type or out
-of range is an error that names the file and the key. Nothing gets a silent default. Numbers are finite; `true` is not 1;
-`1.0` is not a whole number. This page is written by `docs/generate.py` from the schemas.
+Look here if you write one of these files by hand, or read one with a program of yours. For each kind of file there is
+a table of all its keys. *Since* is the first version of the format that has the key. A later version of jaxmuscle
+reads earlier formats.
 
-*Since* is the version of the format that has the key. A later version of jaxmuscle reads earlier formats.
+Files are checked when they are read. A key that is unknown, missing, there twice, of a wrong type or out of range is
+an error that names the file and the key. No missing key is replaced by a default without a word. Numbers must be
+finite. `true` is not 1, and `1.0` is not a whole number. `docs/generate.py` writes this page from the code that
+checks the files.
 """
+<<<<<<< HEAD
 FIT_FILE = """JSON, format 4. Written by `FitResult.save`, read by `load_result`; `load_preset` takes its `task_table`. Of
 one target it has the keys of both tables, of several those of the second stand under `parts`, by name. Keys must agree: the
 value of a parameter with its `task_table`, the spectrum with its `target_table`. Format 3 does not say where starts
@@ -89,6 +95,19 @@ of its parts, each part with its class as `type`. What a task does not have (`ac
 TARGET = """TOML, format 1. Written by `Target.save`, read by `load_target`. As `target_table` of a fit.json it has all keys
 but `format`, and `null` for what is not stated."""
 STUDY = """TOML, read by `run_study`. A study.csv has the columns of the second table."""
+=======
+FIT_FILE = """JSON, format 3. `FitResult.save` writes it and `load_result` reads it. `load_preset` reads its
+`task_table` alone. A fit of one target has the keys of the first two tables side by side. In a fit of several targets
+the keys of the second table stand under `parts`, by the name of the target. Keys must agree: the value of a parameter
+with its `task_table`, the spectrum with its `target_table`. In format 2 keys may be missing that task and target do
+not have."""
+PRESET = """TOML, format 2. `save_preset` writes it and `load_preset` reads it. The `task_table` has every field of
+the task and of its parts. `type` is the class of a part. What a task does not have (`activation`, `initial`, a
+low-pass) is `"none"`. In format 1, which has no key `format`, these may be missing."""
+TARGET = """TOML, format 1. `Target.save` writes it and `load_target` reads it. The `target_table` of a fit.json has
+the same keys without `format`, and `null` for what is not stated."""
+STUDY = """TOML. `run_study` reads it. The second table has the columns of a study.csv."""
+>>>>>>> main
 F = _fit_file
 SECTIONS = (
     ("fit.json", FIT_FILE, 2, (F.FitTable, F.PartTable, F.EstimateTable, F.AdequacyTable, F.RungTable, F.StartTable,
@@ -164,7 +183,8 @@ def files_page() -> str:
             text += f"\n### {(table.__doc__ or '').strip().rstrip('.')}\n\n"
             text += "| key | type and range | required | since | meaning |\n|---|---|---|---|---|\n"
             for field in msgspec.structs.fields(table):
-                given, about = typing.get_args(hints[field.name])[:2]
+                given, *limits, about = typing.get_args(hints[field.name])
+                given = typing.Annotated[given, *limits] if limits else given  # an Annotated within one is flattened
                 told = about.extra["type"] if about.extra else kind(given)
                 needed = "yes" if field.required else "no"
                 text += f"| `{field.name}` | {told} | {needed} | {since} | {about.description} |\n"

@@ -118,7 +118,7 @@ def test_broken_toml_as_target(tmp_path):
 OPTIONS = {
     "unknown target": (["vastus-lateralis-26mv"], "did you mean 'vastus-lateralis-26mvc'"),
     "unknown free parameter": (["{csv}", "--free", "c_W"], "'c_W': did you mean 'c_w'"),
-    "nothing free": (["{csv}", "--free", ","], "name at least one, several with commas"),
+    "nothing free": (["{csv}", "--free", ","], "name at least one; put commas between several"),
     "unknown fixed parameter": (["{csv}", "--fix", "k_ww=1"], "'k_ww' of Isometric: did you mean 'k_w'"),
     "free and fixed": (["{csv}", "--free", "k_w", "--fix", "k_w=1"], "k_w cannot be both free and fixed"),
     "fix without value": (["{csv}", "--fix", "k_w"], "--fix 'k_w': write NAME=VALUE"),
@@ -164,7 +164,7 @@ def test_fewer_bins_than_free_parameters(tmp_path):
 def test_out_is_a_file(tmp_path):
     path = csv_file(tmp_path)
     result = run("fit", path, "--out", path)
-    assert result.exit_code == 2 and "--out" in result.stderr and "is a file, give a folder" in result.stderr
+    assert result.exit_code == 2 and "--out" in result.stderr and "is a file; give the name of a folder" in result.stderr
     below = run("fit", path, "--out", path / "folder")
     assert below.exit_code == 2 and str(path) in below.stderr
 
@@ -219,7 +219,7 @@ def test_a_preset_with_a_mean_force_is_simulated_at_it(tmp_path):
 def test_what_is_observed_of_a_motion(tmp_path):
     arguments = ["simulate", "zagrodny-slifkin", "--observe", "acceleration", "--seeds", 4, "--out", tmp_path]
     refused = run(*arguments)
-    assert refused.exit_code == 2 and "has no motion; add --task prescribed-force" in refused.stderr
+    assert refused.exit_code == 2 and "no motion is the output; add --task prescribed-force" in refused.stderr
     outcome = run(*arguments, "--task", "prescribed-force")
     assert outcome.exit_code == 0 and "a_z: mean" in outcome.stdout and "m/s^2, standard deviation" in outcome.stdout
 
@@ -409,7 +409,7 @@ def test_several_targets_have_a_folder_each(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("result", "code", "word"),
     [
-        (made_result(), 0, "Describes the data: "),
+        (made_result(), 0, "The model describes the data: "),
         (made_result(success=False), 1, "Not fitted: "),
         (failed_result(), 1, "Not fitted: "),
     ],
@@ -648,7 +648,7 @@ signals.LIMIT = 200  # what reports a fit may have to be compiled
 def loud(progress, title):
     def tell(text, share):
         print(text, flush=True)
-        if text.startswith("trying starts"):
+        if text.startswith("searching from"):
             time.sleep(60)  # until the signal
     yield tell
 
@@ -660,7 +660,7 @@ main()
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
         for line in process.stdout:
-            if line.startswith("trying starts"):
+            if line.startswith("searching from"):
                 process.send_signal(signal.SIGINT)
                 break
         _, errors = process.communicate(timeout=300)
@@ -766,7 +766,7 @@ def test_a_designed_motion(tmp_path):
     assert (tmp_path / "out" / "design.png").stat().st_size > 10_000
     for arguments, message in (
         (("--out", tmp_path / "out"), "motor.csv: is there already; overwrite it with --force"),
-        (("--band", "5", "--out", tmp_path / "new"), "--band 5: give lowest and highest frequency in Hz, 0.1:5 say"),
+        (("--band", "5", "--out", tmp_path / "new"), "--band 5: give lowest and highest frequency in Hz, as --band 0.1:5"),
         (("--quantity", "K", "--out", tmp_path / "new"), "quantity 'K' is unknown"),
     ):
         wrong = run("design", preset, *arguments)

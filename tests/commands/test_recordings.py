@@ -72,9 +72,9 @@ def test_a_column_for_each_trial(folder, tmp_path):
 
 REFUSED = {
     "units": (("trial0.csv", "volts.csv"), (), "units N and V cannot be averaged"),
-    "mixed": (("trial0.csv", "fdi-abduction-45mvc"), (), "fit them one at a time, or `jaxmuscle analyse ... --save-target`"),
+    "mixed": (("trial0.csv", "fdi-abduction-45mvc"), (), "They cannot be fitted together: fit one at a time"),
     "segments": (("trial0.csv", "trial1.csv"), ("--segments", 6), "--segments and --dataset belong to spectra"),
-    "groups": (("trial0.csv",), ("--groups", "x.csv"), "--groups needs several targets"),
+    "groups": (("trial0.csv",), ("--groups", "x.csv"), "--groups compares several spectra"),
     "missing": (("nothing.csv", "trial0.csv"), (), "nothing.csv"),
 }
 

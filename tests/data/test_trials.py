@@ -302,7 +302,7 @@ def test_a_fit_has_the_measured_mean(strong):
     assert result.task["m_w"] > 5 * jm.Isometric()["m_w"]
     target = jm.Trials(found).target()
     assert result.settings["carried"] == pytest.approx(result.task["m_w"] / jm.Isometric()["m_w"])
-    assert "carried to the measured mean force" in " ".join(str(result).split())
+    assert "the muscle has the measured mean force" in " ".join(str(result).split())
     without = jm.fit(jm.Isometric(), target, seeds=0, check_seeds=0, starts=16, mean_force=False)
     assert without.per_newton and "P_w" not in without.free
     # Another scale of force is the same spectrum: P_w is one more freedom, which a mean takes away again.

@@ -280,7 +280,7 @@ def test_directions_of_single_targets_are_named():
     flat = np.zeros((2, 7))
     flat[0, 1:4] = flat[1, 4:] = 1 / np.sqrt(3)
     found = identifiability(10 * (np.eye(7) - flat.T @ flat))
-    scale = "all noise amplitudes and the harmonic's can be scaled together"
+    scale = "all noise amplitudes and the harmonic's can be multiplied by one number"
     assert common_scales(names, found) == (f"{scale} (a)", f"{scale} (b)")
 
 
@@ -322,7 +322,7 @@ def test_a_result_holds_everything(quick):
 
 def test_a_result_in_words(quick):
     text = str(quick)
-    assert text.startswith("Describes the data: chi2 per bin ")
+    assert text.startswith("The model describes the data: chi2 per bin ")
     assert text.splitlines()[1] == "  together: low, high"
     for expected_line in ("  low: low, Isometric, BandLimitedNoise, chi2 per bin 0.0", "harmonic_amplitude@high",
                           "corner_frequency@low"):  # fmt: skip

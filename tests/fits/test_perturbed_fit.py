@@ -88,7 +88,7 @@ def test_stiffness_and_damping_are_known(result):
 @pytest.mark.slow
 def test_what_a_fit_says_and_keeps(result, tmp_path):
     text = str(result)
-    assert "Describes the data: chi2 per datum" in text and "PrescribedLength" in text
+    assert "The model describes the data: chi2 per datum" in text and "PrescribedLength" in text
     result.save(tmp_path / "fit.json")
     again = jm.load_result(tmp_path / "fit.json")
     assert str(again) == text

@@ -38,7 +38,7 @@ def made_result(**changes: Any) -> jm.fits.FitResult:
     rng = np.random.default_rng(0)
     fields: dict[str, Any] = {
         "success": True,
-        "message": "converged: 1 of 2 starts agree",
+        "message": "converged: 1 of 2 starts end at this fit",
         "adequacy": Adequacy(26.1, 25.0, 0.4, "the data have more power than the model at 4.3 Hz (1.2 standard errors)"),
         "task": task,
         "target": TARGET,
@@ -51,7 +51,7 @@ def made_result(**changes: Any) -> jm.fits.FitResult:
         },
         "products": ("k_w / c_w",),
         "correlation": {"parameters": ["k_w", "c_w"], "matrix": [[1.0, -0.5], [-0.5, 1.0]]},
-        "undetermined": ("stiffness and damping can be scaled together",),
+        "undetermined": ("stiffness and damping can all be multiplied by one number",),
         "singular_values": np.array([12.0, 1 / 3]),
         "chi2_per_bin": 0.9,
         "rms_log_error": 0.2,
@@ -219,22 +219,22 @@ def test_a_fit_json_is_a_preset(tmp_path):
 def test_text_shows_what_is_known_and_what_is_not():
     text = str(made_result())
     first, second, *_ = text.splitlines()
-    assert first == "Describes the data: chi2 per bin 0.9, p = 0.4"
-    assert second == "  made (user), Isometric, BandLimitedNoise, montecarlo"
+    assert first == "The model describes the data: chi2 per bin 0.9, p = 0.4"
+    assert second == "  made (user), Isometric, BandLimitedNoise, method montecarlo"
     words = " ".join(text.split())
     for part in (
-        "converged: 1 of 2 starts agree",
+        "converged: 1 of 2 starts end at this fit",
         "c_w 6.667 ± 0.013",  # 16.667 N over a mean of 2.5 N
         "corner_frequency 0.333 ± 0.010 above 0.31 Hz",
-        "they also fix, roughly: k_w / c_w",
-        "not determined (near their defaults by the prior): k_w",
-        "do not notice if: - stiffness and damping can be scaled together",
-        "what has newtons in its unit is stated per newton of mean force",
+        "products and ratios known roughly: k_w / c_w",
+        "not determined (values near the defaults: do not interpret them): k_w",
+        "the data leave open: - stiffness and damping can all be multiplied by one number",
+        "stiffness and damping are stated per newton of mean force",
         "note: a notice",
         "chi2 per bin 0.90",
     ):
         assert part in words
-    assert words.index("determined by the data") < words.index("not determined (near")
+    assert words.index("determined by the data") < words.index("not determined (values near")
     assert str(failed_result()).startswith("Not fitted: no start has a finite spectrum")
 
 
@@ -243,12 +243,15 @@ def test_a_fit_that_misses_the_data_says_so_first():
     found = made_result(adequacy=missed, chi2_per_bin=5.0)
     first, *rest = str(found).splitlines()
     assert found.adequate is False and found.adequacy_p == 0.001
-    assert first.startswith("Does not describe the data: chi2 per bin 5, p <= 0.001; the data have more power")
+    assert first.startswith("The model does not describe the data: chi2 per bin 5, p <= 0.001; the data have")
     words = " ".join(" ".join(rest).split())
-    for part in (f"errors are widened by a factor of {np.sqrt(145 / 25):.2g}", "what to do: look at the residuals"):
+    for part in (
+        f"errors are widened by a factor of {np.sqrt(145 / 25):.2g}",
+        "what to do: do not interpret",
+    ):
         assert part in words
     unknown = made_result(adequacy=None, chi2_per_bin=None)
-    assert unknown.adequate is None and str(unknown).startswith("Cannot be judged: the target does not say how much")
+    assert unknown.adequate is None and "the data cannot be judged: the target" in " ".join(str(unknown).split())
 
 
 def test_text_fits_a_terminal():

@@ -250,7 +250,7 @@ def result(**changes):
     residual = np.resize([0.5, -1.5, 2.5, -0.5], f.size)
     fields = {
         "success": True,
-        "message": "converged: 28 of 100 starts agree",
+        "message": "converged: 28 of 100 starts end at this fit",
         "adequate": True,
         "adequacy_p": 0.2,
         "verdict": "describes the data: chi2 per bin 1.2, p = 0.2",
@@ -274,11 +274,11 @@ def result(**changes):
         "model": "Isometric, BandLimitedNoise",
         "residual": residual,
         "deviation": np.full(f.size, 0.3),
-        "undetermined": ("stiffness and damping can be scaled together",),
+        "undetermined": ("stiffness and damping can all be multiplied by one number",),
         "stretch": (10 + np.arange(500) / 100, 5 + 0.01 * np.sin(np.arange(500))),
         "starts": ((), ()),
         "notices": (),
-        "remarks": ("simulation and linear response differ by at most 0.2 % of a bin",),
+        "remarks": ("simulation and closed formula (linear response) differ by at most 0.2 % of a bin",),
         "profile": (np.linspace(0.4, 11.7, 64), 10 - 9 * np.exp(-((np.linspace(0.4, 11.7, 64) - 3.9) ** 2))),
         "harmonic_p_value": 0.08,
         "seed": 7,

@@ -26,8 +26,8 @@ ELSEWHERE = {
 BELOW = {"docs/gallery.md"}  # its program is read instead
 RUN_HERE = {
     "README.md", "docs/coming-from-diffrax.md", "docs/coming-from-matlab.md", "docs/ensembles.md", "docs/fit-a-csv.md",
-    "docs/fitting.md", "docs/force.md", "docs/how-to/own-optimiser.md", "docs/identifiability.md", "docs/index.md",
-    "docs/recordings.md",
+    "docs/fitting.md", "docs/force.md", "docs/how-to/own-optimiser.md", "docs/how-to/report-results.md",
+    "docs/identifiability.md", "docs/index.md", "docs/recordings.md",
     "docs/reference/figures.md", "docs/scaling.md", "docs/tutorial.md", "docs/uncertainty.md",
 }  # fmt: skip
 FEWER_SEEDS = {"seeds=100_000": "seeds=1_000"}
@@ -146,6 +146,8 @@ def test_tutorial_and_front_page():
     names = pages.run("docs/tutorial.md")
     assert "harmonic_frequency" in names["sharper"].free and jm.load_result("mine.json").success
     assert pages.run("docs/index.md")["result"].success
+    reported = pages.run("docs/how-to/report-results.md")["determined"]
+    assert {"corner_frequency", "coefficient_of_variation"} <= set(reported["quantity"]) and Path("table.csv").exists()
     assert pages.run("docs/fitting.md")["in_newtons"].derived["mean"].value == pytest.approx(40.5, abs=3 * 0.8)
 
 

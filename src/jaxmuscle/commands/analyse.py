@@ -21,17 +21,21 @@ def analyse(
     spectrum: Annotated[
         SpectrumName,
         typer.Option(
-            help="standard: bins of 0.39 Hz. slow: of 0.1 Hz, for what is below 1 Hz. multitaper: the same for recordings "
-            "below 30 s. pwelch: MATLAB's."
+            help="How the spectrum is estimated. standard: bins of 0.39 Hz. slow: bins of 0.1 Hz, to see below 1 Hz. "
+            "multitaper: the same for recordings shorter than 30 s. pwelch: as MATLAB does."
         ),
     ] = SpectrumName.standard,
     mvc: Annotated[
         float | None,
-        typer.Option(metavar="FORCE", help="Maximal voluntary contraction in the recording's unit, for the level."),
+        typer.Option(
+            metavar="FORCE", help="Maximal voluntary contraction, in the unit of the recording; gives the level in % MVC."
+        ),
     ] = None,
     output: Output = Path("out"),
     formats: Formats = None,
-    save_target: Annotated[Path | None, typer.Option(metavar="FILE", help="Save the target for `jaxmuscle fit`.")] = None,
+    save_target: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Save the spectrum as a .toml that `jaxmuscle fit` reads.")
+    ] = None,
     force: Force = False,
     as_json: Json = False,
     reading: dict[str, Any],
@@ -41,8 +45,8 @@ def analyse(
     The steady part of each is found by itself, unless --window gives it. The spectra of several trials are averaged. Writes
     DIR/analysis.json, DIR/spectrum.csv and DIR/analysis.png.
 
-    Of a perturbed insertion (--force-column, --displacement): the dynamic stiffness instead, in DIR/analysis.json,
-    DIR/response.csv and DIR/analysis.png.
+    If a motor moved the insertion, name both columns with --force-column and --displacement. Then you get the dynamic
+    stiffness instead, in DIR/analysis.json, DIR/response.csv and DIR/analysis.png.
 
     Examples:
 
@@ -68,11 +72,15 @@ def analyse(
         writable(output, "analysis.json", force=force)
         if perturbed(reading):
             if save_target is not None or mvc is not None:
-                raise ValueError("--save-target and --mvc belong to spectra; this is a perturbation experiment")
+                raise ValueError(
+                    "--save-target and --mvc belong to spectra, and this recording has a moved insertion: leave them out"
+                )
             if len(paths) > 1:
-                raise ValueError(f"{len(paths)} files with force and displacement: give one at a time")
+                raise ValueError(f"{len(paths)} files are given; with force and displacement give one at a time")
             return _write_perturbed(read_perturbed(paths, reading, window)[0], str(spectrum), output, formats_of(formats))
-        unused(reading, *READING, what="a perturbation experiment; name its columns with --force-column and --displacement")
+        unused(
+            reading, *READING, what="recordings with a moved insertion, whose columns --force-column and --displacement name"
+        )
         _write(read_trials(paths, reading, window), str(spectrum), mvc, output, formats_of(formats), save_target)
 
 

@@ -80,14 +80,16 @@ def _groups(path: Path) -> dict[str, str]:
     except csv.Error as error:
         raise ValueError(f"{path}: is not CSV: {error}") from None
     if not rows or not {"target", "group"} <= set(rows[0]):
-        raise ValueError(f"{path}: needs a header with the columns target and group, and a line per target")
+        raise ValueError(
+            f"{path}: has no columns target and group; write them as the first line, then a line for each target"
+        )
     found: dict[str, str] = {}
     for number, row in enumerate(rows, start=2):
         name, group = (row["target"] or "").strip(), (row["group"] or "").strip()
         if not name or not group:
-            raise ValueError(f"{path}: line {number}: give a target and its group")
+            raise ValueError(f"{path}: line {number}: a cell is empty; give a target and its group")
         if found.get(name, group) != group:
-            raise ValueError(f"{path}: line {number}: {name} is in group {found[name]} already")
+            raise ValueError(f"{path}: line {number}: {name} is in group {found[name]} already; give each target one group")
         found[name] = group
     return found
 
@@ -125,7 +127,7 @@ def _columns(rows: list[dict[str, Any]]) -> dict[str, list[Any]]:
 
 
 def _show(cohort: "CohortResult", folder: Path, places: dict[str, Path]) -> None:
-    title = f"{len(cohort.results)} targets, in linear response; in brackets: not determined"
+    title = f"{len(cohort.results)} targets; numbers in brackets are not determined by the data"
     table = Table(title=title, title_justify="left", box=SIMPLE_HEAD, padding=0)
     table.add_column("target", overflow="fold")
     grouped = bool(cohort.groups)

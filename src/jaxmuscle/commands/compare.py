@@ -31,7 +31,8 @@ if TYPE_CHECKING:
 
 def compare(
     target: Annotated[
-        str, typer.Argument(help="Bundled target (see `jaxmuscle targets`) or path of a .toml, .csv, .json, .tar.")
+        str,
+        typer.Argument(help="A bundled spectrum (see `jaxmuscle targets`), or the file of one (.toml, .csv, .json, .tar)."),
     ],
     task: TargetTask = None,
     free: Free = None,
@@ -44,10 +45,11 @@ def compare(
     force: Force = False,
     as_json: Json = False,
 ) -> None:
-    """Compare the colours of noise, each with and without a harmonic, and richer models (activation, tremor) on one target.
+    """Which noise? Fit one spectrum with each colour of noise and with richer models, and say which can be told apart.
 
-    Writes DIR/compare.csv, DIR/compare.json and DIR/compare.png, prints the table and which of them can be told apart. A
-    model that the task cannot carry is left out, and why is said.
+    Each colour is fitted with and without a harmonic (a regular rhythm). The richer models have activation or tremor. Writes
+    DIR/compare.csv, DIR/compare.json and DIR/compare.png, and prints the table. A model that the task cannot carry is left
+    out, and you are told why.
 
     Examples:
 
@@ -87,6 +89,7 @@ def _show(found: "Comparison", files: str) -> None:
     out.print(plain(found), highlight=False, soft_wrap=True)
     if not found.success:
         out.print(
-            "[bold red]failed:[/] not every model came to its maximum: fix a parameter, or free fewer", highlight=False
+            "[bold red]failed:[/] not every model was fitted to the end: fix a parameter (--fix), or fit fewer (--free)",
+            highlight=False,
         )
     out.print(f"Written: {files}", highlight=False)

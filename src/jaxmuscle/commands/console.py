@@ -37,7 +37,9 @@ def task_of(preset: str, task: TaskName | None, observe: Observed | None = None)
     if observe is None:
         return model
     if not isinstance(model, jm.PrescribedForce):
-        raise ValueError(f"--observe {observe}: {type(model).__name__} has no motion; add --task prescribed-force")
+        raise ValueError(
+            f"--observe {observe}: in {type(model).__name__} no motion is the output; add --task prescribed-force"
+        )
     return model.with_parts(observe=str(observe))
 
 
@@ -122,18 +124,18 @@ def show(result: object, *, success: bool) -> None:
 def writable(folder: Path, *results: str, force: bool = False) -> None:
     """Fail before the long work, not after it: also where one of the results is there already, unless it may go."""
     if folder.exists() and not folder.is_dir():
-        raise ValueError(f"--out {folder}: is a file, give a folder")
+        raise ValueError(f"--out {folder}: is a file; give the name of a folder")
     absent(*(folder / name for name in results), force=force)
     folder.mkdir(parents=True, exist_ok=True)
     if not os.access(folder, os.W_OK | os.X_OK):
-        raise ValueError(f"--out {folder}: cannot be written to")
+        raise ValueError(f"--out {folder}: you may not write there; give another folder, or change its permissions")
 
 
 def absent(*results: Path, force: bool) -> None:
     """Raise a `ValueError` for a result that is there already, unless it may be overwritten."""
     for path in results:
         if path.exists() and not force:
-            raise ValueError(f"{path}: is there already; overwrite it with --force, or write somewhere else")
+            raise ValueError(f"{path}: is there already; overwrite it with --force, or give another name")
 
 
 def csv_text(columns: dict[str, Any]) -> str:

@@ -12,25 +12,31 @@ from .options import Force, Formats, Json, Output, Seed, formats_of, names_in
 
 
 def design(
-    source: Annotated[str, typer.Argument(metavar="FIT", help="A fit.json, or a bundled preset or preset file.")],
-    quantity: Annotated[str, typer.Option(metavar="NAMES", help="What is to be known, comma-separated.")] = "K_w0",
-    rms: Annotated[float, typer.Option(metavar="MM", help="Root mean square of the displacement, at most.")] = 1.0,
-    band: Annotated[str, typer.Option(metavar="A:B", help="Frequencies of the motion [Hz].")] = "0.1:5",
-    seconds: Annotated[float, typer.Option(metavar="S", help="Length of the record, and period of the motion.")] = 60.0,
-    rate: Annotated[float, typer.Option(metavar="HZ", help="Sampling rate of the motor's signal.")] = 1000.0,
-    peak: Annotated[float | None, typer.Option(metavar="MM", help="Largest displacement to either side.")] = None,
-    speed: Annotated[float | None, typer.Option(metavar="MM/S", help="Largest speed.")] = None,
-    spread: Annotated[float, typer.Option(metavar="SHARE", help="Share of the motion that is even over the band.")] = 0.1,
+    source: Annotated[
+        str, typer.Argument(metavar="FIT", help="A fit.json of your muscle, or a bundled preset or preset file.")
+    ],
+    quantity: Annotated[
+        str, typer.Option(metavar="NAMES", help="Quantities that you want to know; put commas between names.")
+    ] = "K_w0",
+    rms: Annotated[float, typer.Option(metavar="MM", help="Largest root mean square of the displacement in mm.")] = 1.0,
+    band: Annotated[str, typer.Option(metavar="A:B", help="Lowest and highest frequency of the motion in Hz.")] = "0.1:5",
+    seconds: Annotated[float, typer.Option(metavar="S", help="Length of the record and period of the motion in s.")] = 60.0,
+    rate: Annotated[float, typer.Option(metavar="HZ", help="Sampling rate of the motor's signal in Hz.")] = 1000.0,
+    peak: Annotated[float | None, typer.Option(metavar="MM", help="Largest displacement to either side in mm.")] = None,
+    speed: Annotated[float | None, typer.Option(metavar="MM/S", help="Largest speed of the motor in mm/s.")] = None,
+    spread: Annotated[
+        float, typer.Option(metavar="SHARE", help="Share of the motion, 0 to 1, that is spread evenly over the band.")
+    ] = 0.1,
     seed: Seed = 0,
     output: Output = Path("out"),
     formats: Formats = None,
     force: Force = False,
     as_json: Json = False,
 ) -> None:
-    """Design the motion of a motor from which stiffness or damping of the muscle become best known.
+    """Design the motion of a motor that tells most about the stiffness or damping of the muscle.
 
-    Lengths are in mm here (in Python in m). Writes DIR/motor.csv (the signal), DIR/design.json (what one record of it is
-    expected to tell, beside a motion of even density) and DIR/design.png.
+    Lengths are in mm here (in Python in m). Writes the signal for your motor, DIR/motor.csv, and a figure, DIR/design.png.
+    DIR/design.json has the errors that you can expect from one record, beside those of a motion that is even over the band.
 
     Example:
 
@@ -64,4 +70,4 @@ def _band(text: str) -> tuple[float, float]:
     try:
         return float(low), float(high)
     except ValueError:
-        raise ValueError(f"--band {text}: give lowest and highest frequency in Hz, 0.1:5 say") from None
+        raise ValueError(f"--band {text}: give lowest and highest frequency in Hz, as --band 0.1:5") from None

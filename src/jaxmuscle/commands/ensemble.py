@@ -40,40 +40,55 @@ class Generator(StrEnum):
 
 def ensemble(
     preset: Preset,
-    seeds: Annotated[int, typer.Option(help="Noise paths.")],
-    output: Annotated[str, typer.Option("--out", metavar="FILE.zarr", help="The store: a folder, or a URL as s3://...")],
+    seeds: Annotated[int, typer.Option(help="How many noise paths to simulate.")],
+    output: Annotated[
+        str,
+        typer.Option("--out", metavar="FILE.zarr", help="Where the store is written: a folder, or a URL such as s3://..."),
+    ],
     task: OtherTask = None,
     observe: Observe = None,
     seed: Seed = 0,
     vary: Annotated[
-        list[str] | None, typer.Option(metavar="NAME=VALUES", help="Sweep: k_w=4e5,5e5; several make a grid.")
+        list[str] | None,
+        typer.Option(metavar="NAME=VALUES", help="Simulate several values, as k_w=4e5,5e5; give it again for a grid."),
     ] = None,
-    duration: Annotated[float, typer.Option(help="Simulated time [s].")] = 15.0,
-    dt: Annotated[float, typer.Option(help="Step of the noise [s].")] = 1e-3,
-    reduce: Annotated[bool, typer.Option("--reduce", help="Keep moments, quantiles and the mean spectrum only.")] = False,
-    states: Annotated[bool, typer.Option("--states", help="Keep the states too.")] = False,
-    resume: Annotated[bool, typer.Option("--resume", help="Continue an interrupted store.")] = False,
+    duration: Annotated[float, typer.Option(help="Simulated time of each noise path in s.")] = 15.0,
+    dt: Annotated[float, typer.Option(help="Time step of the noise in s.")] = 1e-3,
+    reduce: Annotated[
+        bool, typer.Option("--reduce", help="Keep means, variances, quantiles and the mean spectrum, not the trajectories.")
+    ] = False,
+    states: Annotated[bool, typer.Option("--states", help="Also keep positions and velocities of the masses.")] = False,
+    resume: Annotated[bool, typer.Option("--resume", help="Continue a store that was interrupted.")] = False,
     part: Annotated[
-        str | None, typer.Option(metavar="I/N", help="Only the I-th of N parts, 1/N to N/N: a job array. See merge.")
+        str | None,
+        typer.Option(metavar="I/N", help="Simulate only part I of N, as 3/64, for a job array; then `jaxmuscle merge`."),
     ] = None,
-    precision: Annotated[Precision, typer.Option(help="Of the simulation.")] = Precision.single,
+    precision: Annotated[Precision, typer.Option(help="Precision of the simulation.")] = Precision.single,
     increments: Annotated[
-        Increments, typer.Option(help="Of the noise; weak ones are faster and for --reduce only.")
+        Increments, typer.Option(help="Random numbers of a step; weak ones are faster, and only for --reduce.")
     ] = Increments.gaussian,
-    generator: Annotated[Generator, typer.Option(help="Of random numbers; threefry is JAX's, slower.")] = Generator.hash,
-    chunk: Annotated[int | None, typer.Option(min=1, max=2**32, help="Seeds (times points) simulated at once.")] = None,
+    generator: Annotated[
+        Generator, typer.Option(help="Generator of the random numbers; threefry is that of JAX, and slower.")
+    ] = Generator.hash,
+    chunk: Annotated[
+        int | None, typer.Option(min=1, max=2**32, help="How many noise paths are simulated at once; chosen by itself.")
+    ] = None,
     threads: Threads = None,
-    coordinator: Annotated[str | None, typer.Option(metavar="HOST:PORT", help="Process 0 of several.")] = None,
-    processes: Annotated[int | None, typer.Option(min=1, help="How many processes.")] = None,
-    process_id: Annotated[int | None, typer.Option(help="Which of them this is, from 0.")] = None,
+    coordinator: Annotated[
+        str | None, typer.Option(metavar="HOST:PORT", help="For several processes of one run: where process 0 listens.")
+    ] = None,
+    processes: Annotated[int | None, typer.Option(min=1, help="How many processes share the run.")] = None,
+    process_id: Annotated[int | None, typer.Option(help="Number of this process, counted from 0.")] = None,
     force: Force = False,
     as_json: Json = False,
 ) -> None:
-    """Simulate any number of seeds into a zarr store, in chunks, on all cores, resumable.
+    """Simulate any number of noise paths (seeds) into a zarr store, on all cores; what was interrupted can go on.
 
-    The store has the dimensions seed, time and frequency (and point with --vary); its attribute `complete` is set last.
-    Under SLURM or Open MPI, or with --coordinator, several processes share the work. With --part they need not know of
-    each other: each adds its part to the store, in any order; the same command again goes on after a kill.
+    The store is a folder that xarray reads. It has the dimensions seed, time and frequency (and point with --vary). Its
+    attribute `complete` is set last.
+
+    On a cluster use --part: each process adds its part to the store, in any order, and needs no other. After a kill give the
+    same command again. Under SLURM or Open MPI, or with --coordinator, several processes share one run.
 
     Examples:
 
@@ -87,10 +102,12 @@ def ensemble(
         from jaxmuscle._common.environment import keep_compiled_programs
 
         if states and reduce:
-            raise ValueError("--states belongs to a store of trajectories: leave out --reduce")
+            raise ValueError("--states keeps trajectories and --reduce throws them away: leave out one of them")
         together = any(given is not None for given in (coordinator, processes, process_id))
         if part is not None and together:
-            raise ValueError(f"--part {part}: a part is a process of its own: leave out --coordinator and its companions")
+            raise ValueError(
+                f"--part {part}: a part is a process of its own: leave out --coordinator, --processes and --process-id"
+            )
         use(precision)
         if part is None and (together or jm.ensembles.launched()):
             jm.ensembles.join(coordinator, processes, process_id)
@@ -166,7 +183,9 @@ def say_failed(failed: list) -> None:
 
     if failed:
         shown = listed([seed for _, seed in failed])
-        err.print(f"[bold red]failed:[/] {len(failed)} seed(s) did not stay finite ({shown}): lower the noise or dt")
+        err.print(
+            f"[bold red]failed:[/] {len(failed)} seed(s) did not stay finite ({shown}): lower the noise amplitude or --dt"
+        )
 
 
 def merge(
@@ -175,8 +194,8 @@ def merge(
 ) -> None:
     """Make one ensemble of the parts that `jaxmuscle ensemble --part` has put into a store.
 
-    Checks that every chunk is there, reduces, and marks the store complete. What is missing is named, with the command to
-    run again. A repetition does no harm.
+    Checks that every chunk is there, computes the averages if --reduce was given, and marks the store complete. If
+    something is missing, the message names the parts to run again. You may repeat this command.
 
     Example:
 
@@ -197,7 +216,7 @@ def numbers_of(part: str) -> tuple[int, int]:
     """I and N of I/N."""
     number, slash, count = part.partition("/")
     if not (slash and number.strip().isdigit() and count.strip().isdigit()):
-        raise ValueError(f"--part {part}: write I/N with whole numbers, 1/4 to 4/4 say")
+        raise ValueError(f"--part {part}: write I/N with whole numbers, as --part 1/4 for the first of four")
     return int(number), int(count)
 
 
@@ -237,7 +256,7 @@ def swept(model: "AbstractTask", vary: list[str]) -> Any:
         try:
             values[name.strip()] = [float(number) for number in text.split(",")]
         except ValueError:
-            raise ValueError(f"--vary {entry}: give a name and numbers, such as k_w=4e5,5e5") from None
+            raise ValueError(f"--vary {entry}: give a name and numbers, as --vary k_w=4e5,5e5") from None
     return jm.Sweep.grid(model, **values) if values else None
 
 

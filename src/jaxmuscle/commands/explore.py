@@ -18,13 +18,21 @@ from .options import Force, Json, Segments, TargetTask, TaskName
 def explore(
     what: Annotated[
         str | None,
-        typer.Argument(metavar="[TARGET]", help="A spectrum or recording, a fit.json, or a preset; by default nothing."),
+        typer.Argument(
+            metavar="[TARGET]",
+            help="What to begin with: a spectrum, a recording, a fit.json or a preset; by default the usual muscle.",
+        ),
     ] = None,
     task: TargetTask = None,
     segments: Segments = None,
-    output: Annotated[Path | None, typer.Option("--out", metavar="FILE", help="Where to write the page, a .html.")] = None,
+    output: Annotated[
+        Path | None,
+        typer.Option("--out", metavar="FILE", help="Write the page to this .html; by default to a temporary one."),
+    ] = None,
     force: Force = False,
-    browser: Annotated[bool, typer.Option("--open/--no-open", help="Open the page in the browser.")] = True,
+    browser: Annotated[
+        bool, typer.Option("--open/--no-open", help="Open the page in the browser, or only write it.")
+    ] = True,
     as_json: Json = False,
 ) -> None:
     """Move parameters with sliders, in a browser, and see what becomes of the spectrum.
@@ -60,7 +68,7 @@ def _content(what: str | None, task: TaskName | None, segments: int | None) -> t
     if "starts" in table and task is None:
         result = jm.load_result(Path(what).expanduser())
         if len(result.targets) > 1:
-            raise ValueError(f"{what} is a fit of several targets: open that of one of them")
+            raise ValueError(f"{what} is a fit of several targets, and the page shows one: give the fit.json of one of them")
         return result.task, result.target
     if what in jm.list_presets() or "task_table" in table:
         return task_of(what, task), None

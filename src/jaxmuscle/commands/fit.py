@@ -50,14 +50,15 @@ def fit(
     target: Annotated[
         list[str],
         typer.Argument(
-            help="A bundled spectrum (see `jaxmuscle targets`), your spectra (.toml, .csv, .json, .tar), or recordings."
+            help="A bundled spectrum (see `jaxmuscle targets`), your spectra (.toml, .csv, .json, .tar), or your recordings."
         ),
     ],
     *,
     window: Window = None,
     task: TargetTask = None,
     method: Annotated[
-        MethodName, typer.Option(help="linear: spectrum in closed form, then corrected. montecarlo: simulated.")
+        MethodName,
+        typer.Option(help="linear: the spectrum is computed in closed form, then corrected. montecarlo: it is simulated."),
     ] = MethodName.linear,
     noise: Noise = None,
     rungs: Annotated[
@@ -65,31 +66,39 @@ def fit(
         typer.Option(
             min=0,
             max=3,
-            help="Richest model that may be tried: 0 base, 1 activation, 2 tremor, 3 a second resonance. Of several "
-            "spectra: the model that all get.",
+            help="Richest model that may be tried: 0 base, 1 with activation, 2 with tremor, 3 with a second resonance; "
+            "several spectra all get this model.",
         ),
     ] = None,
-    residual: Annotated[ResidualName, typer.Option(help="How powers are compared.")] = ResidualName.log,
+    residual: Annotated[
+        ResidualName, typer.Option(help="Compare the log of the powers, the powers themselves, or their running sums.")
+    ] = ResidualName.log,
     free: Free = None,
     fix: Fix = None,
     starts: Annotated[
-        int | None, typer.Option(min=1, help="Starting points; 100, or 8 where there is no linear response.")
+        int | None,
+        typer.Option(min=1, help="How many points the search starts from: 100 by default, 8 if the fit must simulate."),
     ] = None,
     seeds: Annotated[
-        int | None, typer.Option(min=1, help="Simulated noise paths; 32, or 48 where there is no linear response.")
+        int | None,
+        typer.Option(min=1, help="How many noise paths are simulated: 32 by default, 48 if the fit must simulate."),
     ] = None,
     seed: Seed = 0,
     segments: Segments = None,
     quantity: Quantity = None,
-    dataset: Annotated[str | None, typer.Option(metavar="NAME", help="Which dataset of a digitised figure.")] = None,
+    dataset: Annotated[
+        str | None, typer.Option(metavar="NAME", help="Which dataset to fit, if a digitised figure has several.")
+    ] = None,
     axis: Annotated[
         str | None,
         typer.Option(
-            help="log-log, if a digitised figure's points are log10 of Hz and power. Of a point: x, y, z, principal."
+            help="log-log if the points of a digitised figure are log10 of Hz and of power; for a point x, y, z "
+            "or principal."
         ),
     ] = None,
     groups: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="CSV with the columns target, group: compare groups of spectra.")
+        Path | None,
+        typer.Option(metavar="FILE", help="CSV with the columns target and group, to compare groups of spectra."),
     ] = None,
     quick: Annotated[
         bool,
@@ -108,12 +117,12 @@ def fit(
     Recordings are trials of one person in one condition. Their spectra are averaged. Options such as --column say how they
     are read.
 
-    A moved insertion: recordings with a column of force (or torque) and one of displacement (or angle), or a frequency
-    response (CSV with the columns frequency, gain, phase, and coherence or stderr). Then DIR/stiffness.csv holds the dynamic
-    stiffness, measured and fitted.
+    If a motor moved the insertion, give recordings with a column of force (or torque) and one of displacement (or angle).
+    Or give the frequency response: a CSV with the columns frequency, gain, phase, and coherence or stderr. Then
+    DIR/stiffness.csv holds the dynamic stiffness, measured and fitted.
 
-    Several spectra are those of several people. They are fitted together in linear response, without the checks on
-    simulated seeds.
+    Several spectra are taken as those of several people. They are fitted in one go, from the closed form of the spectrum
+    alone, without the checks by simulation.
 
     Of one spectrum or person: prints a table as soon as the search has ended, then what the checks add. Writes DIR/fit.json,
     DIR/fit.png, DIR/spectrum.csv and DIR/report.html.
@@ -146,9 +155,9 @@ def fit(
         read = {"quantity": quantity, "segments": segments, "dataset": dataset, "axis": "linear" if axis is None else axis}
         recorded = [jm.data.is_recording(name) for name in target]
         if any(recorded) and not all(recorded):
-            raise ValueError(f"{target[recorded.index(True)]} is a recording, {target[recorded.index(False)]} a spectrum: "
-                             "fit them one at a time, or `jaxmuscle analyse ... --save-target` the recordings "
-                             "first")  # fmt: skip
+            raise ValueError(f"{target[recorded.index(True)]} is a recording, {target[recorded.index(False)]} a spectrum. "
+                             "They cannot be fitted together: fit one at a time, or first make a spectrum of each recording "
+                             "with `jaxmuscle analyse ... --save-target FILE.toml`")  # fmt: skip
         options = {
             "free": names,
             "fix": fixed,
@@ -163,19 +172,19 @@ def fit(
             unused(reading, "axis", window=window, what="recordings; these are spectra")
 
             if method != MethodName.linear or seeds is not None or quick:
-                raise ValueError("several targets are fitted together in linear response, without checks: leave out "
+                raise ValueError("several spectra are fitted in one go, without simulation: leave out "
                                  "--method, --seeds and --quick, or fit them one at a time")  # fmt: skip
             options |= {"rung": rungs or 0}
             raise typer.Exit(fit_together(target, read, task, groups, output, options, formats_of(formats), force=force))
         if groups is not None:
             raise ValueError(
-                "--groups needs several targets; recordings of several people are a study: see `jaxmuscle study`"
+                "--groups compares several spectra; to compare recordings of several people use `jaxmuscle study`"
             )
         options |= {"method": str(method), "seeds": seeds, "rungs": rungs}
         options |= {"check_seeds": 0} if quick else {}
         if any(recorded):
             if segments is not None or dataset is not None:
-                raise ValueError("--segments and --dataset belong to spectra; these are recordings")
+                raise ValueError("--segments and --dataset belong to spectra, and these are recordings: leave them out")
             found = read_recordings(target, reading, window, task)
             if isinstance(found, list):
                 aim = found, jm.model.TASKS[task or "prescribed-length"]()

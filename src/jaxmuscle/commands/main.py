@@ -56,19 +56,35 @@ def show_version(wanted: bool) -> bool:
 @app.callback()
 def common(
     version: Annotated[
-        bool, typer.Option("--version", is_eager=True, callback=show_version, help="Show the version and exit.")
+        bool, typer.Option("--version", is_eager=True, callback=show_version, help="Print the version and end.")
     ] = False,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="No progress.")] = False,
-    verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Also say what is kept and loaded.")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Show no progress.")] = False,
+    verbose: Annotated[
+        bool, typer.Option("--verbose", "-v", help="Also say which compiled programs are kept and loaded.")
+    ] = False,
 ) -> None:
-    """A stochastic rheological muscle: simulate its force, analyse recordings, fit it to measured force spectra."""
+    """Fit a muscle model to measured force, analyse recordings, and simulate the fluctuations of force.
+
+    `jaxmuscle COMMAND --help` explains a command and its options.
+
+    Examples:
+
+        jaxmuscle fit vastus-lateralis-26mvc --out out/fit
+
+        jaxmuscle analyse trial.csv --column force --rate 2048
+    """
     logging.basicConfig(format="%(message)s", stream=sys.stderr)
     logging.getLogger("jaxmuscle").setLevel(logging.WARNING if quiet else logging.DEBUG if verbose else logging.INFO)
 
 
 @app.command()
 def targets(as_json: Json = False) -> None:
-    """List the bundled targets."""
+    """List the bundled targets: the spectra that `jaxmuscle fit` knows by name.
+
+    Example:
+
+        jaxmuscle targets
+    """
     found = describe_targets()
     table = Table(title="Bundled targets", title_justify="left")
     for column in ("name", "provenance", "quantity", "source"):
@@ -83,7 +99,12 @@ def targets(as_json: Json = False) -> None:
 
 @app.command()
 def presets(as_json: Json = False) -> None:
-    """List the bundled presets (saved tasks)."""
+    """List the bundled presets: muscles in a task that `jaxmuscle simulate` knows by name.
+
+    Example:
+
+        jaxmuscle presets
+    """
     found = describe_presets()
     table = Table(title="Bundled presets", title_justify="left")
     for column in ("name", "task", "description"):

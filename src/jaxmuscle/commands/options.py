@@ -51,62 +51,115 @@ class Observed(StrEnum):
     acceleration = "acceleration"
 
 
-Output = Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for the results.")]
-Force = Annotated[bool, typer.Option("--force", help="Overwrite an earlier result.")]
-Json = Annotated[bool, typer.Option("--json", help="Print the result as one JSON object instead of text.")]
+Output = Annotated[Path, typer.Option("--out", metavar="DIR", help="Folder for the results, made if it is not there.")]
+Force = Annotated[bool, typer.Option("--force", help="Overwrite the results of an earlier run.")]
+Json = Annotated[bool, typer.Option("--json", help="Print one JSON object, for scripts, instead of text.")]
 Formats = Annotated[
-    list[FormatName] | None, typer.Option("--format", help="Format of the figures (png); repeatable.", show_default=False)
+    list[FormatName] | None,
+    typer.Option("--format", help="Format of the figures, png by default; give it again for another.", show_default=False),
 ]
-Seed = Annotated[int, typer.Option(min=0, max=2**32 - 1, help="Seed of all random numbers.")]
-Preset = Annotated[str, typer.Argument(help="Bundled preset (see `jaxmuscle presets`), preset file or fit.json.")]
-OtherTask = Annotated[TaskName | None, typer.Option(help="Put the same muscle into another task.")]
-Observe = Annotated[Observed | None, typer.Option(help="What is observed of the motion in prescribed-force.")]
-TargetTask = Annotated[TaskName | None, typer.Option(help="Default: follows from what the target measured.")]
+Seed = Annotated[
+    int, typer.Option(min=0, max=2**32 - 1, help="Seed of the random numbers: the same seed gives the same result.")
+]
+Preset = Annotated[
+    str, typer.Argument(help="A muscle in a task: a bundled preset (see `jaxmuscle presets`), a preset file or a fit.json.")
+]
+OtherTask = Annotated[TaskName | None, typer.Option(help="Put the same muscle into this task.")]
+Observe = Annotated[
+    Observed | None, typer.Option(help="In the task prescribed-force: which quantity of the motion is the output.")
+]
+TargetTask = Annotated[
+    TaskName | None, typer.Option(help="What is held in the experiment; by default it follows from what was measured.")
+]
 Noise = Annotated[
-    NoiseName | None, typer.Option(help="Colour of the noise (band-limited); if it is given, no richer model is tried.")
+    NoiseName | None,
+    typer.Option(help="Colour of the noise, band-limited by default; if you give it, no richer model is tried."),
 ]
 Free = Annotated[
-    str | None, typer.Option(metavar="NAMES", help="Parameters to fit instead of the usual ones, comma-separated.")
+    str | None,
+    typer.Option(metavar="NAMES", help="Fit these parameters instead of the usual ones; put commas between names."),
 ]
-Fix = Annotated[list[str] | None, typer.Option(metavar="NAME=VALUE", help="Set a parameter and keep it; repeatable.")]
-Segments = Annotated[int | None, typer.Option(min=1, max=10**9, help="How many Welch segments were averaged.")]
-Quantity = Annotated[str | None, typer.Option(help="force, torque, displacement or acceleration.")]
+Fix = Annotated[
+    list[str] | None,
+    typer.Option(metavar="NAME=VALUE", help="Hold a parameter at a value; give it again for another parameter."),
+]
+Segments = Annotated[
+    int | None,
+    typer.Option(min=1, max=10**9, help="How many Welch segments were averaged; the errors of the spectrum follow from it."),
+]
+Quantity = Annotated[str | None, typer.Option(help="What was measured: force, torque, displacement or acceleration.")]
 Window = Annotated[
-    str | None, typer.Option(metavar="A:B", help="Part to analyse [s], or `all`; by default the steady part.")
+    str | None,
+    typer.Option(metavar="A:B", help="Analyse from A to B in s, or `all`; by default the steady part is found."),
 ]
 Recordings = Annotated[
-    list[str], typer.Argument(metavar="RECORDING...", help="Text, .xlsx, .mat, .npy, .npz, .c3d, .edf, ... files of trials.")
+    list[str],
+    typer.Argument(
+        metavar="RECORDING...",
+        help="Files of your sensor, one for each trial: text, .xlsx, .mat, .npy, .npz, .c3d, .edf, ...",
+    ),
 ]
 _Name = Annotated[
     str | None,
-    typer.Option(metavar="NAME", help="Column or point. Data:74 counts from 0. all: a trial in each (no study)."),
+    typer.Option(
+        metavar="NAME",
+        help="Column or point that holds the signal; Data:74 is column 74 of Data, counted from 0; all: every column is a "
+        "trial (not in a study).",
+    ),
 ]
-_Rate = Annotated[float | None, typer.Option(metavar="HZ", help="Sampling rate, if the file does not state it.")]
-_Units = Annotated[str | None, typer.Option(metavar="U", help="N, Nm, mm, m/s^2, % MVC, ...; by default the file's.")]
-_Reference = Annotated[str | None, typer.Option(metavar="NAME", help="Column or point that is subtracted.")]
-_Time = Annotated[str | None, typer.Option(metavar="NAME", help="Column that holds the time, if it is not found.")]
+_Rate = Annotated[float | None, typer.Option(metavar="HZ", help="Sampling rate in Hz, if the file does not state it.")]
+_Units = Annotated[
+    str | None, typer.Option(metavar="U", help="Unit of the signal: N, Nm, mm, m/s^2, % MVC, ...; by default the file's.")
+]
+_Reference = Annotated[str | None, typer.Option(metavar="NAME", help="Column or point that is subtracted from the signal.")]
+_Time = Annotated[str | None, typer.Option(metavar="NAME", help="Column that holds the time, if it is not found by itself.")]
 READING: dict[str, tuple[Any, Any]] = {  # how a recording is read: annotation and default of each option
     "column": (_Name, None),
     "rate": (_Rate, None),
     "units": (_Units, None),
-    "axis": (Annotated[str | None, typer.Option(help="Of a point: x, y, z or principal.")], None),
+    "axis": (
+        Annotated[str | None, typer.Option(help="Direction of a point: x, y, z, or principal for its largest motion.")],
+        None,
+    ),
     "reference": (_Reference, None),
     "time": (_Time, None),
-    "skip_rows": (Annotated[int, typer.Option(min=0, metavar="N", help="Lines to leave out at the top.")], 0),
-    "max_gap": (Annotated[float, typer.Option(metavar="S", help="Longest gap in s that is closed.")], 0.2),
+    "skip_rows": (
+        Annotated[int, typer.Option(min=0, metavar="N", help="How many lines to leave out at the top of the file.")],
+        0,
+    ),
+    "max_gap": (
+        Annotated[float, typer.Option(metavar="S", help="Longest gap in s that is closed by a straight line.")],
+        0.2,
+    ),
 }
-_Force = Annotated[str | None, typer.Option(metavar="NAME", help="Perturbed insertion: the column of the force.")]
-_Displacement = Annotated[str | None, typer.Option(metavar="NAME", help="Perturbed insertion: that of its displacement.")]
-_Moved = Annotated[str | None, typer.Option(metavar="U", help="m, cm, mm, um, deg or rad; by default the file's.")]
-_Arm = Annotated[float | None, typer.Option(metavar="M", help="Lever arm in m, for a torque and for an angle.")]
-_Positive = Annotated[str | None, typer.Option(help="lengthening or shortening; by default found from the data.")]
+_Force = Annotated[str | None, typer.Option(metavar="NAME", help="For a moved insertion: the column of the force.")]
+_Displacement = Annotated[
+    str | None, typer.Option(metavar="NAME", help="For a moved insertion: the column of its displacement.")
+]
+_Moved = Annotated[
+    str | None,
+    typer.Option(metavar="U", help="Unit of the displacement: m, cm, mm, um, deg or rad; by default the file's."),
+]
+_Arm = Annotated[
+    float | None,
+    typer.Option(metavar="M", help="Distance in m from the joint's axis to the insertion, for a torque or an angle."),
+]
+_Positive = Annotated[
+    str | None,
+    typer.Option(help="What a positive displacement is: lengthening or shortening; by default found from the data."),
+]
 PERTURBED: dict[str, tuple[Any, Any]] = {  # the same for a file of force and displacement
     "force_column": (_Force, None),
     "displacement": (_Displacement, None),
     "displacement_units": (_Moved, None),
     "lever_arm": (_Arm, None),
     "positive": (_Positive, None),
-    "delay": (Annotated[float, typer.Option(metavar="S", help="By which the force lags behind the displacement.")], 0.0),
+    "delay": (
+        Annotated[
+            float, typer.Option(metavar="S", help="Time in s by which the channel of the force is late; it is undone.")
+        ],
+        0.0,
+    ),
 }
 SAME_NAME = (
     *READING,
@@ -129,7 +182,7 @@ def names_in(given: str | None, option: str = "--free") -> list[str] | None:
         return None
     names = [name.strip() for name in given.split(",") if name.strip()]
     if not names:
-        raise ValueError(f"{option} {given!r}: name at least one, several with commas between them")
+        raise ValueError(f"{option} {given!r}: name at least one; put commas between several, as {option} k_w,c_w")
     return names
 
 
@@ -143,8 +196,8 @@ def fixed_values(pairs: list[str] | None) -> dict[str, float]:
         except ValueError:
             number = None
         if not (name.strip() and equals) or number is None or not math.isfinite(number):
-            raise ValueError(f"--fix {pair!r}: write NAME=VALUE with a number, --fix k_w=500000 say")
+            raise ValueError(f"--fix {pair!r}: write NAME=VALUE with a number, for example --fix k_w=500000")
         if name.strip() in fixed:
-            raise ValueError(f"--fix {pair!r}: {name.strip()} is fixed twice")
+            raise ValueError(f"--fix {pair!r}: {name.strip()} is fixed twice; give one value")
         fixed[name.strip()] = number
     return fixed

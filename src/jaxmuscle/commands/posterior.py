@@ -32,23 +32,23 @@ if TYPE_CHECKING:
 
 
 def posterior(
-    target: Annotated[str, typer.Argument(help="Bundled target, path of a target file, or a fit.json that is taken up.")],
+    target: Annotated[str, typer.Argument(help="A bundled spectrum, the file of a spectrum or recording, or a fit.json.")],
     task: TargetTask = None,
     noise: Noise = None,
     free: Free = None,
     fix: Fix = None,
     segments: Segments = None,
     quantity: Quantity = None,
-    chains: Annotated[int, typer.Option(min=2, max=10**6, help="Chains, from dispersed starts.")] = 4,
-    draws: Annotated[int, typer.Option(min=100, max=10**9, help="Draws of each chain.")] = 1000,
-    warmup: Annotated[int, typer.Option(min=1, max=10**9, help="Steps of each chain before its draws.")] = 500,
+    chains: Annotated[int, typer.Option(min=2, max=10**6, help="How many chains are run.")] = 4,
+    draws: Annotated[int, typer.Option(min=100, max=10**9, help="How many draws each chain makes.")] = 1000,
+    warmup: Annotated[int, typer.Option(min=1, max=10**9, help="How many steps each chain makes before its draws.")] = 500,
     seed: Seed = 0,
     output: Output = Path("out"),
     formats: Formats = None,
     force: Force = False,
     as_json: Json = False,
 ) -> None:
-    """Draw from the posterior of the muscle's parameters: how sure is the fit.
+    """How sure is a fit? Draw from the posterior of the muscle's parameters.
 
     Fits first (unless given a fit.json), then runs NUTS chains with the likelihood of the Welch bins. Writes DIR/fit.json,
     DIR/posterior.nc (for ArviZ), DIR/posterior.json, corner.png, predictive.png, chains.png and report.html. Exit
@@ -73,7 +73,7 @@ def posterior(
             result = _fitted(target, {"segments": segments, "quantity": quantity}, asked, seed)
         except jm.fits.FitInterrupted as stop:
             stop.result.save(output / "fit.json")
-            err.print(f"what the fit had reached is in {output}/fit.json")
+            err.print(f"the fit is not finished; what it had reached is in {output}/fit.json")
             raise
         if not result.success:
             err.print(f"[bold red]failed:[/] the fit did not converge: {plain(result.message)}", highlight=False)
@@ -103,8 +103,8 @@ def _fitted(target: str, read: dict[str, Any], asked: dict[str, Any], seed: int)
         return jm.load_result(path)
     loaded, model = aim_of(target, asked["task"], read)
     if loaded.segments is None and loaded.sigma is None:
-        raise ValueError(f"{target}: states neither segments nor sigma, so nothing says how much it scatters: give "
-                         "--segments, the number of Welch segments that were averaged, or a third column sigma")  # fmt: skip
+        raise ValueError(f"{target}: does not say how much its bins scatter: give --segments, the number of Welch segments "
+                         "that were averaged, or a third column sigma")  # fmt: skip
     names = names_in(asked["free"])
     with told(True, f"fitting {loaded.name}") as tell:
         return jm.fit(model, loaded, free=names, fix=fixed_values(asked["fix"]), noise=asked["noise"], key=seed,

@@ -48,7 +48,7 @@ def unused(reading: dict[str, Any], *used: str, window: str | None = None, what:
     if window is not None:
         given.append("window")
     if given:
-        raise ValueError(f"--{given[0].replace('_', '-')} belongs to {what}: leave it out")
+        raise ValueError(f"--{given[0].replace('_', '-')} belongs to {what}: leave this option out")
 
 
 def perturbed(reading: dict[str, Any]) -> bool:
@@ -121,4 +121,4 @@ def edges_of(window: str | None) -> Any:
             return float(start), float(stop)
     except ValueError:
         pass
-    raise ValueError(f"--window {window}: give start and end in s, as 8:25, or all")
+    raise ValueError(f"--window {window}: give start and end in s, as --window 8:25, or --window all")

@@ -16,7 +16,9 @@ def reproduce(
     output: Output = Path("out/reproduce"),
     recording: Annotated[
         list[Path] | None,
-        typer.Option(metavar="FILE", help="One of three people's recordings, for Figures 7 and 8; three times."),
+        typer.Option(
+            metavar="FILE", help="Recording of a person for Figures 7 and 8; give it three times, for three people."
+        ),
     ] = None,
     force: Force = False,
     as_json: Json = False,

@@ -18,14 +18,14 @@ def simulate(
     preset: Preset,
     task: OtherTask = None,
     observe: Observe = None,
-    seeds: Annotated[int, typer.Option(min=1, help="Noise paths.")] = 50,
+    seeds: Annotated[int, typer.Option(min=1, help="How many noise paths to simulate.")] = 50,
     seed: Seed = 0,
     output: Output = Path("out"),
     formats: Formats = None,
     force: Force = False,
     as_json: Json = False,
 ) -> None:
-    """Simulate a saved task.
+    """Simulate a muscle in a task, from a bundled preset, a preset file or a fit.json.
 
     Writes DIR/trajectories.nc, DIR/spectrum.csv and DIR/simulate.png.
 

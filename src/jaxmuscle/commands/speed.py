@@ -13,17 +13,23 @@ from .options import Json, OtherTask
 
 
 def speed(
-    preset: Annotated[str | None, typer.Argument(help="Preset or fit.json; the default isometric task without.")] = None,
+    preset: Annotated[
+        str | None, typer.Argument(help="A preset or a fit.json; by default the usual isometric task.")
+    ] = None,
     task: OtherTask = None,
-    seeds: Annotated[int, typer.Option(min=1, help="Noise paths.")] = 2048,
-    duration: Annotated[float, typer.Option(help="Simulated time [s].")] = 15.0,
-    precision: Annotated[Precision, typer.Option(help="Of the simulation.")] = Precision.single,
+    seeds: Annotated[int, typer.Option(min=1, help="How many noise paths to simulate.")] = 2048,
+    duration: Annotated[float, typer.Option(help="Simulated time of each noise path in s.")] = 15.0,
+    precision: Annotated[Precision, typer.Option(help="Precision of the simulation.")] = Precision.single,
     threads: Threads = None,
     as_json: Json = False,
 ) -> None:
-    """Measure this machine: compile time, steps/s, real-time factor, memory.
+    """How fast is this machine? Measure compile time, steps per second, real-time factor and memory.
 
-    Reduces an ensemble as `jaxmuscle ensemble --reduce` does, without control variate; medians of three calls.
+    It simulates as `jaxmuscle ensemble --reduce` does, without control variate. The numbers are medians of three calls.
+
+    Example:
+
+        jaxmuscle speed --seeds 4096
     """
     with reporting(as_json):
         os.environ["JAXMUSCLE_CACHE"] = "off"  # compile time is what it takes, not what loading takes

@@ -14,15 +14,27 @@ from .recordings import edges_of, reads_recordings
 
 @reads_recordings
 def study(
-    table: Annotated[Path, typer.Argument(help="study.csv or study.toml.")],
+    table: Annotated[Path, typer.Argument(help="Table of the recordings (.csv), or a .toml with the table and options.")],
     *,
-    rung: Annotated[str | None, typer.Option(help="Model of all people: 0 to 3 (default 2), or auto: lowest AIC.")] = None,
-    noise: Annotated[NoiseName | None, typer.Option(help="Colour of the noise on stiffness (band-limited).")] = None,
+    rung: Annotated[
+        str | None, typer.Option(help="Model that all people get: 0 to 3 (2 by default), or auto for the lowest AIC.")
+    ] = None,
+    noise: Annotated[
+        NoiseName | None, typer.Option(help="Colour of the noise on stiffness, band-limited by default.")
+    ] = None,
     window: Window = None,
-    spectrum: Annotated[SpectrumName | None, typer.Option(help="As in `jaxmuscle analyse`, the same for all.")] = None,
-    quantities: Annotated[str | None, typer.Option(metavar="NAMES", help="What is compared, comma-separated.")] = None,
-    alpha: Annotated[float | None, typer.Option(help="Level of the tests (0.05); intervals: 1 - alpha.")] = None,
-    correction: Annotated[str | None, typer.Option(help="For many comparisons: holm (default), fdr or none.")] = None,
+    spectrum: Annotated[
+        SpectrumName | None, typer.Option(help="How spectra are estimated, as in `jaxmuscle analyse`; the same for all.")
+    ] = None,
+    quantities: Annotated[
+        str | None, typer.Option(metavar="NAMES", help="Quantities that are compared; put commas between names.")
+    ] = None,
+    alpha: Annotated[
+        float | None, typer.Option(help="Level of the tests, 0.05 by default; intervals are those of 1 - alpha.")
+    ] = None,
+    correction: Annotated[
+        str | None, typer.Option(help="How p is corrected for many comparisons: holm (default), fdr or none.")
+    ] = None,
     seed: Seed = 0,
     output: Output = Path("out"),
     formats: Formats = None,
@@ -32,10 +44,17 @@ def study(
 ) -> None:
     """Compare groups and conditions: fit all recordings of a study with one model, write tables, figures and methods.
 
+<<<<<<< HEAD
     The table has a line for each recording, with the columns file and person; also group, condition and trial, if you have
     these. The trials of a person in a condition are averaged. Options such as --column say how files are read where the
     table does not say it. Writes DIR/people.csv, differences.csv, study.json, spectra.png, quantities.png, methods.txt and
     report.html, all at the end.
+=======
+    The table has a line for each recording. It needs the columns file and person, and may have group, condition and trial.
+    The trials of a person in a condition are averaged. Options such as --column say how files are read, unless the table
+    says it. Writes DIR/people.csv, differences.csv, study.json, spectra.png, quantities.png and methods.txt,
+    all at the end.
+>>>>>>> main
 
     Examples:
 

@@ -203,8 +203,9 @@ class Recording(Shown, eqx.Module):
             found = plateau(even.whole, even.rate) if level else (0, even.whole.size)
             if found is None:
                 raise ValueError(
-                    f"{self.name}: no plateau found (no level that is held for half of the time spent above half of it, "
-                    f"to within 10 %); give the window, as steady((a, b)) with {self.start:g} <= a < b <= {self.stop:g} s"
+                    f"{self.name}: no plateau found: the force did not stay within 10 % of one level for half of the time "
+                    f"that it was above half of that level; give the window, {self.start:g} <= a < b <= {self.stop:g} s, as "
+                    "steady((a, b)), or --window a:b"
                 )
             window = (self.start + found[0] / even.rate, min(self.start + found[1] / even.rate, self.stop))
             whole = found == (0, even.whole.size)

@@ -39,22 +39,22 @@ class RecordingSummary(Printed, eqx.Module):
 
     def rows(self) -> list[tuple[str, str]]:
         """Name and value of every number, as tables print them."""
-        variation = self.coefficient_of_variation
+        variation, top = self.coefficient_of_variation, self.peaks.maximum
         local = ", ".join(f"{peak.interpolated:.3f}" for peak in self.peaks.local_maxima) or "none"
         return [
             ("window", f"{self.duration:.2f} s, {self.segments} Welch segments"),
             ("mean", f"{self.mean:.4g} {self.unit}"),
             ("standard deviation", f"{self.standard_deviation:.4g} {self.unit}"),
             ("coefficient of variation", f"{100 * variation:.3g} %" if variation < 10 else "none, the mean is near zero"),
-            ("signal-to-noise ratio", f"{self.signal_to_noise:.4g}"),
+            ("mean over SD (signal-to-noise)", f"{self.signal_to_noise:.4g}"),
             ("approximate entropy", f"{self.approximate_entropy:.4f}"),
             ("sample entropy", f"{self.sample_entropy:.4f}"),
-            ("maximum", f"{self.peaks.maximum.interpolated:.3f} Hz, {self.peaks.maximum.power:.3f} of the power"),
-            ("local maxima", f"{local} Hz" if self.peaks.local_maxima else local),
+            ("maximum of the spectrum", f"{top.interpolated:.3f} Hz, {top.power:.3f} of the power"),
+            ("local maxima of the spectrum", f"{local} Hz" if self.peaks.local_maxima else local),
         ]
 
     def __str__(self) -> str:
-        return "\n".join(f"{name:<26}{value}" for name, value in self.rows())
+        return "\n".join(f"{name:<32}{value}" for name, value in self.rows())
 
     def to_dataframe(self) -> "pandas.DataFrame":
         """A row for each number: `quantity`, `value`, `unit`; the maximum of the spectrum is called `maximum`."""

@@ -58,12 +58,12 @@ class RecordingTable(ReadingTable, kw_only=True):
     """A recording: a row of a study's table, or an entry of `[[recordings]]`."""
 
     file: Annotated[str, _told("Path, from the folder of the table")]
-    person: Annotated[str | int, _told("Who")]
-    group: Annotated[str | int | None, _told("Of the person: all recordings have one, or none")] = None
-    condition: Annotated[str | int | None, _told("Of the recording: all have one, or none")] = None
-    trial: Annotated[str | int | None, _told("Which of several in a condition")] = None
-    window_start: Annotated[float | None, _told("Part to analyse, from [s]")] = None
-    window_stop: Annotated[float | None, _told("To [s]")] = None
+    person: Annotated[str | int, _told("Name of the person")]
+    group: Annotated[str | int | None, _told("Group of the person; all recordings have one, or none")] = None
+    condition: Annotated[str | int | None, _told("Condition of the recording; all have one, or none")] = None
+    trial: Annotated[str | int | None, _told("Which of several trials in a condition")] = None
+    window_start: Annotated[float | None, _told("Where the part to analyse begins [s]")] = None
+    window_stop: Annotated[float | None, _told("Where it ends [s]")] = None
 
 
 class StudyFile(ReadingTable, kw_only=True):
@@ -74,9 +74,9 @@ class StudyFile(ReadingTable, kw_only=True):
     window: Annotated[tuple[float, float] | Literal["all"] | None, _told("Part to analyse [s], or all")] = None
     rung: Annotated[int | str | None, _told("Model of all people: 0 to 3, or auto")] = None
     noise: Annotated[str | None, _told("Colour of the noise")] = None
-    quantities: Annotated[list[str] | None, _told("What is compared")] = None
+    quantities: Annotated[list[str] | None, _told("Quantities that are compared")] = None
     alpha: Annotated[float | None, _told("Level of the tests, between 0 and 1")] = None
-    correction: Annotated[str | None, _told("holm, fdr or none")] = None
+    correction: Annotated[str | None, _told("Correction for many comparisons: holm, fdr or none")] = None
 
 
 class Row(NamedTuple):

@@ -139,7 +139,7 @@ def ensemble(  # pyright: ignore[reportInconsistentOverload]
     if threads is not None:
         count("threads", threads, 1, 1024)
     if resume and overwrite:
-        raise ValueError("resume continues a store, overwrite replaces it: give one of the two")
+        raise ValueError("resume (--resume) continues a store, overwrite (--force) replaces it: give one of the two")
     if (resume or states) and store is None:
         raise ValueError(f"{'resume' if resume else 'states'} = True belongs to a store: give store=")
     levels, draws = _levels(reduce), Draws.of(generator, increments)

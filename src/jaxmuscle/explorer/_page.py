@@ -82,5 +82,7 @@ def _check(task: AbstractTask) -> None:
     for name in ("P_w", "F_ext", "x_z"):
         signal = getattr(task, name, None)
         if isinstance(signal, AbstractSignal) and not isinstance(signal, Constant | SmoothStep | RampHold):
-            raise ValueError(f"{name} is a {type(signal).__name__}, which no slider sets: hold it, settled(task)")
+            raise ValueError(
+                f"{name} is a {type(signal).__name__}, which no slider can set: hold it at its level, with settled(task)"
+            )
     has_response(task, required=True)

@@ -125,7 +125,7 @@ def rivals(problem: FitProblem, stage: Stage, stated: Mapping[str, Estimate]) ->
     if told:
         verb = "is" if len(moved) == 1 else "are"
         said = (f"{' and '.join(sorted(moved))} {verb} ambiguous: {' or '.join(told)} fits almost as well (log-likelihood "
-                f"within {AMBIGUOUS:g}); the other numbers belong to the frequency shown",)  # fmt: skip
+                f"lower by at most {AMBIGUOUS:g}). All other numbers are those of the frequency shown",)  # fmt: skip
     if not any(p.stderr for p in stated.values()) or not stage.objective.linear:
         return said, moved
     rows = order[np.minimum(np.arange(BATCH), len(order) - 1)]  # one size, so that one program serves all
@@ -135,8 +135,8 @@ def rivals(problem: FitProblem, stage: Stage, stated: Mapping[str, Estimate]) ->
            and np.max(np.abs(values[n] - values[n][0])) > OTHER * p.stderr}  # fmt: skip
     if far:
         others = ", ".join(f"{n} {far[n]:.3g} instead of {values[n][0]:.3g}" for n in far)
-        said += (f"another solution fits almost as well (log-likelihood within {AMBIGUOUS:g}): {others}; no error is stated "
-                 "for what differs",)  # fmt: skip
+        said += (f"another solution fits almost as well (log-likelihood lower by at most {AMBIGUOUS:g}): {others}. What "
+                 "differs has no error",)  # fmt: skip
     return said, moved | set(far)
 
 
@@ -165,12 +165,15 @@ def convergence(
     gain = -0.5 * gradient @ step / max(cost, 1e-300)
     finite = [s.cost for s in starts if s.cost is not None]
     near = sum(c <= 1.05 * min(finite) for c in finite) if finite else 0
-    census = f"{near} of {len(starts)} starts agree"
+    census = f"{near} of {len(starts)} starts end at this fit"
     if final.settled[final.best] or gain < SMALL:
         return True, f"converged: {census}"
     along = known.directions[~known.determined] @ step
     if along @ along >= 0.9 * (step @ step):
-        return True, f"stopped after {max_steps} steps along a direction that the data do not determine; {census}"
+        return (
+            True,
+            f"stopped after {max_steps} steps: further ones change only what the data do not determine; {census}",
+        )
     return False, (f"did not converge: after {max_steps} steps one more would still lower the cost by {100 * gain:.2g} %; "
                    f"raise max_steps or give more starts")  # fmt: skip
 
@@ -187,7 +190,7 @@ def notices_of(target: Any, statistics: BinStatistics, check: dict[str, float | 
     """What has to be said of one target and its task."""
     notices = list(target.notices)
     if not statistics.known:
-        notices.append("the target states neither segments nor sigma: every bin counts alike and there is no chi2")
+        notices.append("the target states neither segments nor sigma, so every bin counts alike and there is no chi2")
     if check.get("largest_deviation", 0.0) > NONLINEAR:
         notices.append(f"the response is not linear here: simulation and linear response differ by up to "
                        f"{100 * check['largest_deviation']:.0f} % of a bin (the fit is corrected for it); large noise or "

@@ -96,7 +96,7 @@ def fit(
         )  # fmt: skip
         task = with_noise(task, noise, fix)
         if recordings:
-            tell("taking off the response to the perturbation", 0.01)
+            tell("subtracting the response to the movement", 0.01)
             target = analysed(recordings, without_rhythm(task, options), options)
         top = _top(task, target, options, chosen=noise is not None)
         task, options = at_mean(task, target, options)
@@ -117,6 +117,6 @@ def _top(task: AbstractTask, target: Target, options: FitOptions, *, chosen: boo
     if options.rungs >= len(RUNGS):
         raise ValueError(f"rungs = {options.rungs}: the highest is {len(RUNGS) - 1}")
     if options.rungs and not possible:
-        raise ValueError("rungs: richer models are tried only by method='linear' with residual='log', on a target that "
-                         "states segments or sigma, and from a task without activation and resonance")  # fmt: skip
+        raise ValueError("rungs: richer models can be tried only if the method is 'linear', the residual 'log', the target "
+                         "states segments or sigma, and the task has no activation or resonance yet")  # fmt: skip
     return options.rungs

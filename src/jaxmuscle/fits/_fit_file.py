@@ -43,9 +43,9 @@ class EstimateTable(Table, kw_only=True):
 class AdequacyTable(Table, kw_only=True):
     """Whether the model describes the data: `adequacy`."""
 
-    chi2: Annotated[float, _told("Of all residuals")]
-    expected: Annotated[float, _told("Of the fitted model's own data")]
-    p: Annotated[Share, _told("How often these lie as far from their fit")]
+    chi2: Annotated[float, _told("Chi² of the fit, over all residuals")]
+    expected: Annotated[float, _told("Chi² to expect if the model is right")]
+    p: Annotated[Share, _told("p-value: share of the model's own data with a larger chi²")]
     misfit: Annotated[str, _told("Where the data lie furthest from the model")]
 
 
@@ -53,18 +53,18 @@ class RungTable(Table, kw_only=True):
     """A model that was tried: an entry of `ladder`."""
 
     number: Annotated[Annotated[int, Meta(ge=-1)], _told("-1 noise alone, 0 base, 1 activation, 2 tremor, 3 resonance")]
-    model: Annotated[str, _told("In words")]
+    model: Annotated[str, _told("The model in words")]
     aic: Annotated[float, _told("-2 ln L + 2 parameters")]
-    parameters: Annotated[float, _told("Their effective number")]
+    parameters: Annotated[float, _told("Effective number of parameters")]
     chi2_per_bin: Annotated[float, _told("Chi² over bins")]
-    p: Annotated[Share, _told("That of the verdict")]
-    chosen: Annotated[bool, _told("Whether it was taken")]
+    p: Annotated[Share, _told("p-value of the verdict on this model")]
+    chosen: Annotated[bool, _told("Whether this model was chosen")]
 
 
 class StartTable(Table, kw_only=True):
     """A start of the search: an entry of `starts`."""
 
-    cost: Annotated[Number, _told("½ Σ r² at its end")]
+    cost: Annotated[Number, _told("½ Σ r² where it ended")]
     success: Annotated[bool, _told("Whether it settled")]
     steps: Annotated[Count, _told("Steps taken")]
     values: Annotated[tuple[float, ...], _told("Where it ended, in the order of settings.free; empty if not finite")] = ()
@@ -73,15 +73,17 @@ class StartTable(Table, kw_only=True):
 class CorrelationTable(Table, kw_only=True):
     """Of the free parameters; empty where the fit failed."""
 
-    parameters: Annotated[list[str], _told("Their names")] = msgspec.field(default_factory=list)
-    matrix: Annotated[list[list[float]], _told("A row for each")] = msgspec.field(default_factory=list)
+    parameters: Annotated[list[str], _told("Names of the parameters")] = msgspec.field(default_factory=list)
+    matrix: Annotated[list[list[float]], _told("Correlations, a row for each parameter")] = msgspec.field(
+        default_factory=list
+    )
 
 
 class ProfileTable(Table, kw_only=True):
     """The harmonic's frequency tried: `profile`."""
 
     frequency_hz: Annotated[Numbers, _told("Frequencies [Hz]")]
-    chi2_rise: Annotated[Numbers, _told("Rise of chi² there, all else fitted anew")]
+    chi2_rise: Annotated[Numbers, _told("How much larger chi² is there, with all else fitted again")]
 
 
 class SettingsTable(Table, kw_only=True):
@@ -94,14 +96,14 @@ class SettingsTable(Table, kw_only=True):
     bounds: Annotated[dict[str, tuple[Number, Number]], _told("Bounds that were asked for, null where there is none")]
     starts: Annotated[Count, _told("Starts of the search")]
     seeds: Annotated[Count, _told("Seeds of the nonlinear correction")]
-    check_seeds: Annotated[Count, _told("Fresh seeds of the reported spectrum")]
-    max_steps: Annotated[Count, _told("Steps of each descent at most")]
+    check_seeds: Annotated[Count, _told("New seeds with which the fit was checked")]
+    max_steps: Annotated[Count, _told("Largest number of steps of each descent")]
     dt: Annotated[Annotated[float, Meta(gt=0)], _told("Step of the noise [s]")]
     coefficient_of_variation: Annotated[bool | dict[str, bool], _told("Whether it was data; of several targets by name")]
     mean_force: Annotated[
         tuple[float, float] | dict[str, tuple[float, float] | None] | None, _told("Mean and its error [N] as data, or null")
     ]
-    carried: Annotated[float | None, _told("By which the task was multiplied to come to the mean force")]
+    carried: Annotated[float | None, _told("Factor by which the task was carried to the mean force")]
     spectrum: Annotated[dict[str, Any], _told("Spectrum settings; of several targets by name")]
     steps_per_sample: Annotated[Count, _told("Steps of dt between samples")]
     optimiser: Annotated[str | None, _told("Solver, where another than Levenberg-Marquardt was asked for")] = None
@@ -114,9 +116,9 @@ class SpectrumTable(Table, kw_only=True):
 
     frequency_hz: Annotated[list[float], _told("Frequencies [Hz]")]
     target: Annotated[list[float], _told("Proportional power of the target")]
-    fitted: Annotated[Numbers, _told("That of the fit")]
+    fitted: Annotated[Numbers, _told("Proportional power of the fit")]
     harmonic_share: Annotated[Numbers, _told("Share of the harmonic in each bin")]
-    residual: Annotated[Numbers, _told("Target against fit [standard deviations]")]
+    residual: Annotated[Numbers, _told("Target against fit, in standard deviations")]
     deviation: Annotated[Numbers | None, _told("Standard deviation of the log power, null where it is unknown")]
     components: Annotated[dict[str, Numbers], _told("Share of each part of the model in each bin")]
 
@@ -152,27 +154,27 @@ class FitTable(Table, kw_only=True):
 
     format: Annotated[Literal[FORMATS], _told("Version of the format")]  # pyright: ignore[reportInvalidTypeForm]
     success: Annotated[bool, _told("Whether the search converged")]
-    message: Annotated[str, _told("How it ended")]
+    message: Annotated[str, _told("How the search ended")]
     adequate: Annotated[bool | None, _told("Whether the model describes the data, null where that is unknown")]
-    adequacy_p: Annotated[Share | None, _told("Its p-value")]
-    adequacy: Annotated[AdequacyTable | None, _told("More of it")]
-    verdict: Annotated[str, _told("The same in words")]
+    adequacy_p: Annotated[Share | None, _told("p-value of that verdict")]
+    adequacy: Annotated[AdequacyTable | None, _told("Numbers behind that verdict")]
+    verdict: Annotated[str, _told("Verdict in words")]
     method: Annotated[Literal[METHODS], _told("How it was fitted")]  # pyright: ignore[reportInvalidTypeForm]
     parameters: Annotated[dict[str, EstimateTable], _told("Every parameter; of several targets also name@target")]
-    derived: Annotated[dict[str, EstimateTable], _told("What follows from them")]
+    derived: Annotated[dict[str, EstimateTable], _told("Quantities that follow from the parameters")]
     products: Annotated[list[str], _told("Products and ratios that the data determine")]
     per_newton: Annotated[dict[str, Number], _told("Stiffness [1/m] and damping [s/m] over the mean force")]
-    correlation: Annotated[CorrelationTable, _told("Of the free parameters")]
-    undetermined: Annotated[list[str], _told("What can be scaled together unnoticed, in sentences")]
+    correlation: Annotated[CorrelationTable, _told("Correlations of the free parameters")]
+    undetermined: Annotated[list[str], _told("Sentences: which parameters can change together while the spectrum stays")]
     ladder: Annotated[list[RungTable], _told("Models that were tried")]
-    singular_values: Annotated[Numbers, _told("Of the Jacobian")]
-    starts: Annotated[list[StartTable], _told("The search")]
-    profile: Annotated[ProfileTable | None, _told("Of the harmonic's frequency")]
-    harmonic_p_value: Annotated[Share | None, _told("Whether there is a harmonic")]
-    notices: Annotated[list[str], _told("What to know about it")]
+    singular_values: Annotated[Numbers, _told("Singular values of the Jacobian, a number for each direction")]
+    starts: Annotated[list[StartTable], _told("Where each start of the search ended")]
+    profile: Annotated[ProfileTable | None, _told("Profile of the frequency of the harmonic")]
+    harmonic_p_value: Annotated[Share | None, _told("p-value of the harmonic: how often chance makes one as strong")]
+    notices: Annotated[list[str], _told("Notes on the fit")]
     seed: Annotated[Annotated[int, Meta(ge=0, lt=SEEDS)] | None, _told("Seed, null where a key was given")]
     settings: Annotated[SettingsTable, _told("How it was fitted")]
-    versions: Annotated[dict[str, str], _told("Of the libraries")]
+    versions: Annotated[dict[str, str], _told("Versions of the libraries")]
 
 
 def disagreement(result: "FitResult") -> str | None:

@@ -41,7 +41,7 @@ def harmonic_test(problem: FitProblem, final: Minima, *, judged: bool = True) ->
     if len(problem.parts) > 1 or not problem.control or "harmonic_frequency" not in names:
         return None
     objective = problem.linear()
-    problem.tell("profile over frequency", 0.9)
+    problem.tell("trying other frequencies of the harmonic", 0.9)
     frequency, rise = _profile(problem, objective, final)
     if (
         not judged
@@ -50,7 +50,7 @@ def harmonic_test(problem: FitProblem, final: Minima, *, judged: bool = True) ->
         or not objective.parts[0].statistics.known
     ):
         return HarmonicTest(frequency, rise, None)
-    problem.tell("bootstrap without harmonic", 0.95)
+    problem.tell("simulating spectra without a harmonic", 0.95)
     return HarmonicTest(frequency, rise, p_value(problem, objective, final))
 
 

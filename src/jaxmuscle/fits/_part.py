@@ -157,7 +157,8 @@ class FittedPart(eqx.Module):
         """Linear response against simulation, in a sentence."""
         if "largest_deviation" not in self.check:
             return ()
-        said = f"simulation and linear response differ by at most {100 * self.check['largest_deviation']:.2g} % of a bin"
+        off = 100 * self.check["largest_deviation"]
+        said = f"simulation and closed formula (linear response) differ by at most {off:.2g} % of a bin"
         if "largest_deviation_se" in self.check:
             said += f" ({self.check['largest_deviation_se']:.1f} standard errors of {self.check['seeds']} seeds)"
         return (said,)

@@ -122,8 +122,8 @@ def report_fit(
     share = elsewhere(ended)
     if share > UNSETTLED:
         moved |= {n for n in parameters | derived if base_of(n).startswith("harmonic_")}
-        other += (f"the harmonic may lie elsewhere or be too faint to be seen: {100 * share:.0f} % of the posterior is more "
-                  "than a bin from the frequency shown. No errors are stated for it",)  # fmt: skip
+        other += (f"the harmonic may have another frequency, or be too faint to be seen: with a probability of "
+                  f"{100 * share:.0f} % it is more than a bin from the frequency shown. So it has no errors",)  # fmt: skip
     factor = 1.0 if judgement is None else judgement.widening
     moved |= too_curved(problem, derived, known)
     parameters, derived = (widened(without_errors(moved, table), factor) for table in (parameters, derived))

@@ -135,7 +135,7 @@ class FitResult(Result, eqx.Module):
         if not self.success:
             return f"not fitted: {self.message}"
         if self.adequacy is None:
-            return "cannot be judged: the target does not say how much its powers scatter (segments or sigma)"
+            return "cannot be judged: the target does not say how much its powers scatter (give segments or sigma)"
         data = sum(part.data for part in self.parts.values())
         each = "bin" if all(part.stiffness is None for part in self.parts.values()) else "datum"
         found = f"chi2 per {each} {self.adequacy.chi2 / data:.2g}, {probability(self.adequacy.p)}"
@@ -148,11 +148,11 @@ class FitResult(Result, eqx.Module):
         """What the verdict means for the numbers, and what to do."""
         if self.adequacy is None or self.adequacy.adequate:
             return ()
-        told = [f"standard errors are widened by a factor of {self.adequacy.widening:.2g}, since the model misses the data"]
+        told = [f"standard errors are widened by a factor of {self.adequacy.widening:.2g}: the model misses the data"]
         if "harmonic_frequency" in self.free:
-            told.append("no p-value of the harmonic: about a model that misses the data anything improves the fit")
-        return (*told, "what to do: look at the residuals, at other noises (compare), and in the recording for drift and "
-                "tremor; do not interpret the parameters")  # fmt: skip
+            told.append("no p-value of the harmonic: where the model misses the data, any harmonic improves the fit")
+        return (*told, "what to do: do not interpret the parameters. Look at the residuals in the figure. Look for drift "
+                "and tremor in the recording. Try other noises (jaxmuscle compare)")  # fmt: skip
 
     @property
     def per_newton(self) -> dict[str, float]:
@@ -210,7 +210,7 @@ class FitResult(Result, eqx.Module):
         said = [s if single else f"{name}: {s}" for name, part in self.parts.items() for s in part.remarks]
         if self.harmonic_p_value is not None:
             word = "significant" if self.harmonic_p_value < 0.05 else "not significant"
-            said.append(f"the harmonic is {word}: p = {self.harmonic_p_value:.2g} by bootstrap without it")
+            said.append(f"the harmonic is {word}: p = {self.harmonic_p_value:.2g}, from simulated spectra that have none")
         return tuple(said)
 
     def plot(self, ax: "Axes | None" = None) -> "Figure | SubFigure":

@@ -3,11 +3,14 @@
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from jaxmuscle._common.cards import Card
 from jaxmuscle._common.text import folded
 from jaxmuscle.model._parameters import PARAMETERS
 from jaxmuscle.objective._arguments import base_of
 from jaxmuscle.objective._consequences import BANDS, MEANINGS
+from jaxmuscle.objective._covariance import spelt
 
 from ._ladder import HEAD
 from ._part import Estimate, FittedPart
@@ -32,17 +35,21 @@ def card_of(result: "FitResult") -> Card:
     order = ("determined", "not determined", "fixed")
     rows.sort(key=lambda row: order.index(row[4]))
     remarks = (f"{_head(result)}: {result.message}", *result.advice, *result.notices, *result.remarks)
-    return Card(text_of(result), _sentence(result.verdict), COLUMNS, tuple(rows), remarks)
+    return Card(text_of(result), _heading(result), COLUMNS, tuple(rows), remarks)
 
 
-def _sentence(words: str) -> str:
-    return words[0].upper() + words[1:]
+def _heading(result: "FitResult") -> str:
+    """The verdict as a sentence of its own."""
+    if not result.success:
+        return result.verdict[0].upper() + result.verdict[1:]
+    subject = "The model" if result.adequate is not None else "Whether the model describes the data"
+    return f"{subject} {result.verdict}"
 
 
 def text_of(result: "FitResult") -> str:
     """The verdict, what the data determine and what they do not, and what to know about it."""
     single = len(result.parts) == 1
-    lines = [_sentence(result.verdict), f"  {_head(result)}"]
+    lines = [_heading(result), f"  {_head(result)}"]
     lines += [f"  {result.message}"] * result.success
     lines += [f"  {HEAD}", *(f"  {rung}" for rung in result.ladder)] if len(result.ladder) > 1 else []
     if not single:
@@ -60,19 +67,19 @@ def text_of(result: "FitResult") -> str:
     lines += _table("determined by the data", rows, " 95 % interval    " * intervals)
     lines += [f"  {sentence}" for sentence in _by_band(in_bands)]
     fixed = [name for name in result.products if name not in result.parameters]
-    lines += [f"  they also fix, roughly: {', '.join(fixed)}"] if fixed else []
+    lines += [f"  products and ratios known roughly: {', '.join(map(spelt, fixed))}"] if fixed else []
     loose = {name: p for name, p in every.items() if name not in shown and p.free}
-    lines += _table("not determined (near their defaults by the prior)", loose) if loose else []
+    lines += _table("not determined (values near the defaults: do not interpret them)", loose) if loose else []
     if factor := result.settings.get("carried"):
         what = "P_w, masses, stiffness" if single and result.only.stiffness is None else "P_w, stiffness"
-        lines += [f"  the muscle was carried to the measured mean force: {what} and damping times {factor:.3g} before the "
-                  "fit (mean_force=False leaves the mean out)"]  # fmt: skip
+        lines += [f"  before the fit {what} and damping were multiplied by {factor:.3g}, so that the muscle has the "
+                  "measured mean force (mean_force=False leaves the mean out)"]  # fmt: skip
     if result.per_newton:
-        lines += ["  the scale of force is unknown, since no mean in newtons was given: what has newtons in its unit is "
-                  "stated per newton of mean force"]  # fmt: skip
+        lines += ["  no mean force in newtons was given, so the scale of force is unknown: forces, masses, stiffness and "
+                  "damping are stated per newton of mean force"]  # fmt: skip
     if result.undetermined:
-        whose = "the data do" if single else "all targets together do"
-        lines += [f"  {whose} not notice if:", *(f"    - {sentence}" for sentence in result.undetermined)]
+        whose = "the data leave" if single else "all targets together leave"
+        lines += [f"  {whose} open:", *(f"    - {sentence}" for sentence in result.undetermined)]
     return folded(lines)
 
 
@@ -113,13 +120,14 @@ def _by_band(table: dict[str, Estimate]) -> list[str]:
 def _head(result: "FitResult") -> str:
     if len(result.parts) > 1:
         return f"together: {', '.join(result.parts)}"
-    return f"{result.target.name} ({result.target.provenance}), {result.only.model}, {result.method}"
+    return f"{result.target.name} ({result.target.provenance}), {result.only.model}, method {result.method}"
 
 
 def _closeness(part: FittedPart, before: str = "") -> str:
     """χ² per bin and rms error, as far as they are known."""
     said = [] if part.chi2_per_bin is None else [f"chi2 per bin {part.chi2_per_bin:.2f}"]
-    said += [] if part.rms_log_error is None else [f"rms log error {part.rms_log_error:.3f}"]
+    off = part.rms_log_error
+    said += [] if off is None else [f"rms log error {off:.3f} (bins are off by a factor of {np.exp(off):.2f})"]
     return before * bool(said) + ", ".join(said)
 
 

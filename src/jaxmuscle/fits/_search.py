@@ -32,6 +32,8 @@ MOST_RIVALS = 3
 RIVAL_MARGIN = 6.0
 POLISHES = 4
 STILL = 2e-3
+TOLD = {"trying starts": "searching from all starting points", "linear response": "refining the best",
+        "polishing": "correcting by simulation"}  # fmt: skip
 
 
 class FitInterrupted(KeyboardInterrupt):
@@ -60,7 +62,7 @@ def search(plan: Plan, answer: Callable[[FitResult], None] | None = None, models
 
     known: Known | None = None
     try:
-        problem.tell("compiling", 0.0)
+        problem.tell("compiling, which the first time takes longest", 0.0)
         if problem.method != "linear":
             _montecarlo(plan, starting_points(problem, plan.starts), stages)
         elif models is None:
@@ -81,7 +83,7 @@ def search(plan: Plan, answer: Callable[[FitResult], None] | None = None, models
         later = tuple(n for n in found.notices if n != UNCHECKED) if plan.check_seeds else found.notices
         answer(dataclasses.replace(found, notices=later))
     try:
-        problem.tell("checking on fresh seeds" if plan.check_seeds else "reporting", 0.8)
+        problem.tell("checking with new simulations" if plan.check_seeds else "computing the errors", 0.8)
         result = report_fit(plan, stages, ladder, ended=ended)
         if models is not None and result.success:
             said = line_or_resonance(plan, result.task, ladder, models, _descended)
@@ -128,7 +130,7 @@ def search_together(plans: list[Plan], tell: Callable[[str, float], None], numbe
         judged = ended is not None and ended.adequacy is not None and len(plan.problem.parts) == 1
         rungs = (rung_of(ended, number)._replace(chosen=True),) if ended is not None and judged else ()
         results.append(report_fit(plan._replace(settings=unused, check_seeds=0), stages, rungs, ended=ended))
-        tell(f"reporting {plan.problem.title}", 0.8 + 0.2 * len(results) / len(plans))
+        tell(f"computing the errors of {plan.problem.title}", 0.8 + 0.2 * len(results) / len(plans))
     return results
 
 
@@ -146,7 +148,7 @@ def _together(
 
     def show(minima: Minima) -> None:
         share = min(1.0, minima.steps.max() / max_steps)
-        tell(name, shares[0] + (shares[1] - shares[0]) * share)
+        tell(TOLD[name], shares[0] + (shares[1] - shares[0]) * share)
 
     found = least_squares(objectives[0], np.concatenate(points), max_steps, data=data, report=show)
     parts = zip(*(np.split(x, np.cumsum(counts)[:-1]) for x in found), strict=True)
@@ -161,7 +163,7 @@ def _stage(problem: FitProblem, stages: list[Stage], objective: Residuals, name:
     def show(minima: Minima) -> None:
         stages[number:] = [Stage(name, objective, minima)]
         share = shares[0] + (shares[1] - shares[0]) * min(1.0, minima.steps.max() / most)
-        problem.tell(f"{name}, cost {minima.cost[minima.best]:.2f}", share)
+        problem.tell(f"{TOLD[name]}, misfit {minima.cost[minima.best]:.2f}", share)
 
     return show
 

@@ -1,6 +1,7 @@
 """What the scatter of the data leaves undetermined: covariance of parameters, determined directions, in words."""
 
 import itertools
+import re
 from typing import NamedTuple
 
 import numpy as np
@@ -91,10 +92,10 @@ def effective_parameters(
 
 SCALES = (
     (
-        "all noise amplitudes and the harmonic's can be scaled together",
+        "all noise amplitudes and the harmonic's can be multiplied by one number",
         ("noise_K_w", "noise_K_z", "noise_P_w", "harmonic_amplitude", "resonance_amplitude", "resonance_2_amplitude"),
     ),
-    ("stiffness and damping can be scaled together", ("k_w", "k_z", "c_w", "c_z")),
+    ("stiffness and damping can all be multiplied by one number", ("k_w", "k_z", "c_w", "c_z")),
 )
 
 
@@ -151,6 +152,11 @@ def _written(names: list[str], signs: tuple[float, ...]) -> str:
     below = [n for n, sign in zip(names[1:], signs, strict=True) if sign < 0]
     bottom = " ".join(below)
     return " ".join(above) + (f" / {f'({bottom})' if len(below) > 1 else bottom}" if below else "")
+
+
+def spelt(product: str) -> str:
+    """A product as it is printed: `k_w * noise_K_w`."""
+    return re.sub(r"(?<=\w) (?=\w)", " * ", product)
 
 
 def residual_covariance(target: Target, part: PartResiduals, share: np.ndarray) -> np.ndarray:

@@ -55,7 +55,7 @@ def require_spread(target: Target) -> None:
     """Raises `ValueError` for a target that states neither segments nor sigma."""
     if target.segments is None and target.sigma is None and len(target.bins):
         raise ValueError(
-            f"{target.name}: states neither segments nor sigma, so nothing says how much it scatters: give segments, "
+            f"{target.name}: states neither segments nor sigma, so how much its bins scatter is not known: give segments, "
             "the number of Welch segments that were averaged (--segments), or a sigma per bin"
         )
 
@@ -63,7 +63,7 @@ def require_spread(target: Target) -> None:
 def measured_bins(target: Target, mask: np.ndarray | None = None) -> Bins:
     """A target's bins with their law, those with `mask` 0 left out. Raises `ValueError` for one that states no segments."""
     if target.segments is None:
-        raise ValueError(f"{target.name}: states no segments, so the law of its bins is unknown; give segments")
+        raise ValueError(f"{target.name}: does not state its segments, so how its bins scatter is not known; give segments")
     law = target_law(target)
     kept = np.ones(len(target.bins)) if mask is None else np.asarray(mask, dtype=float)
     return Bins(np.log(target.proportional_power), law.degrees / 2, *_precision(law.correlation, kept), kept)

@@ -138,7 +138,7 @@ def _sample(
             density, recent = new, []
         else:
             recent.append(white)
-        text = "warming up" if adapting else f"drawing, block {number + 1 - blocks} of {total - blocks}"
+        text = "warming up the chains" if adapting else f"drawing, block {number + 1 - blocks} of {total - blocks}"
         tell(text, (number + 1) / total)
     parts = [np.concatenate([part[i] for part in kept])[:draws] for i in range(6)]
     s, height, acceptance, steps, diverging = (np.swapaxes(part, 0, 1) for part in parts[:5])

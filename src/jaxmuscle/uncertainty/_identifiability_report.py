@@ -13,7 +13,7 @@ from jaxmuscle._common.cards import Printed, Result
 from jaxmuscle._common.files import write_json
 from jaxmuscle._common.tables import frame
 from jaxmuscle._common.text import WIDTH
-from jaxmuscle.objective._covariance import DETERMINED
+from jaxmuscle.objective._covariance import DETERMINED, spelt
 
 if TYPE_CHECKING:
     import pandas
@@ -85,7 +85,7 @@ class Outlook(Printed, Result, eqx.Module):
             return f"{self.name} is impossible: {self.failed}"
         names = sorted(set(self.gained) & set(told(self.quantities)), key=lambda n: self.quantities[n].left)
         if not names:
-            return f"{self.name} would determine nothing that is open now"
+            return f"{self.name} would determine nothing more"
         parts = [f"{n} to {self.quantities[n].percent}" for n in names]
         listed = parts[0] if len(parts) == 1 else f"{', '.join(parts[:-1])} and {parts[-1]}"
         return f"{self.name} would determine {listed}"
@@ -185,28 +185,27 @@ def _present(report: IdentifiabilityReport) -> list[str]:
     lines += _wrapped(f"{now.task}; {now.data}", 2)
     for notice in report.notices:
         lines += _wrapped(notice, 4, "  note: ")
-    lines += [
-        f"  {now.determined} of {len(report.free)} directions of the parameters (singular values from {DETERMINED:g} on):"
-    ]
+    lines += _wrapped(f"{now.determined} of {len(report.free)} combinations of the parameters are determined: those with a "
+                      f"singular value of {DETERMINED:g} or more", 4, "  ")  # fmt: skip
     values = [f"{v:.3g}" for v in now.singular_values]
     lines += _wrapped("  ".join([*values[: now.determined], "|", *values[now.determined :]]), 4)
     if now.products:
-        lines += _wrapped(f"these are known: {_products(now)}", 4, "  ")
+        lines += _wrapped(f"known are: {_products(now)}", 4, "  ")
     if now.undetermined:
-        lines += ["  the data do not notice if:"]
+        lines += ["  the data leave open:"]
         for sentence in now.undetermined:
             lines += _wrapped(sentence, 6, "    - ")
     return lines
 
 
 def _products(outlook: Outlook) -> str:
-    return ", ".join(f"{name} (± {100 * error:.2g} %)" for name, error in outlook.products.items())
+    return ", ".join(f"{spelt(name)} (± {100 * error:.2g} %)" for name, error in outlook.products.items())
 
 
 def _designs(report: IdentifiabilityReport) -> list[str]:
     if not report.designs:
         return []
-    lines = ["  further measurements, and how many directions they would leave determined:"]
+    lines = ["  further measurements, and how many combinations would then be determined:"]
     for number, design in enumerate(report.designs):
         count = "impossible" if design.failed else f"{design.determined} of {len(report.free)}"
         lines += _wrapped(f"{design.name}: {count}", 8, f"    {letter(number):<2}  ")
@@ -220,7 +219,7 @@ def _table(report: IdentifiabilityReport) -> list[str]:
     names = told(report.present.quantities)
     possible = [(letter(i), d) for i, d in enumerate(report.designs) if d.failed is None]
     wide = max(24, *(1 + len(name) for name in names))
-    lines = ["  standard error by data and prior, in percent; in brackets: not determined"]
+    lines = ["  standard error in percent, by data and prior; in brackets: not determined"]
     for start in range(0, max(len(possible), 1), COLUMNS):
         block = possible[start : start + COLUMNS]
         heads = ["value", "prior", "now", *(label for label, _ in block)]
@@ -250,6 +249,6 @@ def _sentences(report: IdentifiabilityReport) -> list[str]:
     best = max((*report.designs, *report.pairs), key=lambda o: (o.determined, len(o.gained)), default=None)
     if best is not None and best.failed is None:
         count = len(report.free) - best.determined
-        rest = f"{count} of {len(report.free)} directions stay open" if count else "nothing stays open"
-        lines += _wrapped(f"with the most telling, {best.name}, {rest}", 4, "  - ")
+        rest = f"{count} of {len(report.free)} combinations stay open" if count else "nothing stays open"
+        lines += _wrapped(f"most would be learnt from {best.name}: {rest}", 4, "  - ")
     return lines

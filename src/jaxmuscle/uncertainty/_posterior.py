@@ -72,7 +72,7 @@ def posterior(
     with told(progress, f"posterior of {result.title}") as tell, jax.enable_x64(True):
         problem = reopened(result, target, free=free, priors=priors, bounds=bounds, key=key)
         likelihood = Likelihood.of(problem)
-        tell("climbing to the maximum", 0.0)
+        tell("searching the most probable parameters", 0.0)
         density, _, _ = density_about(problem, likelihood, problem.theta_of(tuple(result.tasks.values())))
         found, density = sample(density, jax.random.fold_in(problem.key, 5), chains, draws, warmup, tell)
         return _reported(problem, density, found, result, key, warmup)

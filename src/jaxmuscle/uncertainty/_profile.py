@@ -85,7 +85,7 @@ class Profile(Printed, Result, eqx.Module):
             span = f"the data set it no limits between {self.values[0]:.3g} and {self.values[-1]:.3g}{unit}"
         else:
             span = f"{percent} interval " + " and ".join(_in_words(*ends, unit) for ends in self.intervals)
-        kind = "profile of likelihood and prior" if self.with_priors else "profile likelihood"
+        kind = "profile of likelihood and prior" if self.with_priors else "profile likelihood, without priors"
         return folded([f"{self.name} = {self.value:.4g}{unit}: {span} ({kind}); ± {self.stderr:.2g} by curvature"])
 
 
