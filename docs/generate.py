@@ -84,22 +84,10 @@ an error that names the file and the key. No missing key is replaced by a defaul
 finite. `true` is not 1, and `1.0` is not a whole number. `docs/generate.py` writes this page from the code that
 checks the files.
 """
-<<<<<<< HEAD
-FIT_FILE = """JSON, format 4. Written by `FitResult.save`, read by `load_result`; `load_preset` takes its `task_table`. Of
-one target it has the keys of both tables, of several those of the second stand under `parts`, by name. Keys must agree: the
-value of a parameter with its `task_table`, the spectrum with its `target_table`. Format 3 does not say where starts
-ended (`values`). Format 2 may also leave out what task and target do not have."""
-PRESET = """TOML, format 2. Written by `save_preset`, read by `load_preset`. The `task_table` has every field of the task and
-of its parts, each part with its class as `type`. What a task does not have (`activation`, `initial`, a low-pass) is
-`"none"`. Format 1, without the key `format`, may leave these out."""
-TARGET = """TOML, format 1. Written by `Target.save`, read by `load_target`. As `target_table` of a fit.json it has all keys
-but `format`, and `null` for what is not stated."""
-STUDY = """TOML, read by `run_study`. A study.csv has the columns of the second table."""
-=======
-FIT_FILE = """JSON, format 3. `FitResult.save` writes it and `load_result` reads it. `load_preset` reads its
+FIT_FILE = """JSON, format 4. `FitResult.save` writes it and `load_result` reads it. `load_preset` reads its
 `task_table` alone. A fit of one target has the keys of the first two tables side by side. In a fit of several targets
 the keys of the second table stand under `parts`, by the name of the target. Keys must agree: the value of a parameter
-with its `task_table`, the spectrum with its `target_table`. In format 2 keys may be missing that task and target do
+with its `task_table`, the spectrum with its `target_table`. Format 3 does not say where starts ended (`values`). In format 2 keys may be missing that task and target do
 not have."""
 PRESET = """TOML, format 2. `save_preset` writes it and `load_preset` reads it. The `task_table` has every field of
 the task and of its parts. `type` is the class of a part. What a task does not have (`activation`, `initial`, a
@@ -107,7 +95,6 @@ low-pass) is `"none"`. In format 1, which has no key `format`, these may be miss
 TARGET = """TOML, format 1. `Target.save` writes it and `load_target` reads it. The `target_table` of a fit.json has
 the same keys without `format`, and `null` for what is not stated."""
 STUDY = """TOML. `run_study` reads it. The second table has the columns of a study.csv."""
->>>>>>> main
 F = _fit_file
 SECTIONS = (
     ("fit.json", FIT_FILE, 2, (F.FitTable, F.PartTable, F.EstimateTable, F.AdequacyTable, F.RungTable, F.StartTable,

@@ -44,17 +44,10 @@ def study(
 ) -> None:
     """Compare groups and conditions: fit all recordings of a study with one model, write tables, figures and methods.
 
-<<<<<<< HEAD
-    The table has a line for each recording, with the columns file and person; also group, condition and trial, if you have
-    these. The trials of a person in a condition are averaged. Options such as --column say how files are read where the
-    table does not say it. Writes DIR/people.csv, differences.csv, study.json, spectra.png, quantities.png, methods.txt and
-    report.html, all at the end.
-=======
     The table has a line for each recording. It needs the columns file and person, and may have group, condition and trial.
     The trials of a person in a condition are averaged. Options such as --column say how files are read, unless the table
-    says it. Writes DIR/people.csv, differences.csv, study.json, spectra.png, quantities.png and methods.txt,
-    all at the end.
->>>>>>> main
+    says it. Writes DIR/people.csv, differences.csv, study.json, spectra.png, quantities.png, methods.txt
+    and report.html, all at the end.
 
     Examples:
 
