@@ -175,7 +175,7 @@ SECTIONS = (
         Shown("gallery/steadiness.png", "jm.steadiness(trials).plot()", "How steady five trials are",
               "recordings.md#steadiness"),
         Shown("gallery/cohort.png", "cohort.plot()", "What six people's spectra determine", "fitting.md#many-targets"),
-        Shown("gallery/groups.png", "jm.plot.groups(cohort)", "Their spectra and numbers by group", "fitting.md#many-targets"),
+        Shown("gallery/groups.png", "jm.plot.groups(cohort)", "Their spectra and numbers", "fitting.md#many-targets"),
         Shown("gallery/levels.png", 'cohort.plot(by="level")',
               "The same six people by level of contraction", "fitting.md#many-targets"),
         Shown("gallery/joint.png", "jm.fit_joint({name: people[name] for name in pair}, tasks=pair).plot()",
