@@ -24,7 +24,7 @@ fit: .venv/.stamp-run
 	$(BIN)/jaxmuscle fit vastus-lateralis-26mvc --out out/fit --force
 
 OPEN = yes
-notebooks: .venv/.stamp-run
+notebooks: .venv/.stamp-notebooks
 	@if [ "$(OPEN)" = yes ]; then $(BIN)/jupyter lab --notebook-dir=notebooks; \
 	 else echo "JupyterLab is installed; open it with: make notebooks"; fi
 
@@ -69,6 +69,11 @@ clean:
 	@$(PYTHON) -m venv .venv
 	@$(PIP) --upgrade pip
 	@$(PIP) --editable '.[all]'
+	@touch $@
+
+.venv/.stamp-notebooks: .venv/.stamp-run
+	@echo "Installing JupyterLab into .venv"
+	@$(PIP) --editable '.[notebooks]'
 	@touch $@
 
 .venv/.stamp-test: .venv/.stamp-run
