@@ -5,10 +5,11 @@ BIN = .venv/bin
 PYTEST = $(BIN)/python -m pytest -q -n 2 --dist loadfile --no-loadscope-reorder
 PIP = $(BIN)/python -m pip --quiet --disable-pip-version-check install
 
-.PHONY: help fit test test-fast test-minimum mutants bench docs clean
+.PHONY: help fit notebooks test test-fast test-minimum mutants bench docs clean
 
 help:
 	@echo "make fit        fit a bundled measured target; writes report and figure to out/fit"
+	@echo "make notebooks  open the notebooks in JupyterLab; make notebooks OPEN=no only installs it"
 	@echo "make test       ruff, basedpyright and the whole test suite"
 	@echo "make test WING=spectra  the tests of one folder of the package and of those above it"
 	@echo "make test-fast  the tests that are not marked slow"
@@ -21,6 +22,11 @@ help:
 
 fit: .venv/.stamp-run
 	$(BIN)/jaxmuscle fit vastus-lateralis-26mvc --out out/fit --force
+
+OPEN = yes
+notebooks: .venv/.stamp-notebooks
+	@if [ "$(OPEN)" = yes ]; then $(BIN)/jupyter lab --notebook-dir=notebooks; \
+	 else echo "JupyterLab is installed; open it with: make notebooks"; fi
 
 test: .venv/.stamp-test
 	@$(BIN)/python tests/wings.py $(WING) >/dev/null
@@ -63,6 +69,11 @@ clean:
 	@$(PYTHON) -m venv .venv
 	@$(PIP) --upgrade pip
 	@$(PIP) --editable '.[all]'
+	@touch $@
+
+.venv/.stamp-notebooks: .venv/.stamp-run
+	@echo "Installing JupyterLab into .venv"
+	@$(PIP) --editable '.[notebooks]'
 	@touch $@
 
 .venv/.stamp-test: .venv/.stamp-run

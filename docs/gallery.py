@@ -129,7 +129,9 @@ SECTIONS = (
     Section("A fit", FIT, (
         Shown("fit.png", "result.plot()", "A fit: spectra, residuals, output", "tutorial.md#4-read-it"),
         Shown("gallery/schematic.png", "jm.plot.schematic(result)", "The model with its numbers", "model.md#muscle"),
+        Shown("gallery/components.png", "jm.plot.components(result)", "What the power is made of", "fitting.md"),
         Shown("gallery/starts.png", "jm.plot.starts(result)", "Did all starts end at the same minimum?", "fitting.md"),
+        Shown("gallery/start_values.png", "jm.plot.start_values(result)", "In which parameters they agree", "fitting.md"),
         Shown("gallery/target.png", "target.plot(log=True)", "A target with the sampling error of its bins", "digitise.md"),
     )),
     Section("Simulations", SIMULATED, (
@@ -173,7 +175,7 @@ SECTIONS = (
         Shown("gallery/steadiness.png", "jm.steadiness(trials).plot()", "How steady five trials are",
               "recordings.md#steadiness"),
         Shown("gallery/cohort.png", "cohort.plot()", "What six people's spectra determine", "fitting.md#many-targets"),
-        Shown("gallery/groups.png", 'cohort.plot(by="group")', "The same six people by group", "fitting.md#many-targets"),
+        Shown("gallery/groups.png", "jm.plot.groups(cohort)", "Their spectra and numbers", "fitting.md#many-targets"),
         Shown("gallery/levels.png", 'cohort.plot(by="level")',
               "The same six people by level of contraction", "fitting.md#many-targets"),
         Shown("gallery/joint.png", "jm.fit_joint({name: people[name] for name in pair}, tasks=pair).plot()",

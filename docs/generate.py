@@ -84,10 +84,11 @@ an error that names the file and the key. No missing key is replaced by a defaul
 finite. `true` is not 1, and `1.0` is not a whole number. `docs/generate.py` writes this page from the code that
 checks the files.
 """
-FIT_FILE = """JSON, format 3. `FitResult.save` writes it and `load_result` reads it. `load_preset` reads its
+FIT_FILE = """JSON, format 4. `FitResult.save` writes it and `load_result` reads it. `load_preset` reads its
 `task_table` alone. A fit of one target has the keys of the first two tables side by side. In a fit of several targets
 the keys of the second table stand under `parts`, by the name of the target. Keys must agree: the value of a parameter
-with its `task_table`, the spectrum with its `target_table`. In format 2 keys may be missing that task and target do
+with its `task_table`, the spectrum with its `target_table`. Format 3 does not say where
+starts ended (`values`). In format 2 keys may be missing that task and target do
 not have."""
 PRESET = """TOML, format 2. `save_preset` writes it and `load_preset` reads it. The `task_table` has every field of
 the task and of its parts. `type` is the class of a part. What a task does not have (`activation`, `initial`, a

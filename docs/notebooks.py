@@ -16,12 +16,13 @@ NOTEBOOKS = Path(__file__).resolve().parents[1] / "notebooks"
 
 
 def on_files(files: Files, config: Any) -> Files:
-    """Adds a page and its pictures for each notebook."""
+    """Adds for each notebook a page, its pictures, and the notebook to download."""
     for path in sorted(NOTEBOOKS.glob("*.ipynb")):
         text, pictures = page(json.loads(path.read_text(encoding="utf-8")), path.stem)
         files.append(File.generated(config, f"notebooks/{path.stem}.md", content=text))
         for name, content in pictures.items():
             files.append(File.generated(config, f"notebooks/{name}", content=content))
+        files.append(File.generated(config, f"notebooks/{path.name}", content=path.read_bytes()))
     return files
 
 
@@ -56,7 +57,11 @@ def page(notebook: dict[str, Any], stem: str) -> tuple[str, dict[str, bytes]]:
             else:
                 text = "```text\n" + (text or "".join(data.get("text/plain", ""))).rstrip() + "\n```"
             parts.append(text)
-    where = f"This is `notebooks/{stem}.ipynb` with its outputs: open it in Jupyter to run and change it."
+    where = (
+        f'[Download this notebook]({stem}.ipynb){{ .md-button download="{stem}.ipynb" }}\n\n'
+        f"This is `notebooks/{stem}.ipynb` with its outputs. `make notebooks` opens all of them in JupyterLab, where you "
+        "can run and change them."
+    )
     title, *rest = parts[0].split("\n", 1)
     return "\n\n".join([title, where, *rest, *parts[1:]]) + "\n", pictures
 

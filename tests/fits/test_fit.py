@@ -738,6 +738,18 @@ def test_the_answer_comes_before_the_checks_and_an_interruption_in_them_keeps_it
     assert jm.fit(jm.Isometric(), simple_target(), **(given | {"check_seeds": 0})).parameters == quick.parameters
 
 
+def test_an_interruption_between_the_search_and_the_answer_keeps_what_the_search_found(monkeypatch):
+    def interrupt(*_):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched, pytest.raises(jm.fits.FitInterrupted) as caught:
+        patched.setattr(_search.Endpoint, "of", interrupt)
+        jm.fit(jm.Isometric(), simple_target(), free=FEW, **QUICK)
+    (task,) = caught.value.tasks
+    assert {name: task[name] for name in FEW} == {name: caught.value.result.task[name] for name in FEW}
+    assert caught.value.result.success and caught.value.result.check == {}
+
+
 def test_an_interruption_before_the_first_step_has_no_result():
     def interrupt(text, share):
         raise KeyboardInterrupt

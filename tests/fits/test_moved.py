@@ -44,7 +44,7 @@ def read(path):
 @pytest.mark.slow
 def test_a_response_alone_is_fitted_from_the_command_line(fitted):
     folder, said = fitted
-    assert {path.name for path in folder.iterdir()} == {"fit.json", "fit.png", "stiffness.csv"}
+    assert {path.name for path in folder.iterdir()} == {"fit.json", "fit.png", "report.html", "stiffness.csv"}
     assert f"dynamic stiffness: {F.size} points from 0.2 to 8 Hz, chi2 per point" in said
     assert "fit.json, fit.png, stiffness.csv" in said
     result, table, given = jm.load_result(folder / "fit.json"), read(folder / "stiffness.csv"), response()

@@ -61,7 +61,7 @@ def made_result(**changes: Any) -> jm.fits.FitResult:
         "deviation": rng.uniform(0.1, 0.3, 30),
         "components": {"relaxation": rng.uniform(0, 1, 30), "tremor": rng.uniform(0, 1, 30)},
         "ladder": (Rung(0, "base", -250.1, 6.5, 1.9, 0.002), Rung(1, "with activation", -260.0, 7.1, 0.9, 0.3, True)),
-        "starts": (Start(1.5, True, 12), Start(None, False, 3)),
+        "starts": (Start(1.5, True, 12, (4e5, 50 / 3)), Start(None, False, 3)),
         "stretch": (np.arange(10.0, 15.0, 0.01), rng.standard_normal(500)),
         "profile": (np.linspace(0.4, 11.7, 64), rng.uniform(0, 9, 64)),
         "harmonic_p_value": 0.08,
@@ -193,8 +193,8 @@ def test_the_file_has_the_entries_of_the_design(tmp_path):
     assert table["parameters"]["k_w"]["stderr"] is None and not table["parameters"]["k_w"]["identifiable"]
     assert set(table["spectrum"]) >= {"frequency_hz", "target", "fitted"}
     assert table["starts"] == [
-        {"cost": 1.5, "success": True, "steps": 12},
-        {"cost": None, "success": False, "steps": 3},
+        {"cost": 1.5, "success": True, "steps": 12, "values": [4e5, 50 / 3]},
+        {"cost": None, "success": False, "steps": 3, "values": []},
     ]
 
 
@@ -317,7 +317,7 @@ def test_json_refuses_what_it_has_no_word_for(tmp_path):
         ("", "fit.json: is empty"),
         (b"\xff\xfe\x00", "fit.json: is not UTF-8 text"),
         ("[1, 2]", "fit.json: holds no table, but a list"),
-        ("{}", f"is not a fit result of format 2 or {FORMAT}; write it with FitResult.save"),
+        ("{}", f"is not a fit result of format 2 or 3 or {FORMAT}; write it with FitResult.save"),
         (f'{{"format": {FORMAT}, "format": {FORMAT}}}', "is not valid JSON: the key 'format' is there twice"),
         ('{"format": true}', "is not a fit result of format"),
         ('{"a": ' + "[" * 100_000, "fit.json: is nested too deeply"),
@@ -408,6 +408,22 @@ def test_a_result_of_the_format_before_is_read_without_loss(tmp_path):
     table["format"] = FORMAT
     path.write_text(json.dumps(table))
     with pytest.raises(ResultError, match=r"has no key|is missing"):
+        jm.load_result(path)
+
+
+def test_a_result_of_format_3_does_not_say_where_its_starts_ended(tmp_path):
+    path, result = tmp_path / "fit.json", made_result()
+    result.save(path)
+    table = json.loads(path.read_text()) | {"format": 3}
+    for start in table["starts"]:
+        del start["values"]
+    path.write_text(json.dumps(table))
+    read = jm.load_result(path)
+    assert [(s.cost, s.values) for s in read.starts] == [(1.5, ()), (None, ())]
+    with pytest.raises(ValueError, match="does not say where its starts ended"):
+        jm.plot.start_values(read)
+    path.write_text(json.dumps(table | {"format": FORMAT}))
+    with pytest.raises(ResultError, match="has no key 'values'"):
         jm.load_result(path)
 
 

@@ -484,6 +484,129 @@ def test_starts_are_drawn_in_the_order_of_where_they_ended():
     assert not plot.starts(types.SimpleNamespace(starts=())).lines
 
 
+def test_end_values_of_starts_are_drawn_over_those_of_the_best():
+    ended = [(9.0, (4.0, 1.0, 3.0)), (4.0, (2.0, -1.0, 3.0)), (None, ()), (4.5, (1.0, 0.5, 6.0))]
+    starts = tuple(types.SimpleNamespace(cost=c, success=True, values=v) for c, v in ended)
+    ax = plot.start_values(types.SimpleNamespace(starts=starts, settings={"free": ["k_w", "x_z", "c_w"]}))
+    drawn = [line.get_xydata().tolist() for line in ax.lines]  # the best last, above the others
+    assert drawn == [[[2, 0], [1, 1]], [[0.5, 0], [2, 1]], [[1, 0], [1, 1]]]
+    assert [tick.get_text() for tick in ax.get_yticklabels()] == ["k_w", "c_w"]  # a negative value has no logarithm
+    assert ax.get_xscale() == "log" and ax.lines[-1].get_color() == "#000000"
+    bar = ax.figure.axes[1]
+    assert bar.get_ylabel() == "Rise of χ²" and bar.get_ylim() == pytest.approx((0.0, 10.0))
+    assert ax.lines[0].get_color() == plt.get_cmap("viridis")(1.0)
+    with pytest.raises(ValueError, match="saved by an earlier version"):
+        plot.start_values(types.SimpleNamespace(starts=(), settings={"free": []}))
+
+
+@pytest.mark.parametrize("log", [True, False])
+def test_components_add_up_to_the_fit(log):
+    f = result().frequency_hz
+    tremor = np.where(np.abs(f - 9) < 1, 0.8, 0.0)
+    found = result(components={"relaxation": 0.7 * (1 - tremor), "floor": 0.3 * (1 - tremor), "tremor": tremor})
+    ax = plot.components(found, log=log)
+    labels = [text.get_text() for text in ax.get_legend().get_texts()]
+    parts = [label for label in labels if label.endswith(" % of power")]
+    assert [part.partition(",")[0] for part in parts] == ["floor", "relaxation", "tremor"]
+    if log:
+        total = np.sum([np.nan_to_num(named(ax, part).get_ydata()) for part in parts], axis=0)
+    else:
+        last = ax.collections[-1].get_paths()[0].vertices  # of the areas upon each other the uppermost
+        total = np.array([last[np.isclose(last[:, 0], x), 1].max() for x in f])
+    np.testing.assert_allclose(total, found.fitted, rtol=1e-12)
+    np.testing.assert_array_equal(named(ax, "fit").get_ydata(), found.fitted)
+    shares = [100 * np.sum(found.fitted * found.components[part.partition(",")[0]]) for part in parts]
+    assert parts == [f"{part.partition(',')[0]}, {share:.0f} % of power" for part, share in zip(parts, shares, strict=True)]
+
+
+def test_components_that_are_not_known_are_refused():
+    with pytest.raises(ValueError, match="the parts of the power are not known"):
+        plot.components(result(components={}))
+    with pytest.raises(ValueError, match="did you mean 'vastus-lateralis-26mvc'"):
+        plot.components(result(), target="vastus")
+    several = types.SimpleNamespace(parts={"a": result(), "b": result()})
+    with pytest.raises(ValueError, match="give target= one of a, b"):
+        plot.components(several)
+
+
+def cohort_of(people=6, bins=30):
+    """A cohort of two groups, as far as its figures read it; `bins` of the last person."""
+    rng = np.random.default_rng(4)
+    results, rows = {}, []
+    for i in range(people):
+        count = 30 if i < people - 1 else bins
+        name, power = f"p{i}", np.exp(0.2 * rng.standard_normal(count))
+        results[name] = types.SimpleNamespace(target=Target(name, power, bins=range(1, count + 1), segments=[6]))
+        about = {"target": name, "group": "ab"[i % 2], "mvc_fraction": None}
+        rows += [about | {"quantity": "corner_frequency", "value": 1.0 + i, "stderr": 0.1, "unit": "Hz"},
+                 about | {"quantity": "band_0.5_1", "value": 0.1 * i, "stderr": 0.01, "unit": "1"},
+                 about | {"quantity": "k_w", "value": 1.0, "stderr": None, "unit": "N/m^3"}]  # fmt: skip
+    groups = {name: "ab"[i % 2] for i, name in enumerate(results)}
+    return types.SimpleNamespace(results=results, groups=groups, table=lambda: rows)
+
+
+def test_groups_have_a_mean_spectrum_and_their_numbers():
+    found = cohort_of()
+    spectra, corner, share = plot.groups(found).axes
+    power = np.stack([found.results[f"p{i}"].target.proportional_power for i in (1, 3, 5)])
+    mean = named(spectra, "b (3 people)")
+    np.testing.assert_allclose(mean.get_ydata(), np.exp(np.log(power).mean(axis=0)), rtol=1e-12)
+    error = np.log(power).std(axis=0, ddof=1) / np.sqrt(3)
+    last = spectra.collections[-1].get_paths()[0].vertices
+    edges = [[f(last[np.isclose(last[:, 0], x), 1]) for x in F] for f in (np.min, np.max)]
+    np.testing.assert_allclose(edges, mean.get_ydata() * np.exp([[-1], [1]] * error), rtol=1e-9)
+    assert corner.get_ylabel() == "corner frequency\n(Hz)" and share.get_ylabel().replace("\n", " ") == (
+        "power, 0.5 to 1\N{NO-BREAK SPACE}Hz (ratio)"
+    )
+    values = [line.get_ydata() for container in corner.containers for line in container.lines[:1]]
+    np.testing.assert_array_equal(values, [[1, 3, 5], [2, 4, 6]])
+    means = [
+        segment[0][1] for lines in corner.collections for segment in lines.get_segments() if len(set(segment[:, 1])) == 1
+    ]
+    assert {3.0, 4.0} <= set(means)
+    assert len(plot.groups(cohort_of(bins=20)).axes) == 2  # spectra of different bins have no mean
+    with pytest.raises(ValueError, match="nothing to draw"):
+        plot.groups(found, quantities=["k_w"])
+
+
+def words_of(figure):
+    """Every text that is drawn: labels of ticks outside the axes are not."""
+    yield from (text for each in (figure, *figure.subfigs) for text in each.texts)
+    yield from (text for legend in figure.findobj(matplotlib.legend.Legend) for text in legend.get_texts())
+    for ax in figure.axes:
+        yield from (ax.title, ax._left_title, ax._right_title, ax.xaxis.label, ax.yaxis.label, *ax.texts)
+        for axis in (ax.xaxis, ax.yaxis):
+            low, high = sorted(axis.get_view_interval())
+            yield from (tick.label1 for tick in axis.get_major_ticks() if low <= tick.get_loc() <= high)
+
+
+def small_words(figure):
+    """What is smaller than 6 points where the figure is 85 mm wide, leaves the figure, or overlaps something else."""
+    figure.canvas.draw()
+    width, height = figure.canvas.get_width_height()
+    texts = [text for text in words_of(figure) if text.get_text().strip() and text.get_visible()]
+    boxes = [(text.get_text(), text.get_window_extent().shrunk(0.98, 0.8)) for text in texts]
+    small = [text.get_text() for text in texts if text.get_fontsize() * 85 / 25.4 / figure.get_figwidth() < 6.0]
+    out = [word for word, box in boxes if box.x0 < -1 or box.x1 > width + 1 or box.y0 < -1 or box.y1 > height + 1]
+    touch = [(a, b) for i, (a, one) in enumerate(boxes) for b, other in boxes[:i] if one.overlaps(other)]
+    return small, out, touch
+
+
+@pytest.mark.parametrize(
+    "draw",
+    [
+        lambda: plot.simulation(trajectories((3,))),
+        lambda: plot.fit(result()),
+        lambda: plot.components(result()).figure,
+        lambda: plot.groups(cohort_of()),
+        lambda: plot.cohort(cohort_of()),
+    ],
+    ids=["simulation", "fit", "components", "groups", "cohort"],
+)
+def test_words_are_legible_in_a_column_of_a_journal_and_do_not_touch(draw):
+    assert small_words(draw()) == ([], [], [])
+
+
 def test_several_profiles_share_a_figure_and_a_legend():
     values = np.linspace(0.5, 1.5, 21)
     common = {"threshold": 3.84, "level": 0.95, "intervals": [(0.8, 1.2)], "value": 1.0, "stderr": 0.1, "unit": "Hz",

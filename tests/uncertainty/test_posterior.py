@@ -291,7 +291,13 @@ def test_command(tmp_path):
     run = CliRunner().invoke(app, ["posterior", str(tmp_path / "fit.json"), *few,
                                    "--out", str(tmp_path / "b")])  # fmt: skip
     assert run.exit_code == 1 and "did not mix" in run.output
-    assert {p.name for p in (tmp_path / "b").iterdir()} == {"fit.json", "posterior.nc", "posterior.json", "chains.png"}
+    assert {p.name for p in (tmp_path / "b").iterdir()} == {
+        "fit.json",
+        "posterior.nc",
+        "posterior.json",
+        "chains.png",
+        "report.html",
+    }
     assert json.loads((tmp_path / "b" / "posterior.json").read_text())["summary"] is None
     again = CliRunner().invoke(app, ["posterior", str(tmp_path / "b" / "fit.json"), *few, "--force", "--json",
                                      "--out", str(tmp_path / "b")])  # fmt: skip

@@ -1,11 +1,13 @@
 """The notebooks: short, stored with their outputs, linked, and run."""
 
 import re
+import sys
+import types
 
 import nbformat
 import pytest
 from nbclient import NotebookClient
-from pages import IN_A_KERNEL, NOTEBOOKS
+from pages import IN_A_KERNEL, NOTEBOOKS, ROOT, module
 
 
 def stored(path):
@@ -50,6 +52,19 @@ def test_the_links_of_a_notebook_lead_somewhere(path):
 def test_one_notebook_has_sliders():
     kinds = {kind for path in NOTEBOOKS for output in stored(path)[1] for kind in output.get("data", {})}
     assert "application/vnd.jupyter.widget-view+json" in kinds
+
+
+def test_the_site_offers_every_notebook_for_download(monkeypatch):
+    """Its page leads to the file as it is in the repository. Mkdocs itself is not needed for that."""
+    files = types.ModuleType("mkdocs.structure.files")
+    files.Files, files.File = list, types.SimpleNamespace(generated=lambda config, uri, *, content: (uri, content))
+    for name, made in (("mkdocs", None), ("mkdocs.structure", None), ("mkdocs.structure.files", files)):
+        monkeypatch.setitem(sys.modules, name, made or types.ModuleType(name))
+    made = dict(module(ROOT / "docs" / "notebooks.py").on_files([], None))
+    for path in NOTEBOOKS:
+        page = made[f"notebooks/{path.stem}.md"]
+        assert page.startswith("# ") and f"\n\n[Download this notebook]({path.name}){{ .md-button" in page
+        assert made[f"notebooks/{path.name}"] == path.read_bytes()
 
 
 @pytest.mark.slow

@@ -15,12 +15,13 @@ from jaxmuscle._common.progress import told
 
 from .console import BAD_INPUT, CONVERGED, NOT_CONVERGED, csv_text, err, out, plain, record, writable, write_fit
 from .options import TaskName
+from .reports import REPORT, cohort_report
 
 if TYPE_CHECKING:
     from jaxmuscle.fits import CohortResult
 
 
-FILES = ("cohort.csv", "differences.csv", "cohort.png", "cohort.pdf", "cohort.svg")
+FILES = ("cohort.csv", "differences.csv", "cohort.png", "cohort.pdf", "cohort.svg", REPORT)
 SHOWN = {
     "harmonic_frequency": "harmonic (Hz)",
     "corner_frequency": "corner (Hz)",
@@ -106,8 +107,11 @@ def _write(cohort: "CohortResult", folder: Path, places: dict[str, Path], format
     if differences:
         write_text(folder / "differences.csv", csv_text(_columns(differences)))
     if any(row["stderr"] is not None for row in cohort.table()):
-        by = "group" if len(set(cohort.groups.values())) > 1 else "person"
-        write_figure(cohort.plot(by), folder, "cohort", formats)
+        figure = jm.plot.groups(cohort) if len(set(cohort.groups.values())) > 1 else cohort.plot()
+        cohort_report(cohort, figure, folder, places)
+        write_figure(figure, folder, "cohort", formats)
+    else:
+        cohort_report(cohort, None, folder, places)
     fits = {name: str(places[name] / "fit.json") for name in cohort.results}
     record({"success": cohort.success, "verdict": cohort.verdict, "table": cohort.table(), "differences": differences,
             "failed": cohort.failed, "fits": fits})  # fmt: skip
@@ -146,7 +150,7 @@ def _show(cohort: "CohortResult", folder: Path, places: dict[str, Path]) -> None
         if places[name].name != name:
             words = f"{plain(name)}: cannot be the name of a folder here; its fit is in {plain(places[name])}"
             err.print(f"[yellow]notice:[/] {words}", highlight=False)
-    out.print(f"Written: {folder}/cohort.csv and a folder for each target", highlight=False)
+    out.print(f"Written: {folder}/cohort.csv, {REPORT} and a folder for each target", highlight=False)
 
 
 def _cell(estimate: Any) -> str:

@@ -160,20 +160,29 @@ def write_reached(stop: "FitInterrupted", folder: Path) -> None:
     stays(f"the best parameters so far are in {folder / REACHED}")
 
 
-def write_fit(result: "FitResult", folder: Path, formats: Iterable[str] = ()) -> list[str]:
-    """fit.json, fit in each of the formats, and the tables of what was fitted, each whole or not there; their names."""
+def write_fit(result: "FitResult", folder: Path, formats: Iterable[str] = (), *, report: bool = False) -> list[str]:
+    """fit.json, fit in each of the formats, tables, a report if it is wanted, each whole or not there; their names."""
     from jaxmuscle._common.figures import remove_figures, write_figure
     from jaxmuscle._common.files import remove, write_text
 
+    from .reports import REPORT, fit_report
+
     tables = fit_tables(result)
-    remove(folder, *tables, REACHED)
+    remove(folder, *tables, REPORT)
     remove_figures(folder, "fit")
     result.save(folder / "fit.json")
+    remove(folder, REACHED)
     for name, columns in tables.items():
         if columns:
             write_text(folder / name, csv_text(columns))
-    figures = write_figure(result.plot(), folder, "fit", formats) if formats else []
-    return ["fit.json", *figures, *(name for name, columns in tables.items() if columns)]
+    written = ["fit.json", *(name for name, columns in tables.items() if columns)]
+    if formats:
+        figure = result.plot()
+        if report:
+            fit_report(result, figure, folder)
+            written.append(REPORT)
+        written[1:1] = write_figure(figure, folder, "fit", formats)
+    return written
 
 
 def fit_tables(result: "FitResult") -> dict[str, dict[str, Any]]:

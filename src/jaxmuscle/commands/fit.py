@@ -104,7 +104,10 @@ def fit(
         typer.Option(metavar="FILE", help="CSV with the columns target and group, to compare groups of spectra."),
     ] = None,
     quick: Annotated[
-        bool, typer.Option("--quick", help="Leave out the simulated check, the harmonic's profile and p-value, the figure.")
+        bool,
+        typer.Option(
+            "--quick", help="Leave out the simulated check, the harmonic's profile and p-value, figure and report."
+        ),
     ] = False,
     output: Output = Path("out"),
     formats: Formats = None,
@@ -125,10 +128,10 @@ def fit(
     alone, without the checks by simulation.
 
     Of one spectrum or person: prints a table as soon as the search has ended, then what the checks add. Writes DIR/fit.json,
-    DIR/fit.png and DIR/spectrum.csv.
+    DIR/fit.png, DIR/spectrum.csv and DIR/report.html.
 
-    Of several spectra: writes a folder DIR/TARGET for each, DIR/cohort.csv and DIR/cohort.png; with --groups also
-    DIR/differences.csv.
+    Of several spectra: writes a folder DIR/TARGET for each, DIR/cohort.csv, DIR/cohort.png and DIR/report.html; with
+    --groups also DIR/differences.csv.
 
     Examples:
 
@@ -219,7 +222,7 @@ def _fit_one(target: Any, model: Any, folder: Path, options: dict[str, Any], for
         with told(True, f"fitting {target[0].name if isinstance(target, list) else target.name}") as tell:
             result = jm.fit(model, target, progress=tell, answer=answer, **options)
             tell("writing", 1.0)
-            files = write_fit(result, folder, formats)
+            files = write_fit(result, folder, formats, report=True)
     except jm.fits.FitInterrupted as stop:
         if not printed:
             write_reached(stop, folder)

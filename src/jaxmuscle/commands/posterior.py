@@ -64,8 +64,8 @@ def posterior(
     """How sure is a fit? Draw from the posterior of the muscle's parameters.
 
     Fits first (unless given a fit.json), then runs NUTS chains with the likelihood of the Welch bins. Writes DIR/fit.json,
-    DIR/posterior.nc (for ArviZ), DIR/posterior.json, corner.png, predictive.png and chains.png. Exit code 1 if the fit
-    failed or the chains did not mix: then there is no summary.
+    DIR/posterior.nc (for ArviZ), DIR/posterior.json, corner.png, predictive.png, chains.png and report.html. Exit
+    code 1 if the fit failed or the chains did not mix: then there is no summary.
 
     Examples:
 
@@ -131,13 +131,18 @@ def _fitted(target: str, read: dict[str, Any], asked: dict[str, Any], seed: int)
 def _write(found: "Posterior", folder: Path, formats: list[str]) -> None:
     from jaxmuscle._common.figures import remove_figures, write_figure
 
+    from .reports import posterior_report
+
     remove_figures(folder, "corner", "predictive")
     found.save(folder / "posterior.nc")
     found.save(folder / "posterior.json")
-    write_figure(found.plot_chains(), folder, "chains", formats)
+    figures: dict[str, Any] = {}
     if found.success:
-        write_figure(found.plot(), folder, "corner", formats)
-        write_figure(found.plot_predictive().figure, folder, "predictive", formats)
+        figures |= {"corner": found.plot(), "predictive": found.plot_predictive().figure}
+    figures["chains"] = found.plot_chains()
+    posterior_report(found, figures, folder)
+    for name, figure in figures.items():
+        write_figure(figure, folder, name, formats)
 
 
 def _show(found: "Posterior", folder: Path) -> None:

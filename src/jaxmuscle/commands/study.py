@@ -46,8 +46,8 @@ def study(
 
     The table has a line for each recording. It needs the columns file and person, and may have group, condition and trial.
     The trials of a person in a condition are averaged. Options such as --column say how files are read, unless the table
-    says it. Writes DIR/people.csv, differences.csv, study.json, spectra.png, quantities.png and methods.txt,
-    all at the end.
+    says it. Writes DIR/people.csv, differences.csv, study.json, spectra.png, quantities.png, methods.txt
+    and report.html, all at the end.
 
     Examples:
 
@@ -57,6 +57,8 @@ def study(
     """
     with reporting(as_json):
         from jaxmuscle._common.environment import keep_compiled_programs
+
+        from .reports import study_report
 
         keep_compiled_programs()
         span = edges_of(window)
@@ -82,6 +84,7 @@ def study(
             said = "all" if len(names) == len(found.cells) else "; ".join(names)
             err.print(f"[yellow]notice:[/] {plain(said)}: {plain(notice)}", highlight=False)
         found.save(output, formats_of(formats))
+        study_report(found, output)
         record(output / "study.json")
         show(found, success=found.success)
         files = ", ".join(sorted(path.name for path in output.iterdir()))

@@ -15,8 +15,8 @@ from jaxmuscle.objective._arguments import METHODS, RESIDUALS, base_of, target_o
 if TYPE_CHECKING:
     from ._result import FitResult
 
-FORMAT = 3
-FORMATS = (2, 3)  # that can be read; 2 may leave out what task and target do not have
+FORMAT = 4
+FORMATS = (2, 3, 4)  # that can be read; 2 may leave out what task and target do not have, 3 where starts ended
 SAME = 1e-9  # relative
 
 Number = float | None  # null where it is not finite
@@ -67,6 +67,7 @@ class StartTable(Table, kw_only=True):
     cost: Annotated[Number, _told("½ Σ r² where it ended")]
     success: Annotated[bool, _told("Whether it settled")]
     steps: Annotated[Count, _told("Steps taken")]
+    values: Annotated[tuple[float, ...], _told("Where it ended, in the order of settings.free; empty if not finite")] = ()
 
 
 class CorrelationTable(Table, kw_only=True):
@@ -182,6 +183,8 @@ def disagreement(result: "FitResult") -> str | None:
     for key in ("free", "prior_centre", "prior_sd"):
         if set(settings[key]) != free:
             return f"settings.{key} names {_names(settings[key])}, but free among the parameters are {_names(free)}"
+    if any(len(start.values) not in (0, len(free)) for start in result.starts):
+        return f"starts: values needs a number for each of {_names(free)}"
     if not set(settings["bounds"]) <= free:
         return f"settings.bounds names {_names(settings['bounds'])}, but free are {_names(free)}"
     if len(result.parts) > 1 and not {"separate", "proportional"} <= set(settings):

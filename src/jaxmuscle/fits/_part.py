@@ -64,11 +64,16 @@ class Estimate(eqx.Module):
 
 
 class Start(eqx.Module):
-    """One start of a fit: final cost `½ Σ r²` (None if not finite), whether it settled, steps taken."""
+    """One start of a fit: final cost `½ Σ r²` (None if not finite), whether it settled, steps taken.
+
+    `values`, where the free parameters ended, in the order of `settings["free"]`; empty where that is not finite, and of
+    fits that were saved before version 4 of their format.
+    """
 
     cost: float | None
     success: bool
     steps: int
+    values: tuple[float, ...] = ()
 
 
 class FittedPart(eqx.Module):

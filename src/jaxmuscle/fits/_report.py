@@ -78,9 +78,10 @@ def report_fit(
     """
     problem, objective, final = plan.problem, stages[-1].objective, stages[-1].minima
     first = stages[0].minima
+    ends = problem.coordinates.values_of(np.asarray(problem.coordinates.theta(np.asarray(first.s))))
     starts = tuple(
-        Start(float(c) if np.isfinite(c) else None, bool(ok), int(n))
-        for c, ok, n in zip(first.cost, first.settled, first.steps, strict=True)
+        Start(float(c) if np.isfinite(c) else None, bool(ok), int(n), _six_digits(end))
+        for c, ok, n, end in zip(first.cost, first.settled, first.steps, ends, strict=True)
     )
     common = {"method": problem.method, "starts": starts, "seed": plan.seed, "settings": plan.settings,
               "versions": versions(), "ladder": ladder}  # fmt: skip
@@ -152,6 +153,11 @@ def report_fit(
         notices=(*notices, *other, *polish_notices(polish), *of_several(parts), *unsimulated(plan, stages), *beyond),
         **common,
     )
+
+
+def _six_digits(values: np.ndarray) -> tuple[float, ...]:
+    """As `Start` keeps them."""
+    return tuple(float(f"{value:.6g}") for value in values) if np.isfinite(values).all() else ()
 
 
 class _Made(NamedTuple):

@@ -252,7 +252,9 @@ def to_table(result: FitResult) -> dict[str, Any]:
         "undetermined": list(result.undetermined),
         "ladder": [rung._asdict() for rung in result.ladder],
         "singular_values": with_nulls(result.singular_values),
-        "starts": [{"cost": s.cost, "success": s.success, "steps": s.steps} for s in result.starts],
+        "starts": [
+            {"cost": s.cost, "success": s.success, "steps": s.steps, "values": list(s.values)} for s in result.starts
+        ],
         "profile": None if profile is None else dict(zip(PROFILE, map(with_nulls, profile), strict=True)),
         "harmonic_p_value": result.harmonic_p_value,
         "notices": list(result.notices),
@@ -318,7 +320,7 @@ def _from_table(table: dict[str, Any], file: str) -> FitResult:
         undetermined=tuple(said.undetermined),
         ladder=tuple(Rung(**msgspec.structs.asdict(rung)) for rung in said.ladder),
         singular_values=from_nulls(said.singular_values),
-        starts=tuple(Start(s.cost, s.success, s.steps) for s in said.starts),
+        starts=tuple(Start(s.cost, s.success, s.steps, s.values) for s in said.starts),
         profile=None if said.profile is None else tuple(from_nulls(getattr(said.profile, name)) for name in PROFILE),
         harmonic_p_value=said.harmonic_p_value,
         notices=tuple(said.notices),

@@ -87,12 +87,13 @@ def search(plan: Plan, answer: Callable[[FitResult], None] | None = None, models
         raise KeyboardInterrupt("fit interrupted before its first step")
     if interrupted:
         raise _stopped(plan, stages, ladder, interrupted=True)
-    problem, ended = plan.problem, Endpoint.of(plan.problem, stages[-1])
-    if answer is not None:
-        found = _unchecked(plan, stages, ladder, ended)
-        later = tuple(n for n in found.notices if n != UNCHECKED) if plan.check_seeds else found.notices
-        answer(dataclasses.replace(found, notices=later))
+    problem, ended = plan.problem, None
     try:
+        ended = Endpoint.of(problem, stages[-1])
+        if answer is not None:
+            found = _unchecked(plan, stages, ladder, ended)
+            later = tuple(n for n in found.notices if n != UNCHECKED) if plan.check_seeds else found.notices
+            answer(dataclasses.replace(found, notices=later))
         problem.tell("checking with new simulations" if plan.check_seeds else "computing the errors", 0.8)
         result = report_fit(plan, stages, ladder, ended=ended)
         if models is not None and result.success:

@@ -5,6 +5,7 @@ from importlib.metadata import version
 from pathlib import Path
 
 from jaxmuscle._common.files import write_text
+from jaxmuscle._common.pages import document
 
 from ._claims import claims_json
 from ._numbers import SINES, Experiment, Reproduction
@@ -26,19 +27,10 @@ CAPTIONS = {
 }
 CLASSES = {AGREES: "yes", GRID: "grid", DIFFERS: "no"}
 STYLE = """
-:root{color-scheme:light}*{box-sizing:border-box}
-body{margin:0 auto;max-width:62rem;padding:1rem;font:16px/1.5 system-ui,sans-serif;color:#1a1a1a;background:#fff}
-h1{font-size:1.5rem;line-height:1.25}h2{font-size:1.2rem;margin-top:2.2rem}a{color:#0058a3}
 .figures{display:grid;grid-template-columns:repeat(auto-fit,minmax(min(100%,24rem),1fr));gap:1.5rem}
-figure{margin:0}figcaption{font-size:.9rem}img{width:100%;height:auto;display:block}
-table{border-collapse:collapse;width:100%;font-size:.9rem}th,td{text-align:left;vertical-align:top;padding:.45rem .6rem;
-border-bottom:1px solid #ddd;overflow-wrap:anywhere}thead th{border-bottom:2px solid #555}
-.verdict{font-weight:600}.yes{color:#00664a}.grid{color:#0058a3}.no{color:#a33c00}.open{color:#555}
-.source{color:#555;font-size:.85rem}.plain th,.plain .holds{overflow-wrap:normal;white-space:nowrap;padding:.45rem .3rem}
+.figures figure{margin:0}img{width:100%}.source{color:var(--soft);font-size:.85rem}
+.plain th,.plain .holds{overflow-wrap:normal;white-space:nowrap;padding:.45rem .3rem}
 .plain th:not(:first-child),.holds{text-align:center}
-@media(max-width:46rem){table.stack thead{position:absolute;left:-999rem}table.stack tr{display:block;padding:.6rem 0;
-border-bottom:2px solid #bbb}table.stack td{display:block;border:0;padding:.15rem 0}
-table.stack td::before{content:attr(data-label);display:block;font-size:.75rem;color:#555}.scroll{overflow-x:auto}}
 """.strip()
 
 
@@ -50,30 +42,24 @@ def write_page(found: Reproduction, rows: tuple[Row, ...], out: Path) -> None:
 
 def page(found: Reproduction, rows: tuple[Row, ...]) -> str:
     """The whole page."""
-    body = "\n".join(
-        (
-            "<h1>Enhancing rheological muscle models with stochastic processes: reproduced</h1>",
-            "<p>The figures of Zagrodny, Wojnicz, Ludwicki and Barański (<i>the paper</i>) and what its text says, by "
-            f"jaxmuscle {version('jaxmuscle')}. [30] is Slifkin &amp; Newell 1999, [12] Hamilton, Jones &amp; Wolpert "
-            "2004. What is stated was taken from texts; the figures were not available as data.</p>",
-            f"<p><b>{escape(counted(rows))}</b> As data: <a href='claims.json'>claims.json</a>.</p>",
-            "<p>No verdict stands here on whether the model describes data: the parameters were tuned to curves that texts "
-            "describe, whose scatter nobody states. Fits of measured spectra have one (<code>jaxmuscle fit</code>).</p>",
-            "<h2>Figures</h2>",
-            f"<div class='figures'>{''.join(_figure(name, _caption(name, found.experiment)) for name in CAPTIONS)}</div>",
-            "<h2>Statements</h2>",
-            *(_claims(kind, [row for row in rows if row.kind == kind]) for kind in KINDS),
-            "<h2>Where do 0.391 and 4.251 Hz come from? Three readings</h2>",
-            _readings(found),
-            "<h2>Comparison signals</h2>",
-            _regularity(found),
-        )
+    body = (
+        "<h1>Enhancing rheological muscle models with stochastic processes: reproduced</h1>",
+        "<p>The figures of Zagrodny, Wojnicz, Ludwicki and Barański (<i>the paper</i>) and what its text says, by "
+        f"jaxmuscle {version('jaxmuscle')}. [30] is Slifkin &amp; Newell 1999, [12] Hamilton, Jones &amp; Wolpert "
+        "2004. What is stated was taken from texts; the figures were not available as data.</p>",
+        f"<p><b>{escape(counted(rows))}</b> As data: <a href='claims.json'>claims.json</a>.</p>",
+        "<p>No verdict stands here on whether the model describes data: the parameters were tuned to curves that texts "
+        "describe, whose scatter nobody states. Fits of measured spectra have one (<code>jaxmuscle fit</code>).</p>",
+        "<h2>Figures</h2>",
+        f"<div class='figures'>{''.join(_figure(name, _caption(name, found.experiment)) for name in CAPTIONS)}</div>",
+        "<h2>Statements</h2>",
+        *(_claims(kind, [row for row in rows if row.kind == kind]) for kind in KINDS),
+        "<h2>Where do 0.391 and 4.251 Hz come from? Three readings</h2>",
+        _readings(found),
+        "<h2>Comparison signals</h2>",
+        _regularity(found),
     )
-    return (
-        "<!doctype html>\n<html lang='en'>\n<head>\n<meta charset='utf-8'>\n"
-        "<meta name='viewport' content='width=device-width, initial-scale=1'>\n<title>jaxmuscle reproduce</title>\n"
-        f"<style>{STYLE}</style>\n</head>\n<body>\n{body}\n</body>\n</html>\n"
-    )
+    return document("jaxmuscle reproduce", body, style=STYLE)
 
 
 def _caption(name: str, experiment: Experiment) -> str:

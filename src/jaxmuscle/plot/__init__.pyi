@@ -4,7 +4,9 @@ from ._characteristics import static as static
 from ._checks import bootstrap as bootstrap
 from ._checks import goodness as goodness
 from ._cohort import cohort as cohort
+from ._cohort import groups as groups
 from ._comparison import comparison as comparison
+from ._components import components as components
 from ._designed_input import designed_input as designed_input
 from ._fit import fit as fit
 from ._identifiability import identifiability as identifiability
@@ -26,6 +28,7 @@ from ._spectra import QUANTILES as QUANTILES
 from ._spectra import estimate as estimate
 from ._spectra import spectrum as spectrum
 from ._spectra import target as target
+from ._starts import start_values as start_values
 from ._starts import starts as starts
 from ._steadiness import steadiness as steadiness
 from ._study import study as study

@@ -8,10 +8,14 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure, SubFigure
 
-from ._style import BLUE, GREY, PALETTE, canvas, styled
+from jaxmuscle._common.text import printable
+
+from ._numbers import in_words
+from ._study import group_spectra
+from ._style import BLUE, COLUMN, GREY, PALETTE, canvas, fitted_to, frequency_axis, key, styled
 
 WAYS = ("person", "group", "level")
-WIDTH, HEIGHT, ACROSS = 2.25, 1.8, 2  # inches, inches, panels: legible in a column of 85 mm
+HEIGHT, ACROSS, SPECTRA = 1.6, 2, 2.3  # inches, panels, inches
 LABELLED = 12  # people who get a name on the axis
 SHARE = 0.5  # of the targets that must determine a quantity for it to be drawn
 
@@ -28,26 +32,69 @@ def cohort(
     """
     if by not in WAYS:
         raise ValueError(f"by = {by!r}: choose one of {', '.join(WAYS)}")
-    rows = [row for row in cohort.table() if row["stderr"] is not None]
-    names = list(dict.fromkeys(row["quantity"] for row in rows if quantities is None or row["quantity"] in quantities))
-    enough = SHARE * max(len(cohort.results), 1)
-    names = [name for name in names if sum(row["quantity"] == name for row in rows) >= enough]
-    if not names:
-        raise ValueError("no quantity is determined by at least half of the targets: there is nothing to draw")
-    if by == "level" and all(row["mvc_fraction"] is None for row in rows):
+    names = _drawn(cohort, quantities)
+    if by == "level" and all(result.target.mvc_fraction is None for result in cohort.results.values()):
         raise ValueError("by = 'level': no target states its mvc_fraction")
-    down = -(-len(names) // ACROSS)
-    fig = canvas(ax, (WIDTH * ACROSS, HEIGHT * down))
-    axes = fig.subplots(down, ACROSS, squeeze=False)
-    groups = list(dict.fromkeys(cohort.groups.get(name, "") for name in cohort.results))
-    for panel, name in zip(axes.flat, names, strict=False):
-        _panel(panel, [row for row in rows if row["quantity"] == name], list(cohort.results), groups, by)
+    height = HEIGHT * -(-len(names) // ACROSS)
+    fig = canvas(ax, (COLUMN, height))
+    _panels(fig, cohort, names, by)
+    if len(_groups(cohort)) > 1 and by != "group":
+        fitted_to(fig, height, key(fig, ACROSS))
+    return fig
+
+
+@styled
+def groups(cohort: Any, ax: Axes | None = None, *, quantities: Collection[str] | None = None) -> Figure | SubFigure:
+    """Draws the spectra of the groups of a cohort, and what the fits found by group.
+
+    Above: every target (thin), the geometric mean of each group with its standard error (thick). Below: what at least half
+    of the targets determine, with standard errors; the grey line is the mean of the group. `quantities`, only these.
+    Where the targets differ in their bins, their spectra have no mean and are left out.
+
+    **Raises:** `ValueError` if nothing is determined by half of the targets.
+    """
+    names = _drawn(cohort, quantities)
+    targets = {name: result.target for name, result in cohort.results.items()}
+    alike = len({tuple(target.frequency) for target in targets.values()}) == 1
+    heights = [SPECTRA] * alike + [HEIGHT * -(-len(names) // ACROSS)]
+    fig = canvas(ax, (COLUMN, sum(heights)))
+    places = fig.subfigures(len(heights), 1, height_ratios=heights, squeeze=False)[:, 0]
+    if alike:
+        panel = places[0].add_subplot()
+        for number, group in enumerate(_groups(cohort)):
+            here = [target for name, target in targets.items() if cohort.groups.get(name, "") == group]
+            group_spectra(panel, here, PALETTE[number % len(PALETTE)], group, True)
+        frequency_axis(panel, log=True)
+        panel.set_ylabel("Power (fraction per bin)")
+        panel.legend(loc="lower left")
+    _panels(places[-1], cohort, names, "group")
+    return fig
+
+
+def _groups(cohort: Any) -> list[str]:
+    return list(dict.fromkeys(cohort.groups.get(name, "") for name in cohort.results))
+
+
+def _drawn(cohort: Any, quantities: Collection[str] | None) -> dict[str, list[dict[str, Any]]]:
+    """The rows of every quantity that at least half of the targets determine."""
+    found: dict[str, list[dict[str, Any]]] = {}
+    for row in cohort.table():
+        if row["stderr"] is not None and (quantities is None or row["quantity"] in quantities):
+            found.setdefault(row["quantity"], []).append(row)
+    enough = SHARE * max(len(cohort.results), 1)
+    found = {name: rows for name, rows in found.items() if len(rows) >= enough}
+    if not found:
+        raise ValueError("no quantity is determined by at least half of the targets: there is nothing to draw")
+    return found
+
+
+def _panels(fig: Any, cohort: Any, names: dict[str, list[dict[str, Any]]], by: str) -> None:
+    axes = fig.subplots(-(-len(names) // ACROSS), ACROSS, squeeze=False)
+    for panel, rows in zip(axes.flat, names.values(), strict=False):
+        _panel(panel, rows, list(cohort.results), _groups(cohort), by)
     for panel in axes.flat[len(names) :]:
         panel.remove()
-    if len(groups) > 1 and by != "group":
-        handles, labels = axes.flat[0].get_legend_handles_labels()
-        fig.legend(handles, labels, loc="outside upper right", ncols=len(groups), frameon=False)
-    return fig
+    fig.align_ylabels()
 
 
 def _panel(ax: Axes, rows: list[dict[str, Any]], people: list[str], groups: list[str], by: str) -> None:
@@ -64,12 +111,9 @@ def _panel(ax: Axes, rows: list[dict[str, Any]], people: list[str], groups: list
             if len(here):
                 ax.hlines(value.mean(), number - 0.35, number + 0.35, color=GREY, linewidth=1)
         ax.errorbar(place, value, error, fmt="o", markersize=3.5, capsize=2, linewidth=1, color=colour, label=group or None)
-    unit = rows[0]["unit"]
-    name = rows[0]["quantity"]
-    label = (name if name[1] == "_" else name.replace("_", " ")) + ("" if unit == "1" else f" ({unit})")
-    ax.set_ylabel(textwrap.fill(label, 18))
+    ax.set_ylabel(textwrap.fill(in_words(rows[0]["quantity"], rows[0]["unit"]), 18))
     if by == "group":
-        ax.set_xticks(range(len(groups)), [group or "all" for group in groups])
+        ax.set_xticks(range(len(groups)), [printable(group) or "all" for group in groups])
         ax.set_xlim(-0.6, len(groups) - 0.4)
     elif by == "level":
         ax.set_xlabel("Level (% MVC)")
@@ -77,6 +121,8 @@ def _panel(ax: Axes, rows: list[dict[str, Any]], people: list[str], groups: list
         ax.set_xlim(-0.5, len(people) - 0.5)
         if len(people) <= LABELLED:
             turned = 35 if len(people) <= 6 else 60
-            ax.set_xticks(range(len(people)), people, rotation=turned, ha="right", rotation_mode="anchor")
+            ax.set_xticks(
+                range(len(people)), [printable(name) for name in people], rotation=turned, ha="right", rotation_mode="anchor"
+            )
         else:
             ax.set_xlabel("Target number")

@@ -1,6 +1,5 @@
 """The figure of a comparison of noises: how the best of each fits, and whether they can be told apart."""
 
-import textwrap
 from typing import Any
 
 import numpy as np
@@ -8,32 +7,29 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure, SubFigure
 
 from ._spectra import target
-from ._style import BLACK, GREY, PALETTE, canvas, styled
+from ._style import BLACK, COLUMN, GREY, PALETTE, canvas, fitted_to, heading, key, styled, without_legend
 
-WIDTH, HEIGHT, LINE = 9.0, 3.0, 0.17  # inches
-SIZES = (1.7, 0.9, 1.0)
-WRAP = 150  # characters on a line of WIDTH
+SPECTRA, ROW = 2.4, 0.24  # inches
 MARK: dict[str, Any] = {"ms": 5.5, "zorder": 3}
 DASHES: tuple[Any, ...] = ("-", (0, (5, 1.5)), (0, (2, 1)), (0, (5, 1, 1, 1)))
 
 
 @styled
 def comparison(comparison: Any, ax: Axes | None = None) -> Figure | SubFigure:
-    """Draws the best fit of each noise, AIC and held-out score of every model, and says whether they can be told apart."""
-    lines = _lines(comparison)
-    low = LINE * (len(lines) + 0.5)
-    fig = canvas(ax, (WIDTH, HEIGHT + low + 0.3))
-    parts: Any = fig.subfigures(2, 1, height_ratios=[HEIGHT, low])
-    above, below = parts
-    spectra, criterion, scores = above.subplots(1, 3, width_ratios=SIZES)
+    """Draws the best fit of each noise, and AIC and held-out score of every model.
+
+    Which can be told apart is what `print(comparison)` says.
+    """
+    rows = sorted(comparison.rows, key=lambda row: row.aic)
+    heights = SPECTRA, 0.9 + ROW * len(rows)
+    fig = canvas(ax, (COLUMN, sum(heights)))
+    grid = fig.add_gridspec(2, 2, height_ratios=heights)
     names = dict.fromkeys(row.noise for row in comparison.rows)
     colours = {name: PALETTE[i % len(PALETTE)] for i, name in enumerate(names)}
-    rows = sorted(comparison.rows, key=lambda row: row.aic)
-    _spectra(spectra, comparison, colours)
-    _criterion(criterion, rows, colours)
-    _scores(scores, rows, colours)
-    for i, line in enumerate(lines):
-        below.text(0.012, 1 - (i + 0.5) * LINE / low, line, va="center", parse_math=False, size=7.5)
+    _spectra(fig.add_subplot(grid[0, :]), comparison, colours)
+    _criterion(fig.add_subplot(grid[1, 0]), rows, colours)
+    _scores(fig.add_subplot(grid[1, 1]), rows, colours)
+    fitted_to(fig, sum(heights), heading(fig, comparison.target.name) + key(fig))
     return fig
 
 
@@ -48,7 +44,7 @@ def _spectra(ax: Axes, comparison: Any, colours: dict[str, str]) -> None:
         style = {"color": colours[noise], "ls": DASHES[number % len(DASHES)], "lw": 1.3, "zorder": 5 - 0.1 * number}
         ax.plot(frequency, comparison.fitted[noise, best.harmonic], label=best.label, **style)
     ax.set(title="Best fit of each noise", ylim=(0.5 * power.min(), 2 * power.max()))
-    ax.legend(loc="lower left", fontsize=7)
+    without_legend(ax).set_ylabel("Power (fraction per bin)")
 
 
 def _criterion(ax: Axes, rows: list[Any], colours: dict[str, str]) -> None:
@@ -93,9 +89,3 @@ def _rows(ax: Axes, labels: list[str]) -> None:
 
 def _face(row: Any, colours: dict[str, str]) -> str:
     return colours[row.noise] if row.harmonic else "white"
-
-
-def _lines(comparison: Any) -> list[str]:
-    said = [*comparison.verdict, *(f"left out: {noise}: {why}" for noise, why in comparison.left_out.items())]
-    wrap = textwrap.TextWrapper(WRAP, initial_indent="•  ", subsequent_indent="    ")
-    return [line for sentence in said for line in wrap.wrap(sentence)]

@@ -12,12 +12,25 @@ from matplotlib.figure import Figure, SubFigure
 
 from jaxmuscle._common.text import probability
 
+from ._components import parts_of_power
 from ._spectra import target
 from ._stiffness import gain, phase, stiffness_residuals
-from ._style import BLACK, BLUE, GREEN, GREY, ORANGE, PURPLE, SKY, VERMILLION, canvas, output_label, styled
+from ._style import (
+    BLACK,
+    BLUE,
+    COLUMN,
+    GREY,
+    ORANGE,
+    VERMILLION,
+    canvas,
+    fitted_to,
+    heading,
+    key,
+    output_label,
+    styled,
+    without_legend,
+)
 
-WIDTH = 4.5  # inches: in a column of 85 mm its letters are those of 6 points
-LINE = 0.17  # inches
 ALLOWED = 3.84  # 95 % quantile of χ² with one degree of freedom
 DARK_GREEN = "#00664A"  # the palette's green is too light for small letters
 
@@ -34,39 +47,23 @@ def fit(result: Any, ax: Axes | None = None) -> Figure | SubFigure:
     """
     panels = _panels(result)
     heights = [height for height, _ in panels]
-    fig = canvas(ax, (WIDTH, sum(heights)), w_pad=0.05, h_pad=0.04)
+    fig = canvas(ax, (COLUMN, sum(heights)), w_pad=0.05, h_pad=0.04)
     grid = fig.add_gridspec(len(heights), 2, height_ratios=heights)
     for row, (_, draw) in enumerate(panels):
         for column, panel in enumerate(draw):
             panel(fig.add_subplot(grid[row, column] if len(draw) > 1 else grid[row, :]))
-    rows = _title(fig, result) + _key(fig)
-    if isinstance(fig, Figure):  # panels keep their heights, however much the title and the legend say
-        fig.set_size_inches(WIDTH, sum(heights) + 0.3 + LINE * rows)
+    fitted_to(fig, sum(heights), _title(fig, result) + key(fig))
     return fig
 
 
 def _title(fig: Figure | SubFigure, result: Any) -> int:
     """The target's name, and in red whatever forbids to believe the fit; how many lines."""
     name = ", ".join(result.parts) if len(result.parts) > 1 else result.target.name
-    lines = [name if len(name) <= 50 else f"{name[:49]}…"]
+    name = name if len(name) <= 50 else f"{name[:49]}…"
     if any(part.target.provenance == "reconstructed" for part in result.parts.values()):
-        lines[0] += " (reconstructed)"
-    if not result.success:
-        lines.append("Not fitted")
-    elif result.adequate is False:
-        lines.append("Does not describe the data")
-    color = rcParams["text.color"] if len(lines) == 1 else VERMILLION
-    fig.suptitle("\n".join(lines), x=0.02, ha="left", size=9, weight="bold", color=color, parse_math=False)
-    return len(lines)
-
-
-def _key(fig: Figure | SubFigure) -> int:
-    """One legend below all panels of spectra, in which each name stands once; how many lines."""
-    named = {label: handle for ax in fig.axes if ax.get_legend() is None
-             for handle, label in zip(*ax.get_legend_handles_labels(), strict=True)}  # fmt: skip
-    if named:
-        fig.legend(named.values(), named, loc="outside lower center", ncols=2, frameon=False, columnspacing=1.2)
-    return -(-len(named) // 2)
+        name += " (reconstructed)"
+    bad = "Not fitted" if not result.success else "Does not describe the data" if result.adequate is False else ""
+    return heading(fig, name, bad=bad)
 
 
 Panel = Callable[[Axes], None]
@@ -120,7 +117,7 @@ def _spectra(ax: Axes, part: Any, *, log: bool, title: str = "") -> None:
         dots.set_linewidth(0.0)
         ax.plot(frequency, fitted, color=BLUE, label="fit", zorder=4)
         if set(part.components) - {"relaxation", "floor", "harmonic"}:
-            _components(ax, part, frequency, fitted, log=log)
+            parts_of_power(ax, part, log=log, named=not log)
         else:
             _harmonic(ax, part, frequency, fitted)
     ax.set_title(title or ("Logarithmic" if log else "Linear"), parse_math=False)
@@ -130,9 +127,7 @@ def _spectra(ax: Axes, part: Any, *, log: bool, title: str = "") -> None:
     else:
         ax.set(xlim=(0, frequency[-1] + frequency[0]), ylim=(0, None))
     ax.set_ylabel("Power (fraction per bin)")
-    own = ax.get_legend()
-    if own is not None:
-        own.remove()
+    without_legend(ax)
 
 
 def _log_limits(ax: Axes, part: Any, fitted: Any) -> None:
@@ -140,26 +135,6 @@ def _log_limits(ax: Axes, part: Any, fitted: Any) -> None:
     seen = np.concatenate([part.target.proportional_power, fitted, *(band or ())])
     seen = seen[np.isfinite(seen) & (seen > 0)]
     ax.set_ylim(seen.min() / 1.4, seen.max() * 1.4)
-
-
-AREAS = {"floor": ("0.75", "floor"), "relaxation": (SKY, "relaxation"), "harmonic": (ORANGE, "harmonic"),
-         "tremor": (GREEN, "tremor"), "resonance_2": (PURPLE, "second resonance")}  # fmt: skip
-
-
-def _components(ax: Axes, part: Any, frequency: Any, fitted: Any, *, log: bool) -> None:
-    """What the parts of the model hold of the fitted power: one area upon the other; over a logarithmic axis, lines."""
-    below = np.zeros(len(fitted))
-    for name, (color, words) in AREAS.items():
-        power = fitted * np.maximum(part.components.get(name, 0.0), 0.0)
-        total = float(np.sum(power))
-        if not total > 1e-4:
-            continue
-        if log:
-            ax.plot(frequency, np.where(power > 0, power, np.nan), color=color, lw=1.0, zorder=3)
-            continue
-        label = f"{words}, {'<1' if total < 0.01 else f'{100 * total:.0f}'} % of power"
-        ax.fill_between(frequency, below, below + power, color=color, alpha=0.7, lw=0, zorder=2, label=label)
-        below = below + power
 
 
 def _harmonic(ax: Axes, part: Any, frequency: Any, fitted: Any) -> None:
@@ -230,7 +205,7 @@ def _profile(ax: Axes, result: Any) -> None:
     ax.axvline(float(result.task["harmonic_frequency"]), color=ORANGE, lw=0.8, ls=(0, (4, 2)), zorder=0)
     ax.set_title("Profile of the harmonic's frequency")
     if result.harmonic_p_value is not None:
-        ax.set_title(f"harmonic p = {result.harmonic_p_value:.2g}", loc="right", weight="normal", size=7.0)
+        ax.set_title(f"harmonic p = {result.harmonic_p_value:.2g}", loc="right", weight="normal")
     top = float(np.max(rise, where=np.isfinite(rise), initial=2 * ALLOWED))
     ax.set(xlabel="Frequency (Hz)", ylabel="Δχ²", xlim=(0, frequency[-1] + frequency[0]), ylim=(0, 1.05 * top))
 

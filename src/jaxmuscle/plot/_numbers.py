@@ -29,3 +29,12 @@ def unit_in_print(unit: str, power: int = 0) -> str:
     raised = re.sub(r"\^(-?\d+)", lambda match: match[1].translate(digits), unit)
     ten = f"10{str(power).translate(digits)}" if power else ""
     return " ".join(part for part in (ten, raised if raised != "1" or not ten else "") if part)
+
+
+def in_words(name: str, unit: str) -> str:
+    """A quantity as the label of an axis; what has no unit is a ratio."""
+    base, at, target = name.partition("@")
+    low, _, high = base.removeprefix("band_").partition("_")
+    words = base if base[1:2] == "_" else base.replace("_", " ")
+    words = f"power, {low} to {high}\N{NO-BREAK SPACE}Hz" if base.startswith("band_") else words
+    return f"{words}{at}{target} ({'ratio' if unit in ('', '1') else unit_in_print(unit)})"

@@ -1,5 +1,6 @@
 """Figures of a posterior: corner, predictive spectra, traces."""
 
+import textwrap
 from typing import Any
 
 import numpy as np
@@ -8,10 +9,24 @@ from matplotlib.figure import Figure, SubFigure
 
 from jaxmuscle._common.errors import NotMixedError
 
-from ._style import BLUE, ORANGE, PALETTE, PROPORTIONAL, SKY, VERMILLION, axes_or_new, canvas, styled
+from ._numbers import in_words, unit_in_print
+from ._style import (
+    BLUE,
+    COLUMN,
+    ORANGE,
+    PALETTE,
+    PROPORTIONAL,
+    SKY,
+    VERMILLION,
+    axes_or_new,
+    canvas,
+    fitted_to,
+    heading,
+    styled,
+)
 
 ORDER = ("corner_frequency", "harmonic_frequency", "harmonic_share", "high_frequency_floor", "coefficient_of_variation")
-MOST, PANEL = 6, 1.25  # quantities, inches
+MOST, PAIRS = 6, 4  # quantities that are drawn; those of which all pairs have room in a column
 CUT = (0.002, 0.998)
 BANDS = ((0.025, 0.975, 0.18), (0.25, 0.75, 0.35))
 MASS = (0.95, 0.8, 0.5)
@@ -31,18 +46,20 @@ def chosen(found: Any) -> list[str]:
 def posterior(found: Any, ax: Axes | None = None) -> Figure | SubFigure:
     """Draws the posterior `found` of what the data determine: densities, and 50, 80 and 95 % regions of pairs.
 
+    Of four quantities at most, so that it is legible in a column of 85 mm. `found.summary()` has all.
+
     **Raises:** `NotMixedError` if the chains did not mix; `ValueError` if the data determine nothing.
     """
     if not found.success:
         raise NotMixedError(f"{found.title}: {found.message}")
-    names = chosen(found)
+    names = chosen(found)[:PAIRS]
     if not names:
         raise ValueError(f"{found.title}: the data determine no quantity, so there is nothing to draw")
     count = len(names)
     draws = [found.quantities[name].ravel() for name in names]
     limits = [np.quantile(x, CUT) for x in draws]
-    size = max(PANEL * count + 0.6, 3.4)
-    fig = canvas(ax, (size, size))
+    size = COLUMN if count > 2 else 3.0
+    fig = canvas(ax, (size, size), w_pad=0.02, h_pad=0.02, wspace=0.02, hspace=0.02)
     axes = fig.subplots(count, count, squeeze=False)
     for i in range(count):
         for j in range(count):
@@ -51,7 +68,7 @@ def posterior(found: Any, ax: Axes | None = None) -> Figure | SubFigure:
                 panel.remove()
                 continue
             panel.set_xlim(*limits[j])
-            panel.locator_params(nbins=3)
+            panel.locator_params(nbins=2)
             panel.tick_params(labelbottom=i == count - 1, labelleft=j == 0 and i > 0)
             if i == j:
                 _density(panel, draws[i])
@@ -59,18 +76,16 @@ def posterior(found: Any, ax: Axes | None = None) -> Figure | SubFigure:
                 _pair(panel, draws[j], draws[i], limits[j], limits[i])
             if i == count - 1:
                 panel.set_xlabel(_label(found, names[j]))
-                panel.tick_params(axis="x", rotation=30)
+                panel.tick_params(axis="x", rotation=90)
             if j == 0 and i > 0:
                 panel.set_ylabel(_label(found, names[i]))
     fig.align_labels()
-    fig.suptitle(f"Posterior: {found.title} ({found.model})", x=0.01, ha="left", fontsize=9, fontweight="bold")
+    heading(fig, found.title)
     return fig
 
 
 def _label(found: Any, name: str) -> str:
-    words = name.replace("_", " ")
-    words = words if len(words) < 15 else words.replace(" ", "\n", 1)
-    return words + ("" if found.unit(name) == "1" else f" ({found.unit(name)})")
+    return textwrap.fill(in_words(name, found.unit(name)), 12, break_long_words=False)
 
 
 def _density(ax: Axes, x: np.ndarray) -> None:
@@ -80,7 +95,6 @@ def _density(ax: Axes, x: np.ndarray) -> None:
     ax.axvspan(float(low), float(high), color=BLUE, alpha=0.08, lw=0)
     ax.set_yticks([])
     ax.spines["left"].set_visible(False)
-    ax.set_title(f"{middle:.3g}\n{low:.3g} to {high:.3g}", fontsize=6.5, fontweight="normal", loc="center", pad=3)
 
 
 def _pair(ax: Axes, x: np.ndarray, y: np.ndarray, wide: np.ndarray, high: np.ndarray) -> None:
@@ -94,7 +108,7 @@ def _pair(ax: Axes, x: np.ndarray, y: np.ndarray, wide: np.ndarray, high: np.nda
     mid = 0.5 * (xs[1:] + xs[:-1]), 0.5 * (ys[1:] + ys[:-1])
     ax.contourf(*mid, smooth.T, levels=[*levels, smooth.max() * 1.01], colors=["#cfe6f5", SKY, BLUE][-len(levels) :])
     ax.set_ylim(*high)
-    ax.locator_params(nbins=3)
+    ax.locator_params(nbins=2)
 
 
 @styled
@@ -117,8 +131,8 @@ def predictive(found: Any, ax: Axes | None = None, target: str | None = None) ->
     ax.plot(f, np.asarray(part.target.proportional_power), color=VERMILLION, marker="o", ms=3, lw=0, label="target")
     ax.set_yscale("log")
     ax.set(xlabel="Frequency (Hz)", ylabel=PROPORTIONAL, xlim=(0, f[-1] + f[0]))
-    ax.set_title(f"{part.target.name}: posterior-predictive χ², p = {part.replicates.p_value:.2g}")
-    ax.legend(frameon=False, ncols=2)
+    ax.set_title(f"{part.target.name}, p = {part.replicates.p_value:.2g}", parse_math=False)
+    ax.legend(frameon=False, loc="lower left")
     return ax
 
 
@@ -126,21 +140,18 @@ def predictive(found: Any, ax: Axes | None = None, target: str | None = None) ->
 def chains(found: Any, ax: Axes | None = None) -> Figure | SubFigure:
     """Draws every chain of the posterior `found` over its draws, also of chains that did not mix."""
     names = chosen(found) or list(found.samples)[:MOST]
-    fig = canvas(ax, (6.5, 1.1 * len(names) + 0.5))
+    fig = canvas(ax, (COLUMN, 0.9 * len(names)))
     axes = fig.subplots(len(names), 1, sharex=True, squeeze=False)
     for panel, name in zip(axes[:, 0], names, strict=True):
         for number, chain in enumerate(found.quantities[name]):
             panel.plot(chain, lw=0.3, color=PALETTE[number % len(PALETTE)])
         r_hat, bulk, _ = found.diagnostics[name]
-        panel.set_title(
-            f"{name.replace('_', ' ')}: R-hat {r_hat:.3f}, effective sample size {bulk:.0f}", fontweight="normal"
-        )
-        panel.set_ylabel("(ratio)" if found.unit(name) == "1" else f"({found.unit(name)})")
+        panel.set_title(in_words(name, found.unit(name)), pad=3.0, weight="normal", parse_math=False)
+        panel.set_title(f"R-hat {r_hat:.3f}, ESS {bulk:.0f}", pad=3.0, weight="normal", loc="right")
+        panel.set_ylabel("ratio" if found.unit(name) in ("", "1") else unit_in_print(found.unit(name)))
         for draw in np.unique(np.nonzero(found.chains.diverging)[1]):
             panel.axvline(draw, color=ORANGE, lw=0.5, zorder=0)
     axes[-1, 0].set_xlabel("Draw")
-    if not found.success:
-        fig.suptitle(f"NOT MIXED: {found.message}", x=0.01, ha="left", fontsize=7.5, color=VERMILLION, wrap=True)
-    else:
-        fig.suptitle(f"{found.title}: chains", x=0.01, ha="left", fontsize=9, fontweight="bold")
+    fig.align_ylabels()
+    fitted_to(fig, 0.9 * len(names), heading(fig, found.title, bad="" if found.success else "Not mixed"))
     return fig

@@ -7,7 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure, SubFigure
 
 from ._spectra import _finite, _mean_and_band, spectrum
-from ._style import axes_or_new, canvas, legend, output_label, styled
+from ._style import COLUMN, axes_or_new, canvas, fitted_to, heading, key, legend, output_label, styled, without_legend
 
 
 @styled
@@ -45,22 +45,22 @@ def simulation(runs: Any, ax: Axes | None = None) -> Figure | SubFigure:
 
     **Arguments:** `runs`, one seed or an ensemble; `ax`, its place. **Returns:** the figure.
     """
-    figure = canvas(ax, (9.0, 5.6))
-    axes = figure.subplots(2, 2)
-    task = runs.task
-    trajectory(runs, axes[0, 0])
-    trajectory(runs, axes[0, 1], window=runs.analysed)
-    spectra = runs.spectrum()
-    spectrum(spectra, axes[1, 0])
-    spectrum(spectra, axes[1, 1], log=True)
-    titles = ("Whole run", "Analysed window", "Spectrum, linear", "Spectrum, logarithmic")
-    for panel in axes[:, 1]:
-        if panel.get_legend() is not None:  # the same as to the left
-            panel.get_legend().remove()
-    for panel, title in zip(axes.flat, titles, strict=True):
-        panel.set_title(title)
-    count = np.atleast_1d(runs.seeds).size
-    figure.suptitle(
-        f"{type(task).__name__}, {type(task.noise).__name__}, {count} seed{'s' * (count > 1)}", x=0.01, ha="left"
+    heights = (1.4, 1.4, 1.9)
+    figure = canvas(ax, (COLUMN, sum(heights)))
+    grid = figure.add_gridspec(3, 2, height_ratios=heights)
+    task, spectra = runs.task, runs.spectrum()
+    panels = (
+        trajectory(runs, figure.add_subplot(grid[0, :])),
+        trajectory(runs, figure.add_subplot(grid[1, :]), window=runs.analysed),
+        spectrum(spectra, figure.add_subplot(grid[2, 0])),
+        spectrum(spectra, figure.add_subplot(grid[2, 1]), log=True),
     )
+    titles = ("Whole run", "Analysed window", "Spectrum, linear", "Spectrum, logarithmic")
+    for panel, title in zip(panels, titles, strict=True):
+        without_legend(panel).set_title(title)
+    for panel in panels[2:]:
+        panel.set_ylabel("Power (fraction per bin)")
+    count = np.atleast_1d(runs.seeds).size
+    words = f"{type(task).__name__}, {count} seed{'s' * (count > 1)}"
+    fitted_to(figure, sum(heights), heading(figure, words) + key(figure))
     return figure

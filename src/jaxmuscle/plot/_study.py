@@ -7,9 +7,9 @@ from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure, SubFigure
 
-from ._style import PALETTE, PROPORTIONAL, canvas, density_unit, frequency_axis, styled
+from ._style import COLUMN, PALETTE, canvas, density_unit, frequency_axis, styled
 
-WIDTH, HEIGHT, ACROSS = 3.6, 3.0, 3  # inches, inches, panels
+HEIGHT, ACROSS = 2.2, 2  # inches, panels beside each other
 
 
 @styled
@@ -26,24 +26,27 @@ def study(study: Any, ax: Axes | None = None, *, proportional: bool = True) -> F
     if not proportional and (len(units) > 1 or any(cell.target.trial_power is None for cell in cells)):
         raise ValueError("proportional = False: power is known where everybody has at least two trials, in the same unit")
     down, across = -(-len(study.conditions) // ACROSS), min(len(study.conditions), ACROSS)
-    fig = canvas(ax, (WIDTH * max(across, 1.3), HEIGHT * down))
+    fig = canvas(ax, (COLUMN, HEIGHT * down))
     axes = fig.subplots(down, across, squeeze=False, sharex=True, sharey=True)
     for panel, condition in zip(axes.flat, study.conditions, strict=False):
         for number, group in enumerate(study.groups):
             here = [cell.target for cell in cells if (cell.group, cell.condition) == (group, condition)]
             if here:
-                _group(panel, here, PALETTE[number % len(PALETTE)], group, proportional)
-        panel.set_title(condition)
+                group_spectra(panel, here, PALETTE[number % len(PALETTE)], group, proportional)
+        panel.set_title(condition, parse_math=False)
         frequency_axis(panel, log=True)
         panel.legend(loc="lower left")
+        panel.label_outer()
     for panel in axes.flat[len(study.conditions) :]:
         panel.remove()
     unit = next(iter(units)) or "?"
-    axes[0, 0].set_ylabel(PROPORTIONAL if proportional else f"Power ({density_unit(unit)})")
+    for row in axes:
+        row[0].set_ylabel("Power (fraction per bin)" if proportional else f"Power ({density_unit(unit)})")
     return fig
 
 
-def _group(ax: Axes, targets: list[Any], colour: str, group: str, proportional: bool) -> None:
+def group_spectra(ax: Axes, targets: list[Any], colour: str, group: str, proportional: bool) -> None:
+    """Spectra of the people of a group (thin), their geometric mean and its standard error (thick)."""
     rows = [target.proportional_power if proportional else _power(target) for target in targets]
     for target, row in zip(targets, rows, strict=True):
         ax.plot(target.frequency, row, color=colour, lw=0.5, alpha=0.45, zorder=2)

@@ -11,6 +11,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure, SubFigure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
+from jaxmuscle._common.text import printable
+
 # Okabe & Ito 2008, Color Universal Design: told apart with any common form of colour vision.
 BLUE, VERMILLION, GREEN, PURPLE = "#0072B2", "#D55E00", "#009E73", "#CC79A7"
 ORANGE, SKY, BLACK, GREY = "#E69F00", "#56B4E9", "#000000", "#767676"
@@ -25,18 +27,20 @@ STYLE: dict[str, Any] = {
     "axes.linewidth": 0.6,
     "axes.spines.top": False,
     "axes.spines.right": False,
-    "xtick.labelsize": 7.5,
-    "ytick.labelsize": 7.5,
+    "xtick.labelsize": 8.0,
+    "ytick.labelsize": 8.0,
     "xtick.major.width": 0.6,
     "ytick.major.width": 0.6,
-    "legend.fontsize": 7.5,
+    "legend.fontsize": 8.0,
     "legend.facecolor": "white",
     "legend.edgecolor": "none",
     "legend.framealpha": 0.85,
     "lines.linewidth": 1.5,
     "figure.dpi": 160.0,
 }
-SIZE = (4.5, 3.0)
+COLUMN = 4.4  # inches: in a column of 85 mm letters of 8 points are those of 6
+LINE = 0.17  # inches
+SIZE = (COLUMN, 3.0)
 LOCK = threading.RLock()  # pyplot and rcParams are those of all threads
 PROPORTIONAL = "Proportional power (fraction per bin)"
 
@@ -85,6 +89,37 @@ def output_label(name: str, unit: str) -> str:
 
 def density_unit(unit: str) -> str:
     return f"{unit}²/Hz" if unit.isalpha() else f"({unit.replace('^2', '²')})²/Hz"
+
+
+def heading(fig: Figure | SubFigure, words: str, *, bad: str = "") -> int:
+    """What is drawn, and below it in red what forbids to believe it; how many lines."""
+    text = "\n".join(filter(None, (printable(words if len(words) <= 50 else f"{words[:49]}…"), bad)))
+    color = VERMILLION if bad else matplotlib.rcParams["text.color"]
+    fig.suptitle(text, x=0.02, ha="left", size=9, weight="bold", color=color, parse_math=False)
+    return 1 + bool(bad)
+
+
+def key(fig: Figure | SubFigure, columns: int = 2) -> int:
+    """One legend below all panels that have none, in which each name stands once; how many lines."""
+    named = {label: handle for ax in fig.axes if ax.get_legend() is None
+             for handle, label in zip(*ax.get_legend_handles_labels(), strict=True)}  # fmt: skip
+    if named:
+        fig.legend(named.values(), named, loc="outside lower center", ncols=columns, frameon=False, columnspacing=1.2)
+    return -(-len(named) // columns)
+
+
+def fitted_to(fig: Figure | SubFigure, panels: float, lines: int) -> None:
+    """A figure of its own becomes as high as its panels and so many lines of words need."""
+    if isinstance(fig, Figure):
+        fig.set_size_inches(COLUMN, panels + 0.3 + LINE * lines)
+
+
+def without_legend(ax: Axes) -> Axes:
+    """The axes, whose names stand elsewhere."""
+    own = ax.get_legend()
+    if own is not None:
+        own.remove()
+    return ax
 
 
 def axes_or_new(ax: Axes | None) -> Axes:

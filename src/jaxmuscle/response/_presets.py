@@ -21,7 +21,7 @@ from jaxmuscle.model._tasks import AbstractTask
 from ._scaling import at_force
 
 FORMAT = 2  # of a preset; 1 may leave out what a task does not have
-FIT_FORMATS = (2, 3)  # of a fit.json; 2 may
+FIT_FORMATS = (2, 3, 4)  # of a fit.json; 2 may
 
 
 def load_preset(name_or_path: str | Path) -> AbstractTask:

@@ -1,0 +1,219 @@
+"""report.html of a fit, a cohort, a study and a posterior: verdict, numbers, figures, what to do, how it was made."""
+
+import shlex
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from jaxmuscle._common import pages
+from jaxmuscle._common.pages import Html
+
+if TYPE_CHECKING:
+    from jaxmuscle.fits import CohortResult, FitResult, StudyResult
+    from jaxmuscle.uncertainty import Posterior
+
+REPORT = "report.html"
+STATE = 4  # the column of a fit's card that says whether the data determine a number
+PARAMETERS = ("name", "value", "95 % interval", "unit", "what it is")
+FIGURES = {
+    "fit": "Points: target, with the range of one standard deviation. Blue line: fit. Bars: residuals, up where the target "
+    "lies above the fit; the grey bands are one and two standard deviations.",
+    "stiffness": "Points: measured dynamic stiffness with two standard errors either way. Blue line: fit.",
+    "cohort": "What the data of at least half of the targets determine, with standard errors. Spectra: every target (thin), "
+    "the geometric mean of each group with its standard error (thick).",
+    "spectra": "Spectra of all people (thin), and the geometric mean of each group with its standard error (thick).",
+    "corner": "What the data determine. Diagonal: density, median and 95 % interval. Below it: regions of 50, 80 and 95 %.",
+    "predictive": "The target among spectra that the posterior predicts.",
+    "chains": "Every chain over its draws.",
+}
+
+
+def fit_report(result: "FitResult", figure: Any, folder: Path) -> None:
+    """Write report.html of a fit of one target."""
+    card = result.summary()
+    rows = {state: [row[:STATE] + row[STATE + 1 :] for row in card.rows if row[STATE] == state]
+            for state in ("determined", "not determined", "fixed")}  # fmt: skip
+    body = [
+        _verdict(card.heading, good=False if not result.success else result.adequate),
+        pages.heading("What the data determine"),
+        pages.table(PARAMETERS, rows["determined"]) if rows["determined"] else pages.paragraph("Nothing."),
+        pages.picture(figure, FIGURES["fit" if result.only.fitted.size else "stiffness"]),
+        pages.heading("What it means"),
+        pages.items(card.remarks),
+        *([pages.paragraph("The data do not notice if:"), pages.items(result.undetermined)] if result.undetermined else []),
+        pages.heading("What to do next"),
+        pages.items(_after_a_fit(result, folder / "fit.json")),
+    ]
+    if rows["not determined"]:
+        body += [pages.heading("What the data do not determine"),
+                 pages.paragraph("The prior keeps these near their defaults. Do not interpret them."),
+                 pages.table(PARAMETERS, rows["not determined"])]  # fmt: skip
+    if rows["fixed"]:
+        body += [pages.heading("What was fixed"), pages.table(PARAMETERS, rows["fixed"])]
+    body += _data(result.targets)
+    body += _how(result.settings | {"method": result.method, "seed": result.seed}, result.versions)
+    pages.write_page(folder / REPORT, result.title, body)
+
+
+def cohort_report(cohort: "CohortResult", figure: Any | None, folder: Path, places: dict[str, Path]) -> None:
+    """Write report.html of a cohort."""
+    numbers = [
+        (row["target"], row["group"], row["quantity"], f"{row['value']:.3g} ± {row['stderr']:.2g}", _unit(row["unit"]))
+        for row in cohort.table()
+        if row["stderr"] is not None
+    ]
+    card = cohort.summary()
+    body = [
+        _verdict(cohort.verdict, good=cohort.success and not any(r.adequate is False for r in cohort.results.values())),
+        pages.table(card.columns, card.rows),
+        *([pages.picture(figure, FIGURES["cohort"])] if figure is not None else []),
+    ]
+    differences = [
+        (d.quantity, f"{d.b} - {d.a}", f"{d.difference:.3g}", f"{d.low:.3g} to {d.high:.3g}", _unit(d.unit))
+        for d in cohort.differences()
+    ]
+    if differences:
+        columns = ("quantity", "groups", "difference of means", "95 % interval", "unit")
+        body += [pages.heading("What differs between groups"), pages.table(columns, differences)]
+    body += [
+        pages.heading("What the data determine"),
+        pages.table(("target", "group", "quantity", "value", "unit"), numbers) if numbers else pages.paragraph("Nothing."),
+        pages.heading("What to do next"),
+        pages.items((
+            "Fit a target alone for the checks that a cohort leaves out: `jaxmuscle fit TARGET`.",
+            "Do not interpret the numbers of a target that the model does not describe.",
+            "All numbers are in cohort.csv; each fit is in "
+            + ", ".join(f"`{place / 'fit.json'}`" for place in places.values()) + ".",
+        )),
+    ]  # fmt: skip
+    first = next(iter(cohort.results.values()))
+    body += _how(first.settings | {"method": first.method, "seed": first.seed}, first.versions)
+    pages.write_page(folder / REPORT, f"{len(cohort.results)} targets", body)
+
+
+def study_report(study: "StudyResult", folder: Path) -> None:
+    """Write report.html of a study."""
+    import matplotlib.pyplot as plt
+
+    figure: Any = study.plot()
+    shown = pages.picture(figure, FIGURES["spectra"])
+    plt.close(figure)
+    differences = sorted(study.differences(), key=lambda d: (d.p_corrected, d.p))
+    rows = [(d.quantity, d.where, f"{d.b} - {d.a}", f"{d.difference:.3g}", f"{d.low:.3g} to {d.high:.3g}", _unit(d.unit),
+             f"{d.p:.2g}", "" if d.p_corrected is None else f"{d.p_corrected:.2g}") for d in differences]  # fmt: skip
+    columns = ("quantity", "condition", "comparison", "difference", "interval", "unit", "p", "p corrected")
+    fits = [(name, result.verdict) for name, result in study.cohort.results.items()]
+    fits += [(name, f"not fitted: {why}") for name, why in study.cohort.failed.items()]
+    body = [
+        _verdict(study.cohort.verdict, good=study.success),
+        pages.items(line.strip() for line in str(study).splitlines()[:3]),
+        shown,
+        pages.heading("What differs"),
+        pages.table(columns, rows) if rows else pages.paragraph("Nothing could be compared."),
+        pages.heading("The fits"),
+        pages.table(("person and condition", "in words"), fits),
+        pages.heading("For your methods section"),
+        pages.paragraph(study.methods()),
+        pages.heading("What to do next"),
+        pages.items((
+            "Look at people whom the model does not describe, before you interpret a difference.",
+            "Report p corrected, and how many people were left out of each comparison.",
+            "All numbers are in people.csv and differences.csv.",
+        )),
+        *_how(study.options | {"source": study.source}, next(iter(study.cohort.results.values())).versions),
+    ]  # fmt: skip
+    pages.write_page(folder / REPORT, "Study", body)
+
+
+def posterior_report(found: "Posterior", figures: dict[str, Any], folder: Path) -> None:
+    """Write report.html of a posterior."""
+    body = [_verdict(found.message, good=found.success)]
+    if found.success:
+        summary = found.summary()
+        columns = ("name", "median", "95 % interval", "unit", "R-hat", "effective sample size")
+        rows: dict[bool, list[tuple[str, ...]]] = {True: [], False: []}
+        for name in summary.rows:
+            told = summary[name]
+            unit, size = _unit(summary.units[name]), min(told["ess_bulk"], told["ess_tail"])
+            rows[name in found.determined].append(
+                (name, f"{told['median']:.4g}", f"{told['low']:.4g} to {told['high']:.4g}", unit,
+                 f"{told['r_hat']:.3f}", f"{size:.0f}")
+            )  # fmt: skip
+        body += [pages.heading("What the data determine"), pages.table(columns, rows[True])]
+        body += _pictures(figures)
+        body += [pages.heading("What the data do not determine"),
+                 pages.paragraph("The prior keeps these where they are. Do not interpret them."),
+                 pages.table(columns, rows[False])] if rows[False] else []  # fmt: skip
+        after = (
+            "Report medians with their 95 % intervals, R-hat and the effective sample sizes.",
+            "All draws are in posterior.nc: `arviz.from_netcdf` reads it.",
+        )
+    else:
+        body += _pictures(figures)
+        after = (
+            "Do not use these draws.",
+            "Draw longer: `--warmup 2000 --draws 4000`.",
+            "Or fix what the data do not determine: `--fix NAME=VALUE`.",
+        )
+    body += [pages.heading("What it means"), pages.code(str(found)), pages.heading("What to do next"), pages.items(after)]
+    body += _data({name: part.target for name, part in found.parts.items()})
+    body += _how(found.settings | {"seed": found.seed}, found.versions)
+    pages.write_page(folder / REPORT, f"Posterior of {found.title}", body)
+
+
+def _unit(unit: str) -> str:
+    return "" if unit == "1" else unit
+
+
+def _pictures(figures: dict[str, Any]) -> list[Html]:
+    return [pages.picture(figure, FIGURES[name], pixels=name == "chains") for name, figure in figures.items()]
+
+
+def _verdict(words: str, *, good: bool | None) -> Html:
+    said = words[:1].upper() + words[1:]
+    kind = "open" if good is None else "yes" if good else "no"
+    return pages.paragraph(said if said.endswith(".") else f"{said}.", f"verdict {kind}")
+
+
+def _after_a_fit(result: "FitResult", path: Path) -> list[str]:
+    """What helps in this case, with the command."""
+    if not result.success:
+        return [
+            "Do not use these numbers.",
+            "Search from more starts: `--starts 400`.",
+            "Or leave less to the search: `--fix NAME=VALUE`, `--free NAMES`.",
+        ]
+    if result.adequate is None:
+        return [
+            "Say how much the powers scatter: `--segments N`, the number of Welch segments that were averaged.",
+            "Then the fit can be judged.",
+        ]
+    if not result.adequate:
+        return [
+            "Look at the residuals: red bars are where the model misses the data.",
+            f"Try other noises: `jaxmuscle compare {shlex.quote(result.title)}`.",
+            "Look for drift and tremor in the recording: `jaxmuscle analyse RECORDING`.",
+            "Do not interpret the parameters before the model describes the data.",
+        ]
+    place = shlex.quote(str(path))
+    return [
+        f"How sure is each number? `jaxmuscle posterior {place}` draws from the posterior.",
+        f"Move the parameters yourself: `jaxmuscle explore {place}`.",
+        f"What should you measure to know the rest? In Python: `jm.identifiability(jm.load_result({str(path)!r}))`.",
+        'In a paper, give the numbers under "What the data determine" with their intervals.',
+        "Name those that the data do not determine.",
+    ]
+
+
+def _data(targets: dict[str, Any]) -> list[Html]:
+    return [pages.heading("The data"), *(pages.code(str(target)) for target in targets.values())]
+
+
+def _how(settings: dict[str, Any], versions: dict[str, str]) -> list[Html]:
+    """The command, settings and versions."""
+    return [
+        pages.heading("To make it again"),
+        pages.code(shlex.join(["jaxmuscle", *sys.argv[1:]])),
+        pages.settings_table(settings),
+        pages.paragraph("Versions: " + ", ".join(f"{name} {number}" for name, number in versions.items())),
+    ]

@@ -1,0 +1,67 @@
+"""What the parts of the model hold of the fitted power: in the figure of a fit, and as a figure of its own."""
+
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+
+from jaxmuscle._common.text import choices
+
+from ._spectra import target as draw_target
+from ._style import BLUE, GREEN, ORANGE, PURPLE, SKY, axes_or_new, styled
+
+PARTS = {"floor": ("0.75", "floor"), "relaxation": (SKY, "relaxation"), "harmonic": (ORANGE, "harmonic"),
+         "tremor": (GREEN, "tremor"), "resonance_2": (PURPLE, "second resonance")}  # fmt: skip
+LEAST = 1e-4  # share of the power below which a part is not drawn
+DECADE = 10.0  # by which a part may lie below the spectrum to be seen
+
+
+def parts_of_power(ax: Axes, part: Any, *, log: bool, named: bool = True) -> None:
+    """One area upon the other, which add up to the fit; over a logarithmic axis a line for each."""
+    frequency, fitted = np.asarray(part.frequency_hz), np.asarray(part.fitted)
+    below = np.zeros(len(fitted))
+    for name, (color, words) in PARTS.items():
+        power = fitted * np.maximum(part.components.get(name, 0.0), 0.0)
+        total = float(np.sum(power))
+        if not total > LEAST:
+            continue
+        label = f"{words}, {'<1' if total < 0.01 else f'{100 * total:.0f}'} % of power" if named else None
+        if log:
+            ax.plot(frequency, np.where(power > 0, power, np.nan), color=color, lw=1.0, zorder=3, label=label)
+            continue
+        ax.fill_between(frequency, below, below + power, color=color, alpha=0.7, lw=0, zorder=2, label=label)
+        below = below + power
+
+
+@styled
+def components(result: Any, ax: Axes | None = None, target: str | None = None, *, log: bool = True) -> Axes:
+    """Draws what the parts of the model hold of the fitted power: they add up to the fit.
+
+    The floor is from noise on the passive tissue, the relaxation from noise on the active one. Harmonic, tremor and second
+    resonance are drawn where the model has them.
+
+    **Arguments:** `result`, what `jaxmuscle.fit` returns; `ax`, or a new figure; `target`, which of several; `log`, both
+    axes logarithmic with a line for each part, else areas upon each other. **Returns:** the axes.
+
+    **Raises:** `ValueError` for an unknown target, and where the parts are not known (no spectrum, or no linear response).
+    """
+    if target is not None and target not in result.parts:
+        raise ValueError(f"target = {target!r}: {choices(target, result.parts)}")
+    if target is None and len(result.parts) > 1:
+        raise ValueError(f"a fit of several targets: give target= one of {', '.join(result.parts)}")
+    part = next(iter(result.parts.values())) if target is None else result.parts[target]
+    if not part.components:
+        raise ValueError(f"{part.target.name}: the parts of the power are not known: the fit has no linear response, or the "
+                         "target no spectrum")  # fmt: skip
+    ax = axes_or_new(ax)
+    draw_target(part.target, ax, log=log)
+    dots, fitted = ax.lines[0], np.asarray(part.fitted)
+    dots.set(label="target", linewidth=0.0)
+    ax.plot(part.frequency_hz, fitted, color=BLUE, label="fit", zorder=4)
+    parts_of_power(ax, part, log=log)
+    if log:
+        seen = np.concatenate([fitted, part.target.proportional_power])
+        ax.set_ylim(seen[seen > 0].min() / DECADE, 1.5 * seen.max())
+    ax.set_title(part.target.name, parse_math=False)
+    ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.2), ncols=2, frameon=False, columnspacing=1.2)
+    return ax

@@ -1,0 +1,115 @@
+"""report.html: what the commands say in it, in which order, and that names out of files stay words."""
+
+import sys
+from types import SimpleNamespace
+
+import matplotlib.pyplot as plt
+import pytest
+from test_html import HOSTILE, Seen
+from test_result import POWER, failed_result, made_result
+from test_study import made_study
+
+import jaxmuscle as jm
+from jaxmuscle.commands import cohort as cohort_command
+from jaxmuscle.commands.console import write_fit
+from jaxmuscle.commands.reports import fit_report, posterior_report, study_report
+
+
+@pytest.fixture(autouse=True)
+def closed(monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["jaxmuscle", "fit", HOSTILE, "--out", "here"])
+    yield
+    plt.close("all")
+
+
+def told(folder):
+    """The words of the report, and its elements."""
+    seen = Seen((folder / "report.html").read_text(encoding="utf-8"))
+    assert not {"script", "iframe", "a", "link"} & {tag for tag, _ in seen.elements}
+    assert not [name for _, given in seen.elements for name in given if name.startswith("on")]
+    assert all(given["src"].startswith("data:image/") for _, given in seen.elements if "src" in given)
+    return " | ".join(word for word in seen.words if word.strip()), seen
+
+
+def test_of_a_fit(tmp_path):
+    target = jm.Target(HOSTILE, POWER, segments=[6], notices=[HOSTILE])
+    result = made_result(target=target, notices=(HOSTILE,))
+    files = write_fit(result, tmp_path, ["png"], report=True)
+    assert files == ["fit.json", "fit.png", "spectrum.csv", "report.html"]
+    text, seen = told(tmp_path)
+    assert [text.index(words) for words in ("What the data determine", "What the data do not determine", "What was fixed")] \
+        == sorted(text.index(words) for words in ("What the data determine", "What the data do not determine",
+                                                  "What was fixed"))  # fmt: skip
+    first, second = text.split("What the data do not determine", 1)
+    assert "corner_frequency | 0.333 ± 0.010 | above 0.31 | Hz" in first and "k_w" not in first.split("What it means")[0]
+    assert "k_w" in second and "m_w" in second.split("What was fixed", 1)[1]
+    assert text.count(HOSTILE) >= 4 and "jaxmuscle fit '<script>" in text  # in the shell, too, it is one word
+    assert "dt | 0.0025" in text and "jaxmuscle 0.1, jax 0.8" in text
+    assert sum(tag == "img" for tag, _ in seen.elements) == 1
+    assert write_fit(result, tmp_path) == ["fit.json", "spectrum.csv"] and not (tmp_path / "report.html").exists()
+
+
+ADVICE = {
+    "good": (made_result(), "yes", "jaxmuscle posterior"),
+    "failed": (failed_result(), "no", "Do not use these numbers."),
+    "unknown": (made_result(adequacy=None), "open", "--segments N"),
+}
+
+
+@pytest.mark.parametrize("case", ADVICE)
+def test_what_to_do_depends_on_the_verdict(case, tmp_path):
+    result, kind, words = ADVICE[case]
+    fit_report(result, plt.figure(), tmp_path)
+    text, seen = told(tmp_path)
+    assert words in text.split("What to do next", 1)[1]
+    assert [given["class"] for tag, given in seen.elements if "verdict" in given.get("class", "")] == [f"verdict {kind}"]
+
+
+def test_of_a_cohort(tmp_path):
+    results = {HOSTILE: made_result(target=jm.Target(HOSTILE, POWER, segments=[6])), "b": failed_result()}
+    groups = {HOSTILE: "<b>old</b>", "b": "young"}
+    found = jm.fits.CohortResult(results, groups, {"c": f"no file {HOSTILE}"})
+    cohort_command._write(found, tmp_path, {HOSTILE: tmp_path / "a", "b": tmp_path / "b"}, ["png"])
+    text, _ = told(tmp_path)
+    assert f"{HOSTILE} | <b>old</b> | corner_frequency | 0.333 ± 0.01 | Hz" in text
+    assert f"not fitted: no file {HOSTILE}" in text and "What differs between groups" in text
+    assert not (tmp_path / "a" / "report.html").exists()
+
+
+def test_of_a_study(tmp_path):
+    study = made_study()
+    study_report(study, tmp_path)
+    text, _ = told(tmp_path)
+    smallest = min(study.differences(), key=lambda d: (d.p_corrected, d.p))
+    cells = ("p corrected", smallest.quantity, smallest.where, f"{smallest.b} - {smallest.a}")
+    assert " | ".join(filter(None, cells)) in text  # the clearest first
+    assert study.methods() in text and "people.csv and differences.csv" in text
+
+
+def posterior(success):
+    row = {"median": 1.25, "low": 0.5, "high": 2.0, "r_hat": 1.001, "ess_bulk": 900.0, "ess_tail": 800.0}
+    summary = SimpleNamespace(rows={"k_w": (), "corner_frequency": ()}, units={"k_w": "N/m^3", "corner_frequency": "Hz"})
+
+    class Table(SimpleNamespace):
+        def __getitem__(self, name):
+            return row
+
+    target = jm.Target(HOSTILE, POWER, segments=[6])
+    return SimpleNamespace(
+        success=success, message="4 chains mixed" if success else "R-hat 1.4", title=HOSTILE, settings={"chains": 4}, seed=1,
+        versions={"jaxmuscle": "0.1"}, determined=("corner_frequency",), parts={"a": SimpleNamespace(target=target)},
+        summary=lambda: Table(**vars(summary)),
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("success", [True, False])
+def test_of_a_posterior(success, tmp_path):
+    posterior_report(posterior(success), {"chains": plt.figure(figsize=(1, 1))}, tmp_path)
+    text, seen = told(tmp_path)
+    assert f"Posterior of {HOSTILE}" in text
+    if success:
+        first, second = text.split("What the data do not determine")
+        assert "corner_frequency | 1.25 | 0.5 to 2 | Hz | 1.001 | 800" in first and "k_w | 1.25" in second
+    else:
+        assert "Do not use these draws." in text and "corner_frequency |" not in text
+    assert [given["src"][:22] for tag, given in seen.elements if tag == "img"] == ["data:image/png;base64,"]
