@@ -753,7 +753,7 @@ def test_the_command_speaks_json(tmp_path):
     [
         (["--seeds", "0"], "seeds = 0"),
         (["--seeds", "8", "--vary", "k_w=a"], "--vary k_w=a: give a name and numbers"),
-        (["--seeds", "8", "--reduce", "--states"], "--states belongs to a store of trajectories"),
+        (["--seeds", "8", "--reduce", "--states"], "--states keeps trajectories and --reduce throws them away"),
         (["--seeds", "8", "--processes", "2"], "belong together"),
         (["--seeds", "8", "--duration", "0.0031"], "duration = 0.0031 s is not a whole number"),
         (["--seeds", "8", "--threads", "0"], "Invalid value for '--threads'"),  # the rest is typer's
