@@ -8,15 +8,14 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure, SubFigure
 
-from jaxmuscle._common.text import printable
-
 from ._numbers import in_words
 from ._study import group_spectra
-from ._style import BLUE, COLUMN, GREY, PALETTE, canvas, fitted_to, frequency_axis, key, styled
+from ._style import BLUE, COLUMN, GREY, PALETTE, canvas, fitted_to, frequency_axis, key, named, styled
 
 WAYS = ("person", "group", "level")
 HEIGHT, ACROSS, SPECTRA = 1.6, 2, 2.3  # inches, panels, inches
 LABELLED = 12  # people who get a name on the axis
+LONGEST = 20  # letters of it
 SHARE = 0.5  # of the targets that must determine a quantity for it to be drawn
 
 
@@ -113,7 +112,7 @@ def _panel(ax: Axes, rows: list[dict[str, Any]], people: list[str], groups: list
         ax.errorbar(place, value, error, fmt="o", markersize=3.5, capsize=2, linewidth=1, color=colour, label=group or None)
     ax.set_ylabel(textwrap.fill(in_words(rows[0]["quantity"], rows[0]["unit"]), 18))
     if by == "group":
-        ax.set_xticks(range(len(groups)), [printable(group) or "all" for group in groups])
+        ax.set_xticks(range(len(groups)), [named(group, LONGEST) or "all" for group in groups])
         ax.set_xlim(-0.6, len(groups) - 0.4)
     elif by == "level":
         ax.set_xlabel("Level (% MVC)")
@@ -121,8 +120,7 @@ def _panel(ax: Axes, rows: list[dict[str, Any]], people: list[str], groups: list
         ax.set_xlim(-0.5, len(people) - 0.5)
         if len(people) <= LABELLED:
             turned = 35 if len(people) <= 6 else 60
-            ax.set_xticks(
-                range(len(people)), [printable(name) for name in people], rotation=turned, ha="right", rotation_mode="anchor"
-            )
+            labels = [named(name, LONGEST) for name in people]
+            ax.set_xticks(range(len(people)), labels, rotation=turned, ha="right", rotation_mode="anchor")
         else:
             ax.set_xlabel("Target number")

@@ -26,6 +26,7 @@ from ._style import (
     fitted_to,
     heading,
     key,
+    named,
     output_label,
     styled,
     without_legend,
@@ -59,7 +60,7 @@ def fit(result: Any, ax: Axes | None = None) -> Figure | SubFigure:
 def _title(fig: Figure | SubFigure, result: Any) -> int:
     """The target's name, and in red whatever forbids to believe the fit; how many lines."""
     name = ", ".join(result.parts) if len(result.parts) > 1 else result.target.name
-    name = name if len(name) <= 50 else f"{name[:49]}…"
+    name = named(name, 50)
     if any(part.target.provenance == "reconstructed" for part in result.parts.values()):
         name += " (reconstructed)"
     bad = "Not fitted" if not result.success else "Does not describe the data" if result.adequate is False else ""

@@ -91,9 +91,15 @@ def density_unit(unit: str) -> str:
     return f"{unit}²/Hz" if unit.isalpha() else f"({unit.replace('^2', '²')})²/Hz"
 
 
+def named(name: str, most: int) -> str:
+    """A name from a file as it is drawn: in one line, and cut where it is long."""
+    shown = printable(name)
+    return shown if len(shown) <= most else f"{shown[: most - 1]}…"
+
+
 def heading(fig: Figure | SubFigure, words: str, *, bad: str = "") -> int:
     """What is drawn, and below it in red what forbids to believe it; how many lines."""
-    text = "\n".join(filter(None, (printable(words if len(words) <= 50 else f"{words[:49]}…"), bad)))
+    text = "\n".join(filter(None, (named(words, 50), bad)))
     color = VERMILLION if bad else matplotlib.rcParams["text.color"]
     fig.suptitle(text, x=0.02, ha="left", size=9, weight="bold", color=color, parse_math=False)
     return 1 + bool(bad)
