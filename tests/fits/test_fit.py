@@ -747,7 +747,7 @@ def test_an_interruption_between_the_search_and_the_answer_keeps_what_the_search
         jm.fit(jm.Isometric(), simple_target(), free=FEW, **QUICK)
     (task,) = caught.value.tasks
     assert {name: task[name] for name in FEW} == {name: caught.value.result.task[name] for name in FEW}
-    assert caught.value.result.success and caught.value.result.check == {}
+    assert caught.value.result.success and "seeds" not in caught.value.result.check
 
 
 def test_an_interruption_before_the_first_step_has_no_result():
