@@ -52,7 +52,7 @@ def compare_noise(
     of the harmonic, "two resonances".
 
     Each model is climbed, in linear response, to the highest of the maxima of its posterior from 64 starting points (16
-    without harmonic). There
+    without harmonic). Half of those of a model with a resonance begin where the best of the poorer ones ended. There
 
         AIC = -2 ln L + 2 p,    p = tr(F (F + Λ)⁻¹),
 
@@ -84,11 +84,12 @@ def compare_noise(
         problems = _setups(carried, target, free, fixed, proper_values(priors), proper_values(bounds), key)
         folds = None if target.segments is None else Folds.of([target], groups)
         found: dict[tuple[str, bool], dict[str, Any]] = {}
-        for number, (noise, problem) in enumerate(problems.items()):
+        for number, (noise, problem) in enumerate(sorted(problems.items(), key=lambda item: RICHER.get(item[0], 0))):
+            known = _poorer(noise, task, found)
             for harmonic in (True, False) if float(problem.parts[0].task["harmonic_amplitude"]) > 0 else (False,):
                 what = f"{noise}, {'with' if harmonic else 'without'} harmonic"
                 tell(what, (number + 0.5 * (not harmonic)) / len(problems))
-                found[noise, harmonic] = _fitted(problem, folds, harmonic=harmonic)
+                found[noise, harmonic] = _fitted(problem, folds, known, harmonic=harmonic)
     sought = any("harmonic_frequency" in problem.coordinates.names for problem in problems.values())
     needed = NEEDED + 2 * np.log(len(target.bins)) * sought
     tasks, fitted = ({model: values.pop(name) for model, values in found.items()} for name in ("task", "fitted"))
@@ -148,9 +149,22 @@ def _of(given: dict[str, Value], names: set[str]) -> dict[str, Value]:
     return {name: value for name, value in given.items() if name in names}
 
 
-def _fitted(problem: FitProblem, folds: Folds | None, *, harmonic: bool) -> dict[str, Any]:
+def _poorer(noise: str, task: AbstractTask, found: Mapping[tuple[str, bool], dict[str, Any]]) -> dict[str, float] | None:
+    """Where the best of the poorer models of the same noise ended; None for a model that has no resonance."""
+    rung = RICHER.get(noise, 0)
+    poorer = [values for (name, _), values in found.items()
+              if RICHER.get(name, 0) < rung and (name in RICHER or NOISES[name] is type(task.noise))]  # fmt: skip
+    if rung < RICHER["tremor"] or not poorer:
+        return None
+    ended = min(poorer, key=lambda values: values["aic"] if np.isfinite(values["aic"]) else np.inf)["task"]
+    return {name: float(ended[name]) for name in ended.parameter_names}
+
+
+def _fitted(
+    problem: FitProblem, folds: Folds | None, known: dict[str, float] | None = None, *, harmonic: bool
+) -> dict[str, Any]:
     """One model at its maximum, with its score."""
-    model, target = Candidate.of(problem, harmonic=harmonic), problem.parts[0].target
+    model, target = Candidate.of(problem, harmonic=harmonic, known=known), problem.parts[0].target
     moving = np.ones((1, len(problem.prior)))
     bins = None if folds is None else masked_bins(target, np.ones((1, len(target.bins))))
     peak = maxima(model, model.starts[None], bins, moving)

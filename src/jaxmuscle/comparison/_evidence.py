@@ -1,6 +1,7 @@
 """One model against one data set or many: highest maximum, effective parameters, and how well it foretells bins left out."""
 
 import dataclasses
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -16,7 +17,7 @@ from jaxmuscle.objective._covariance import effective_parameters
 from jaxmuscle.objective._likelihood import Bins, Likelihood, _precision, without_offsets
 from jaxmuscle.objective._problem import FitProblem
 from jaxmuscle.objective._scoring import Maximum, maximise
-from jaxmuscle.objective._starts import points_about, starting_points
+from jaxmuscle.objective._starts import continued, points_about, starting_points
 from jaxmuscle.response._expected import Moments
 from jaxmuscle.spectra._bin_law import target_law
 
@@ -55,8 +56,11 @@ class Candidate(NamedTuple):
     starts: Float[np.ndarray, "starts free"]
 
     @classmethod
-    def of(cls, problem: FitProblem, *, harmonic: bool) -> "Candidate":
+    def of(cls, problem: FitProblem, *, harmonic: bool, known: Mapping[str, float] | None = None) -> "Candidate":
         """Of a fit, or of the same without harmonic: amplitude zero, whatever the coordinates of amplitude and frequency.
+
+        With `known` values, where a poorer model ended, there are as many starts again that begin from there: with a free
+        resonance the highest maximum is hard to find from the prior's centre.
 
         The data then say nothing about these two, so that they stay at their prior's centre and count as no parameters; the
         compiled programs are those of the model with harmonic.
@@ -68,7 +72,8 @@ class Candidate(NamedTuple):
         wide = harmonic or bool(set(RESONANCE) & set(names))  # a frequency has a maximum at almost every peak
         spread = problem.coordinates.theta(starting_points(problem, SPREAD if wide else PLAIN - RANDOM))
         about = points_about(problem, np.zeros(len(names))) if harmonic else spread[:0]
-        starts = np.concatenate([about, spread, scattered])
+        on = spread[:0] if known is None else problem.coordinates.theta(continued(problem, SPREAD + RANDOM, known))
+        starts = np.concatenate([about, spread, scattered, on])
         if not harmonic:
             starts[:, [n in HARMONIC for n in names]] = 0.0
         return cls(Likelihood.of(problem), problem.prior, starts)

@@ -18,7 +18,7 @@ from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.objective._arguments import FitOptions, Plan
 from jaxmuscle.objective._covariance import effective_parameters
 from jaxmuscle.objective._likelihood import log_marginal, measured_bins
-from jaxmuscle.objective._starts import starting_points
+from jaxmuscle.objective._starts import continued, starting_points
 
 from ._adequacy import ADEQUATE, Endpoint
 from ._checks import Stage
@@ -119,13 +119,10 @@ def _has_line(found: Climbed) -> bool:
 
 def _warm(plan: Plan, best: Climbed) -> Float[np.ndarray, "starts free"]:
     """Starts of a richer model: for the most part what it shares with the best one begins where that ended."""
-    problem, before = plan.problem, best.plan.problem
-    points = np.array(problem.coordinates.theta(starting_points(problem, min(plan.starts, STARTS))))
+    before = best.plan.problem
     (task,) = before.tasks_at(best.ended.seen.theta)
-    for column, name in enumerate(problem.coordinates.names):
-        if name in before.coordinates.names and problem.coordinates.positive[column]:
-            points[: 2 * len(points) // 3, column] = problem.coordinates.theta_of(name, float(task[name]))
-    return problem.coordinates.from_theta(points)
+    known = {name: float(task[name]) for name in before.coordinates.names}
+    return continued(plan.problem, min(plan.starts, STARTS), known)
 
 
 def rung_of(ended: Endpoint, number: int) -> Rung:

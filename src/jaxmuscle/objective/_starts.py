@@ -2,6 +2,7 @@
 
 import itertools
 import math
+from collections.abc import Mapping
 
 import numpy as np
 from jaxtyping import Float
@@ -29,6 +30,15 @@ def starting_points(problem: FitProblem, count: int) -> Float[np.ndarray, "start
         theta[:, coordinates.names.index(name)] = coordinates.theta_of(name, frequencies)
     _spread_resonances(problem, theta)
     return coordinates.from_theta(theta)
+
+
+def continued(problem: FitProblem, count: int, known: Mapping[str, float]) -> Float[np.ndarray, "starts free"]:
+    """Starts of a richer model: in two thirds of them what it shares with a poorer one begins where that ended (`known`)."""
+    points = np.array(problem.coordinates.theta(starting_points(problem, count)))
+    for column, name in enumerate(problem.coordinates.names):
+        if name in known and problem.coordinates.positive[column]:
+            points[: 2 * len(points) // 3, column] = problem.coordinates.theta_of(name, known[name])
+    return problem.coordinates.from_theta(points)
 
 
 def _spread_resonances(problem: FitProblem, theta: Float[np.ndarray, "starts free"]) -> None:
