@@ -231,6 +231,31 @@ def test_without_harmonic_its_power_is_zero(x64):
     assert len(Candidate.of(problem, harmonic=True).starts) >= 32
 
 
+def test_a_richer_model_is_also_sought_from_where_the_best_poorer_one_ended(x64):
+    """From the prior's centre alone a muscle that rings at the tremor's frequency was missed by 100 in AIC."""
+    task, on = jm.Isometric(), functools.partial(jm.on_rung, jm.Isometric())
+    ended = {
+        ("band-limited", True): {"aic": 30.0, "task": task},
+        ("pink", False): {"aic": -50.0, "task": with_noise(task, "pink")},  # another noise than the tremor's
+        ("activation", True): {"aic": 3.0, "task": on(1).replace(c_w=3.0, activation_time=0.2)},
+        ("activation", False): {"aic": 4.0, "task": on(1)},
+        ("two resonances", False): {"aic": 0.0, "task": on(3)},  # richer
+    }
+    known = _compare._poorer("tremor", task, ended)
+    assert known["c_w"] == 3.0 and known["activation_time"] == 0.2 and "resonance_frequency" not in known
+    assert _compare._poorer("activation", task, ended) is None is _compare._poorer("tremor", task, {})
+    free = ("c_w", "activation_time", "resonance_amplitude", "resonance_frequency")
+    problem = planned(on(2), target_of(on(2)), FitOptions(free=free)).problem
+    plain = Candidate.of(problem, harmonic=False).starts
+    starts = Candidate.of(problem, harmonic=False, known=known).starts
+    np.testing.assert_array_equal(starts[: len(plain)], plain)
+    values = problem.coordinates.values_of(starts[len(plain) :])
+    from_there = np.isclose(values[:, 0], 3.0) & np.isclose(values[:, 1], 0.2)
+    assert from_there.sum() >= len(plain) // 2 and not from_there.all()
+    frequencies = values[from_there, 3]
+    assert frequencies.min() < 2 and frequencies.max() > 10  # over the band of the target
+
+
 # --- its words
 
 
@@ -291,6 +316,9 @@ def test_six_and_the_same_sign_are_needed():
     assert decided(("a", "b"), Evidence(0.0, up), Evidence(6.0, down), needed=12.8).winner is None
     assert decided(("a", "b"), Evidence(0.0, None), Evidence(6.0, None)).winner == "a"
     assert decided(("a", "b"), Evidence(np.nan, up), Evidence(6.0, down)).winner is None
+    open_ = decided(("a", "b"), Evidence(0.0, up), Evidence(60.0, down, settled=False))
+    assert open_.winner is None and str(open_) == (
+        "a and b cannot be told apart: the search of b did not come to its end")  # fmt: skip
 
 
 def test_verdict_in_words():

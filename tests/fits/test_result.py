@@ -227,14 +227,14 @@ def test_text_shows_what_is_known_and_what_is_not():
         "c_w 6.667 ± 0.013",  # 16.667 N over a mean of 2.5 N
         "corner_frequency 0.333 ± 0.010 above 0.31 Hz",
         "products and ratios known roughly: k_w / c_w",
-        "not determined (values near the defaults: do not interpret them): k_w",
+        "not determined: do not interpret these values: k_w",
         "the data leave open: - stiffness and damping can all be multiplied by one number",
         "stiffness and damping are stated per newton of mean force",
         "note: a notice",
         "chi2 per bin 0.90",
     ):
         assert part in words
-    assert words.index("determined by the data") < words.index("not determined (values near")
+    assert words.index("determined by the data") < words.index("not determined: do not")
     assert str(failed_result()).startswith("Not fitted: no start has a finite spectrum")
 
 
@@ -248,6 +248,7 @@ def test_a_fit_that_misses_the_data_says_so_first():
     for part in (
         f"errors are widened by a factor of {np.sqrt(145 / 25):.2g}",
         "what to do: do not interpret",
+        "would be determined if the model held:",
     ):
         assert part in words
     unknown = made_result(adequacy=None, chi2_per_bin=None)

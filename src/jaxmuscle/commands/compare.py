@@ -1,14 +1,14 @@
 """`jaxmuscle compare`."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 import jaxmuscle as jm
 from jaxmuscle._common.progress import told
 
-from .console import CONVERGED, NOT_CONVERGED, aim_of, csv_text, out, plain, record, reporting, writable
+from .console import CONVERGED, NOT_CONVERGED, aim_of, aimed, csv_text, out, plain, record, reporting, writable
 from .options import (
     Fix,
     Force,
@@ -20,6 +20,7 @@ from .options import (
     Seed,
     Segments,
     TargetTask,
+    TaskName,
     fixed_values,
     formats_of,
     names_in,
@@ -29,10 +30,16 @@ if TYPE_CHECKING:
     from jaxmuscle.comparison import Comparison
 
 
+FIT = "fit.json"
+
+
 def compare(
     target: Annotated[
         str,
-        typer.Argument(help="A bundled spectrum (see `jaxmuscle targets`), or the file of one (.toml, .csv, .json, .tar)."),
+        typer.Argument(
+            help="A bundled spectrum (see `jaxmuscle targets`), the file of one (.toml, .csv, .json, .tar), or "
+            "the fit.json of a fit, whose spectrum is taken."
+        ),
     ],
     task: TargetTask = None,
     free: Free = None,
@@ -57,6 +64,8 @@ def compare(
 
         jaxmuscle compare my-spectrum.csv --segments 45 --fix k_w=450000 --fix c_w=55
 
+        jaxmuscle compare out/fit/fit.json --out out/compare
+
         jaxmuscle compare my-displacement.csv --quantity displacement --segments 12
     """
     with reporting(as_json):
@@ -65,7 +74,8 @@ def compare(
         keep_compiled_programs()
         fixed = fixed_values(fix)
         names = names_in(free)
-        aim, model = aim_of(target, task, {"quantity": quantity, "segments": segments})
+        read = {"quantity": quantity, "segments": segments}
+        aim, model = _of_a_fit(target, task, read) if Path(target).name == FIT else aim_of(target, task, read)
         writable(output, "compare.json", force=force)
         with told(True, f"comparing models on {aim.name}") as tell:
             found = jm.compare_noise(model, aim, free=names, fix=fixed, key=seed, progress=tell)
@@ -73,6 +83,17 @@ def compare(
         record(output / "compare.json")
         _show(found, f"{output}/{', '.join(files)}")
     raise typer.Exit(CONVERGED if found.success else NOT_CONVERGED)
+
+
+def _of_a_fit(path: str, task: TaskName | None, read: dict[str, Any]) -> tuple[Any, Any]:
+    """The spectrum of a fit of one target, and the task for it."""
+    given = [name for name, value in read.items() if value is not None]
+    if given:
+        raise ValueError(f"--{given[0]}: the spectrum of a fit states this already; leave the option out")
+    targets = list(jm.load_result(path).targets.values())
+    if len(targets) > 1:
+        raise ValueError(f"{path}: is a fit of {len(targets)} spectra; give the file of one of them")
+    return aimed(targets[0], task)
 
 
 def _write(found: "Comparison", folder: Path, formats: list[str]) -> list[str]:
@@ -85,11 +106,20 @@ def _write(found: "Comparison", folder: Path, formats: list[str]) -> list[str]:
     return ["compare.csv", "compare.json", *write_figure(found.plot(), folder, "compare", formats)]
 
 
+def _unsettled(found: "Comparison") -> str:
+    """Whose search did not come to its end, and what may help: the parameters that the data say least about."""
+    from jaxmuscle.model._parameters import RESONANCE
+
+    rows = [row for row in found.rows if not row.success]
+    words = f"the search did not come to its end for {'; '.join(row.label for row in rows)}. Do not use these rows"
+    own = [n for n in RESONANCE if all(n in found.tasks[row.noise, row.harmonic].parameter_names for row in rows)]
+    name = own[-1] if own else "c_z"
+    value = float(found.tasks[rows[0].noise, rows[0].harmonic][name])
+    return f"{words}. Hold a parameter of theirs, for example --fix {name}={value:.2g}, or leave it out of --free"
+
+
 def _show(found: "Comparison", files: str) -> None:
     out.print(plain(found), highlight=False, soft_wrap=True)
     if not found.success:
-        out.print(
-            "[bold red]failed:[/] not every model was fitted to the end: fix a parameter (--fix), or fit fewer (--free)",
-            highlight=False,
-        )
+        out.print(f"[bold red]failed:[/] {plain(_unsettled(found))}", highlight=False, soft_wrap=True)
     out.print(f"Written: {files}", highlight=False)

@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from jaxmuscle.uncertainty import Posterior
 
 REPORT = "report.html"
+WOULD = "What the data would determine if the model held"
 STATE = 4  # the column of a fit's card that says whether the data determine a number
 PARAMETERS = ("name", "value", "95 % interval", "unit", "what it is")
 FIGURES = {
@@ -35,8 +36,9 @@ def fit_report(result: "FitResult", figure: Any, folder: Path) -> None:
             for state in ("determined", "not determined", "fixed")}  # fmt: skip
     body = [
         _verdict(card.heading, good=False if not result.success else result.adequate),
-        pages.heading("What the data determine"),
+        pages.heading("What the data determine" if result.adequate is not False else WOULD),
         pages.table(PARAMETERS, rows["determined"]) if rows["determined"] else pages.paragraph("Nothing."),
+        *_tried(result),
         pages.picture(figure, FIGURES["fit" if result.only.fitted.size else "stiffness"]),
         pages.heading("What it means"),
         pages.items(card.remarks),
@@ -46,13 +48,26 @@ def fit_report(result: "FitResult", figure: Any, folder: Path) -> None:
     ]
     if rows["not determined"]:
         body += [pages.heading("What the data do not determine"),
-                 pages.paragraph("The prior keeps these near their defaults. Do not interpret them."),
+                 pages.paragraph("Do not interpret these values."),
                  pages.table(PARAMETERS, rows["not determined"])]  # fmt: skip
     if rows["fixed"]:
         body += [pages.heading("What was fixed"), pages.table(PARAMETERS, rows["fixed"])]
     body += _data(result.targets)
     body += _how(result.settings | {"method": result.method, "seed": result.seed}, result.versions)
     pages.write_page(folder / REPORT, result.title, body)
+
+
+def _tried(result: "FitResult") -> list[Html]:
+    """The models that were tried, where there were several."""
+    if len(result.ladder) < 2:
+        return []
+    rows = [(str(rung.number), rung.model, f"{rung.chi2_per_bin:.2f}", f"{rung.p:.2g}", f"{rung.aic:.1f}",
+             "the result" if rung.chosen else "") for rung in result.ladder]  # fmt: skip
+    return [
+        pages.heading("Models tried"),
+        pages.paragraph("Simplest first. The numbers are those before the correction by simulation."),
+        pages.table(("", "model", "chi2 per bin", "p", "AIC", ""), rows),
+    ]
 
 
 def cohort_report(cohort: "CohortResult", figure: Any | None, folder: Path, places: dict[str, Path]) -> None:
@@ -191,9 +206,16 @@ def _after_a_fit(result: "FitResult", path: Path) -> list[str]:
     if not result.adequate:
         return [
             "Look at the residuals: red bars are where the model misses the data.",
-            f"Try other noises: `jaxmuscle compare {shlex.quote(result.title)}`.",
+            *(
+                [
+                    f"Try other noises: `jaxmuscle compare {shlex.quote(str(path))} --out {shlex.quote(str(path.parent / 'compare'))}`."
+                ]
+                if result.only.fitted.size
+                else []
+            ),
             "Look for drift and tremor in the recording: `jaxmuscle analyse RECORDING`.",
-            "Do not interpret the parameters before the model describes the data.",
+            "Report that the model does not describe the data, and no number of the model.",
+            "Mean, variation, bands and peak need no model: `jaxmuscle steadiness RECORDING`.",
         ]
     place = shlex.quote(str(path))
     return [

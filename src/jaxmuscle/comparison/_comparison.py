@@ -36,10 +36,11 @@ COLUMNS = ("noise", "harmonic", *NUMBERS, "adequate", "success")
 
 
 class Evidence(NamedTuple):
-    """What a decision looks at: a model's AIC, and its score of every bin, if there is one."""
+    """What a decision looks at: a model's AIC, its score of every bin, if there is one, and whether its climbs settled."""
 
     aic: float
     scores: Float[np.ndarray, " bins"] | None
+    settled: bool = True
 
 
 class Decision(Printed, Result, eqx.Module):
@@ -47,7 +48,7 @@ class Decision(Printed, Result, eqx.Module):
 
     How much lower the AIC of `a` is (`aic_gain`), how much higher its held-out score (`score_gain`, `score_stderr`; None
     if nothing was held out). The two are told apart if the AIC differs by at least `needed` and the held-out score, if there
-    is one, says the same.
+    is one, says the same. `unsettled` names those whose search did not come to its end: they cannot be told apart.
     """
 
     a: str
@@ -56,11 +57,12 @@ class Decision(Printed, Result, eqx.Module):
     score_gain: float | None
     score_stderr: float | None
     needed: float = NEEDED
+    unsettled: tuple[str, ...] = ()
 
     @property
     def winner(self) -> str | None:
         """The better one; None if they cannot be told apart."""
-        if not abs(self.aic_gain) >= self.needed or self._score_against:
+        if self.unsettled or not abs(self.aic_gain) >= self.needed or self._score_against:
             return None
         return self.a if self.aic_gain > 0 else self.b
 
@@ -77,6 +79,8 @@ class Decision(Printed, Result, eqx.Module):
         if self.winner is not None:
             return f"{better} rather than {worse}: {numbers}"
         open_ = f"{better} and {worse} cannot be told apart"
+        if self.unsettled:
+            return f"{open_}: the search of {' and of '.join(self.unsettled)} did not come to its end"
         if abs(self.aic_gain) >= self.needed:
             return f"{open_}: the two measures disagree, {numbers}"
         return f"{open_}: {numbers}; {self.needed:.3g} in AIC is needed"
@@ -84,7 +88,8 @@ class Decision(Printed, Result, eqx.Module):
 
 def decided(names: tuple[str, str], a: Evidence, b: Evidence, needed: float = NEEDED) -> Decision:
     """The decision between two models, called by `names`."""
-    return Decision(*names, b.aic - a.aic, *score_difference(a.scores, b.scores), needed)
+    unsettled = tuple(name for name, one in zip(names, (a, b), strict=True) if not one.settled)
+    return Decision(*names, b.aic - a.aic, *score_difference(a.scores, b.scores), needed, unsettled)
 
 
 def score_difference(
@@ -132,7 +137,7 @@ class ComparedModel(eqx.Module):
     @property
     def evidence(self) -> "Evidence":
         """What a decision looks at."""
-        return Evidence(self.aic, self.scores)
+        return Evidence(self.aic, self.scores, self.success)
 
     @property
     def label(self) -> str:

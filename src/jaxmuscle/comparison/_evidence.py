@@ -22,7 +22,7 @@ from jaxmuscle.response._expected import Moments
 from jaxmuscle.spectra._bin_law import target_law
 
 SPREAD, RANDOM, PLAIN = 24, 8, 16
-BLOCK, BLOCKS, ENOUGH = 12, 10, 1e-3
+BLOCK, BLOCKS, ENOUGH = 12, 20, 1e-3
 SAME, KEPT = 1e-3, 16
 
 

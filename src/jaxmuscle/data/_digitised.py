@@ -145,6 +145,9 @@ def _collections(project: Any, file: str) -> tuple[list[Any], list[Any]]:
         axes = {**parameters, "name": "XY", "type": kind, "calibrationPoints": points}
         datasets = [{**_table(entry, file), "axesName": "XY"} for entry in _get(old, "dataSeries", list, file)]
         return [axes], datasets
+    if isinstance(project, dict) and "target_table" in project:
+        raise TargetError(f"{file}: is the result of a fit, and a spectrum is needed. `jaxmuscle compare` takes the "
+                          "spectrum of a fit.json; else give the file that was fitted")  # fmt: skip
     if not isinstance(project, dict) or "axesColl" not in project:
         raise TargetError(f"{file}: is not a WebPlotDigitizer project (it has no axesColl)")
     _check_version(project, 4, file)

@@ -152,7 +152,7 @@ class FitResult(Result, eqx.Module):
         if "harmonic_frequency" in self.free:
             told.append("no p-value of the harmonic: where the model misses the data, any harmonic improves the fit")
         return (*told, "what to do: do not interpret the parameters. Look at the residuals in the figure. Look for drift "
-                "and tremor in the recording. Try other noises (jaxmuscle compare)")  # fmt: skip
+                "and tremor in the recording. Try other noises (jaxmuscle compare fit.json)")  # fmt: skip
 
     @property
     def per_newton(self) -> dict[str, float]:

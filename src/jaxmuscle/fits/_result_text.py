@@ -27,7 +27,8 @@ COLUMNS = ("name", "value", "95 % interval", "unit", "in the fit", "what it is")
 def card_of(result: "FitResult") -> Card:
     """The result as text, and as a table of all its numbers: those that the data determine first, then what was fixed."""
     rows = []
-    for name, p in result.as_shown(result.found | result.parameters).items():
+    fixed = {name: p for name, p in result.parameters.items() if not p.free}
+    for name, p in result.as_shown(fixed | result.found).items():
         state = ("determined" if p.stderr is not None else "not determined") if p.free else "fixed"
         row, unit = PARAMETERS.get(base_of(name)), "" if p.unit == "1" else p.unit
         words = MEANINGS.get(base_of(name), "") if row is None else row.meaning.partition(";")[0]
@@ -64,12 +65,13 @@ def text_of(result: "FitResult") -> str:
     intervals = any(p.interval is not None for p in shown.values())
     in_bands = {name: p for name, p in shown.items() if base_of(name) in BANDS}
     rows = {name: p for name, p in shown.items() if name not in in_bands}
-    lines += _table("determined by the data", rows, " 95 % interval    " * intervals)
+    title = "determined by the data" if result.adequate is not False else "would be determined if the model held"
+    lines += _table(title, rows, " 95 % interval    " * intervals)
     lines += [f"  {sentence}" for sentence in _by_band(in_bands)]
     fixed = [name for name in result.products if name not in result.parameters]
     lines += [f"  products and ratios known roughly: {', '.join(map(spelt, fixed))}"] if fixed else []
     loose = {name: p for name, p in every.items() if name not in shown and p.free}
-    lines += _table("not determined (values near the defaults: do not interpret them)", loose) if loose else []
+    lines += _table("not determined: do not interpret these values", loose) if loose else []
     if factor := result.settings.get("carried"):
         what = "P_w, masses, stiffness" if single and result.only.stiffness is None else "P_w, stiffness"
         lines += [f"  before the fit {what} and damping were multiplied by {factor:.3g}, so that the muscle has the "

@@ -49,7 +49,7 @@ def _spectra(ax: Axes, comparison: Any, colours: dict[str, str]) -> None:
 
 def _criterion(ax: Axes, rows: list[Any], colours: dict[str, str]) -> None:
     """AIC above the lowest; filled with a harmonic, open without."""
-    ax.axvspan(0, rows[0].needed, color="0.92", lw=0, zorder=0)
+    ax.axvspan(0, rows[0].needed, color="0.85", lw=0, zorder=0)
     for i, row in enumerate(rows):
         ax.plot(row.delta_aic, i, "o", color=colours[row.noise], mfc=_face(row, colours), **MARK)
     if len({row.harmonic for row in rows}) > 1:
@@ -59,7 +59,9 @@ def _criterion(ax: Axes, rows: list[Any], colours: dict[str, str]) -> None:
             loc="lower right", bbox_to_anchor=(1.02, 1.0), ncols=2, borderaxespad=0.0, columnspacing=0.8, handletextpad=0.1
         )
     _rows(ax, [row.noise for row in rows])
-    ax.set(xlim=(-0.06 * _span(rows), _span(rows)), xlabel="AIC above the lowest\n(grey: not told apart)")
+    near = any(row.delta_aic < row.needed for row in rows[1:])
+    ax.set(xlim=(-0.06 * _span(rows), _span(rows)))
+    ax.set_xlabel("AIC above the lowest" + "\n(grey: not told apart)" * near)
 
 
 def _span(rows: list[Any]) -> float:
@@ -67,7 +69,7 @@ def _span(rows: list[Any]) -> float:
 
 
 def _scores(ax: Axes, rows: list[Any], colours: dict[str, str]) -> None:
-    """Held-out score minus that of the model of lowest AIC."""
+    """Held-out score minus that of the model of lowest AIC; none of a search that did not come to its end."""
     _rows(ax, [""] * len(rows))
     if rows[0].scores is None:
         ax.set(xticks=[])
@@ -75,6 +77,9 @@ def _scores(ax: Axes, rows: list[Any], colours: dict[str, str]) -> None:
         return
     ax.axvline(0, color=BLACK, lw=0.6, zorder=1)
     for i, row in enumerate(rows):
+        if not row.success:
+            ax.text(0.02, i, "not settled", transform=ax.get_yaxis_transform(), va="center", color=GREY)
+            continue
         error = row.score_stderr or None
         ax.errorbar(row.score_difference, i, xerr=error, fmt="o", capsize=2, lw=1, color=colours[row.noise],
                     mfc=_face(row, colours), **MARK)  # fmt: skip
