@@ -203,21 +203,15 @@ def _after_a_fit(result: "FitResult", path: Path) -> list[str]:
             "Say how much the powers scatter: `--segments N`, the number of Welch segments that were averaged.",
             "Then the fit can be judged.",
         ]
+    place, other = shlex.quote(str(path)), shlex.quote(str(path.parent / "compare"))
     if not result.adequate:
         return [
             "Look at the residuals: red bars are where the model misses the data.",
-            *(
-                [
-                    f"Try other noises: `jaxmuscle compare {shlex.quote(str(path))} --out {shlex.quote(str(path.parent / 'compare'))}`."
-                ]
-                if result.only.fitted.size
-                else []
-            ),
+            *([f"Try other noises: `jaxmuscle compare {place} --out {other}`."] if result.only.fitted.size else []),
             "Look for drift and tremor in the recording: `jaxmuscle analyse RECORDING`.",
             "Report that the model does not describe the data, and no number of the model.",
             "Mean, variation, bands and peak need no model: `jaxmuscle steadiness RECORDING`.",
         ]
-    place = shlex.quote(str(path))
     return [
         f"How sure is each number? `jaxmuscle posterior {place}` draws from the posterior.",
         f"Move the parameters yourself: `jaxmuscle explore {place}`.",

@@ -27,7 +27,7 @@ from ._harmonic_evidence import SIGNIFICANT, p_value
 STARTS = 32
 ALIKE = 2.0
 TREMOR = 2  # the rung whose rhythm is no line
-HEAD = f"{'models tried, simplest first (-> is the result)':<47}{'chi2/bin':>9}{'p':>9}{'AIC':>9}"
+HEAD = f"{'models tried (-> result), before simulation':<47}{'chi2/bin':>9}{'p':>9}{'AIC':>9}"
 
 
 class Rung(NamedTuple):

@@ -138,7 +138,8 @@ class FitResult(Result, eqx.Module):
             return "cannot be judged: the target does not say how much its powers scatter (give segments or sigma)"
         data = sum(part.data for part in self.parts.values())
         each = "bin" if all(part.stiffness is None for part in self.parts.values()) else "datum"
-        found = f"chi2 per {each} {self.adequacy.chi2 / data:.2g}, {probability(self.adequacy.p)}"
+        chi2, expected = self.adequacy.chi2 / data, self.adequacy.expected / data
+        found = f"chi2 per {each} {chi2:.2f} (expected {expected:.2f}), {probability(self.adequacy.p)}"
         if self.adequacy.adequate:
             return f"describes the data: {found}"
         return f"does not describe the data: {found}; {self.adequacy.misfit}"
