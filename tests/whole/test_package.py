@@ -76,7 +76,7 @@ def test_metadata_of_the_wheel(built):
     data = email.message_from_bytes(archive.read(f"{folder}/METADATA"))
     assert (data["Name"], data["Version"], data["License-Expression"]) == ("jaxmuscle", jm.__version__, "Apache-2.0")
     assert data["Description-Content-Type"] == "text/markdown"
-    assert set(data.get_all("Provides-Extra", [])) == {"all", "c3d", "labs", "notebooks", "posterior", "url"}
+    assert set(data.get_all("Provides-Extra", [])) == {"all", "c3d", "kernel", "labs", "notebooks", "posterior", "url"}
     assert f"{folder}/licenses/LICENSE" in archive.namelist()
     assert archive.read(f"{folder}/entry_points.txt").decode().split() == [
         "[console_scripts]", "jaxmuscle", "=", "jaxmuscle.__main__:main",
