@@ -364,6 +364,7 @@ def test_what_was_fitted_can_be_explored(fitted, tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:.*K_w is negative")  # so it is in this made-up spectrum
 def test_what_to_measure_next_is_told_of_a_fit(fitted, tmp_path):
     _, folder = fitted
     outcome = run("identifiability", folder / "fit.json", "--out", tmp_path)

@@ -136,7 +136,7 @@ class DesignedInput(Printed, Result, eqx.Module):
         most = " and ".join(f"{100 * share:.0f} % at {a:.2g} to {b:.2g} Hz" for a, b, share in self.moves)
         rows = [f"    {n:<22}" + "".join(f"{self.percent(n, e):>10.2g}" for e in (self.now, self.flat, self.stderr))
                 for n in self.told]  # fmt: skip
-        names = " and ".join(self.quantity)
+        names = " and ".join(filter(None, [", ".join(self.quantity[:-1]), self.quantity[-1]]))
         variance = (
             f"relative variance of {names}" if len(self.quantity) == 1 else f"sum of the relative variances of {names}"
         )

@@ -240,7 +240,7 @@ def _table(report: IdentifiabilityReport) -> list[str]:
             now = report.present.quantities[name]
             cells = [f"({_cell(now, now.prior_sd)})", *(_shown(o.quantities[name]) for o in
                                                         (report.present, *(d for _, d in block)))]  # fmt: skip
-            value, unit = _stated(now, report.mean_force)
+            value, unit = _stated(now, None if name == "mean" else report.mean_force)
             lines.append(f"  {name:<{wide}}{value:>9.3g} {unit:<5}" + "".join(f"{cell:>6}" for cell in cells))
     return lines
 
