@@ -58,6 +58,7 @@ def test_a_response_alone_is_fitted_from_the_command_line(fitted):
     np.testing.assert_allclose(result.only.stiffness_residual, off, rtol=1e-5, atol=1e-5)
     assert result.only.chi2_per_point == pytest.approx(np.sum(np.abs(off) ** 2) / (2 * F.size), rel=1e-5)
     assert result["K_w0"].stderr is not None and "chi2 per datum" in result.verdict
+    assert f"dynamic stiffness  {F.size} points" in str(result.targets["figure"])
 
 
 @pytest.mark.slow

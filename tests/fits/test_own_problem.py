@@ -80,6 +80,31 @@ def test_log_density_and_its_slope(problem):
 
 
 @pytest.mark.slow
+def test_far_away_the_density_is_zero_and_not_a_number_for_a_sampler_to_choke_on(problem):
+    far = np.full(len(problem.names), 15.0)
+    assert float(problem.log_density(far)) == -np.inf
+    assert np.isfinite(float(problem.log_density(problem.start)))
+
+
+def test_a_theta_of_another_shape_is_refused(problem):
+    many = np.zeros((5, len(problem.names)))
+    for wrong, said in ((many, "use jax.vmap for several"), (np.zeros(2), "theta has the shape"), ({}, "problem.theta")):
+        with pytest.raises(ValueError, match=said):
+            problem._scaled(wrong)  # of all methods, which the tests' type checker guards by itself
+    assert jax.vmap(problem.log_prior)(many).shape == (5,)
+
+
+def test_the_log_likelihood_is_that_of_the_task_but_for_the_variation():
+    """A coefficient of variation scatters as at the start; without one the two are the same."""
+    target = jm.Target("a", TARGET.proportional_power, segments=12)
+    problem = jm.problem(TASK, target, free=("k_w", "c_w", "noise_K_z"))
+    off = [
+        float(problem.log_likelihood(theta)) - float(jm.log_likelihood(problem.task(theta), target))
+        for theta in np.array([[0.0, 0, 0], [1, 1, -1], [-1, 0.5, 0.5]])
+    ]
+    np.testing.assert_allclose(off, off[0], atol=1e-8)
+
+
 def test_scipy_finds_the_minimum_of_the_fit(problem, result):
     """In the two descents that a fit makes: what the harmonic holds of the bins is unknown first, then known.
 

@@ -1,5 +1,6 @@
 """The integrator against scipy's, and what surrounds it: seeds, chunks, sub-steps, sampling, errors, exports."""
 
+import inspect
 import json
 
 import equinox as eqx
@@ -17,6 +18,7 @@ from jaxmuscle.model import Decay, RampHold, Sampled, SmoothStep
 from jaxmuscle.model._noise import Realisation
 from jaxmuscle.simulation._batch import draw, respond
 from jaxmuscle.simulation._grid import Grid
+from jaxmuscle.simulation._simulate import schedule
 
 KEY = jax.random.key(11)
 HARMONIC = jm.Harmonic(0.1, 4.25, 0.3)
@@ -246,6 +248,12 @@ def test_what_does_not_stay_finite_is_named(x64):
 def test_impossible_grids_are_refused(settings, message):
     with pytest.raises(ValueError, match=message):
         jm.simulate(jm.Isometric(), KEY, **settings)
+
+
+def test_a_traced_duration_says_that_it_is_traced():
+    plan = inspect.unwrap(schedule)  # without the tests' type checker
+    with pytest.raises(ValueError, match=r"duration is traced by JAX.*static_argnames"):
+        jax.jit(lambda duration: plan(jm.Isometric(), duration, 1e-3, None, None, None))(1.0)
 
 
 def test_impossible_ensembles_are_refused():

@@ -111,7 +111,7 @@ def _as_options(message: str) -> str:
 
 def plain(text: object) -> str:
     """Text without markup, each control character and half character as its escape: a file may be called anything."""
-    whole = str(text).encode("utf-8", "backslashreplace").decode()
+    whole = str(text).encode("utf-8", "backslashreplace").decode().replace("\N{NO-BREAK SPACE}", " ")
     shown = "".join(sign if sign.isprintable() or sign == "\n" else sign.encode("unicode_escape").decode() for sign in whole)
     return shown.replace("[", r"\[")
 

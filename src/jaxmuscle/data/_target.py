@@ -227,14 +227,16 @@ class Target(Shown, eqx.Module):
         return plot.target(self, ax, log=log)
 
     def _card(self) -> Card:
-        peak = int(np.argmax(self.proportional_power))
         f, p, settings = self.frequency, self.proportional_power, self.settings
-        known = [
-            ("source", self.source),
-            ("spectrum", settings.name or "settings of its own"),
-            ("bins", f"{f.size} of {settings.frequency.size}, {f[0]:.3f} to {f[-1]:.3f} Hz"),
-            ("maximum", f"{p[peak]:.3f} at {f[peak]:.3f} Hz"),
-        ]
+        known = [("source", self.source)]
+        if f.size:
+            peak = int(np.argmax(p))
+            known += [("spectrum", settings.name or "settings of its own"),
+                      ("bins", f"{f.size} of {settings.frequency.size}, {f[0]:.3f} to {f[-1]:.3f} Hz"),
+                      ("maximum", f"{p[peak]:.3f} at {f[peak]:.3f} Hz")]  # fmt: skip
+        if self.stiffness is not None:
+            at = self.stiffness.frequency
+            known.append(("dynamic stiffness", f"{at.size} points, {at[0]:.3g} to {at[-1]:.3g} Hz"))
         if self.segments is not None:
             known.append(("segments", f"{_words(self.segments)} ({self.degrees_of_freedom:.1f} degrees of freedom)"))
         if self.coefficient_of_variation is not None:
@@ -247,7 +249,8 @@ class Target(Shown, eqx.Module):
         if self.dispersion:
             known.append(("trials", _dispersion_in_words(self.dispersion)))
         known += [("notice", notice) for notice in self.notices]
-        return facts(f"{self.name}: proportional power of {self.quantity}, {self.provenance}", known)
+        what = "proportional power" if f.size else "dynamic stiffness"
+        return facts(f"{self.name}: {what} of {self.quantity}, {self.provenance}", known)
 
 
 def load_target(

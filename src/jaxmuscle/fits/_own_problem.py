@@ -59,7 +59,7 @@ class Problem(Shown):
 
     def parameters(self, theta: Theta) -> dict[str, Scalar]:
         """The parameters by name, in their units."""
-        return self.objective.coordinates.values(self.objective.theta(jnp.asarray(theta)))
+        return self.objective.coordinates.values(self._scaled(theta))
 
     def theta(self, parameters: Mapping[str, float]) -> Float[np.ndarray, " free"]:
         """θ of parameters by name, in their units; those not named are at their start. The inverse of `parameters`.
@@ -82,27 +82,30 @@ class Problem(Shown):
     def task(self, theta: Theta) -> AbstractTask:
         """The task with these parameters."""
         part = self.objective.parts[0]
-        return task_at(part.task, part.coordinates, self.objective.theta(jnp.asarray(theta)))
+        return task_at(part.task, part.coordinates, self._scaled(theta))
 
     def residuals(self, theta: Theta) -> Float[Array, " residuals"]:
         """What a fit makes small, `½ Σ r²`: those of the data in standard deviations, then those of the prior."""
-        scaled: Any = self.objective.theta(jnp.asarray(theta))
+        scaled = self._scaled(theta)
         return self.objective.residuals(scaled, self._moments(scaled), self.objective.data)
 
     def log_likelihood(self, theta: Theta) -> Scalar:
-        """Log likelihood of the target, as `jaxmuscle.log_likelihood`, up to a constant.
+        """Log likelihood of the target, up to a constant.
+
+        `jaxmuscle.log_likelihood` is the same, but for a coefficient of variation: there it scatters as in the task that
+        is given, here as in the task at `start`, or at the θ of `scattering_as`. So the density that a sampler draws from
+        has one scatter.
 
         Raises `ValueError` for a target that states neither segments nor sigma.
         """
         if self.likelihood is None:
             require_spread(self.fit_problem.parts[0].target)
         assert self.likelihood is not None
-        return self.likelihood.marginal(self._moments(self.objective.theta(jnp.asarray(theta))))
+        return self.likelihood.marginal(self._moments(self._scaled(theta)))
 
     def log_prior(self, theta: Theta) -> Scalar:
         """Log density of the prior as one of θ, up to a constant. Flat, and then improper, where the prior is None."""
-        theta, c = jnp.asarray(theta), self.objective.coordinates
-        scaled = self.objective.theta(theta)
+        scaled, theta, c = self._scaled(theta), jnp.asarray(theta), self.objective.coordinates
         bounded = np.isfinite(c.low)
         width = np.log(np.where(bounded, c.high - c.low, 1.0))
         stretch = jnp.where(bounded, width + jax.nn.log_sigmoid(theta) + jax.nn.log_sigmoid(-theta), 0.0)
@@ -111,9 +114,12 @@ class Problem(Shown):
     def log_density(self, theta: Theta) -> Scalar:
         """Log density of the posterior as one of θ, `log_likelihood + log_prior`: what a sampler asks for.
 
+        It is -inf where the model cannot be computed, which is more than about ten prior standard deviations away.
+
         Raises `ValueError` as `log_likelihood` does.
         """
-        return self.log_likelihood(theta) + self.log_prior(theta)
+        found = self.log_likelihood(theta) + self.log_prior(theta)
+        return jnp.where(jnp.isnan(found), -jnp.inf, found)
 
     def scattering_as(self, theta: Theta) -> "Problem":
         """The problem whose data scatter as the model at θ says.
@@ -126,6 +132,15 @@ class Problem(Shown):
             seen = expand(self.fit_problem.linear(), scaled[None]).row(0)
             shares = [np.clip(np.nan_to_num(m.line / m.power), 0.0, 1.0) for m in seen.moments]
             return Problem.of(self.fit_problem.scattering_as(self.fit_problem.tasks_at(scaled)), shares)
+
+    def _scaled(self, theta: Any) -> Any:
+        """What the objective is a function of. Raises `ValueError` for anything but one number for each name."""
+        if isinstance(theta, Mapping):
+            raise ValueError("theta is a dictionary: give problem.theta(values), which makes an array of it")
+        if np.shape(theta) != (len(self.names),):
+            raise ValueError(f"theta has the shape {np.shape(theta)}, this problem takes ({len(self.names)},), a number for "
+                             f"each of {', '.join(self.names)}: use jax.vmap for several")  # fmt: skip
+        return self.objective.theta(jnp.asarray(theta))
 
     def _moments(self, scaled: Any) -> tuple[Moments, ...]:
         return tuple(part.moments(scaled) for part in self.objective.parts)

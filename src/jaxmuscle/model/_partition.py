@@ -18,9 +18,10 @@ def partition(task: AbstractTask, names: Iterable[str]) -> tuple[Values, Callabl
         values, rebuild = partition(task, ("k_w", "c_w"))
         jax.grad(lambda v: loss(rebuild(v)))(values)        # a slope for every name
 
-    The leaves of a task are Python numbers, exact in either precision. `jax.grad` does not take them, and
-    `equinox.filter_grad`, which differentiates arrays only, returns None in their place. `values` are arrays of JAX's
-    default precision, in their natural units: any optimiser of pytrees (optax, optimistix) can move them.
+    Use it to move some parameters and to keep the others. `values` are arrays of JAX's default precision, in their natural
+    units: any optimiser of pytrees (optax, optimistix) can move them. (`jax.grad` takes a task as it is, and gives a slope
+    for every number of it. `equinox.filter_grad` gives None for all of them: a task holds Python numbers, which are exact
+    in either precision, and not arrays.)
 
     **Arguments:** `task`; `names` of its parameters (`task.parameter_names` are all).
 

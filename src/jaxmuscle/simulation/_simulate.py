@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, PRNGKeyArray
 
 from jaxmuscle._common.arguments import count, positive
-from jaxmuscle._common.arrays import all_concrete, as_arrays, as_numbers
+from jaxmuscle._common.arrays import all_concrete, as_arrays, as_numbers, is_concrete
 from jaxmuscle._common.errors import OperatingPointError, SimulationError
 from jaxmuscle._common.keys import key_of, seed_of
 from jaxmuscle._common.programs import kept
@@ -121,6 +121,9 @@ def schedule(
     if sampling not in get_args(Sampling):
         raise ValueError(f"sampling = {sampling!r} must be one of {', '.join(get_args(Sampling))}")
     for name, value in (("dt", dt), ("rate", rate), ("duration", duration)):
+        if not is_concrete(value):
+            raise ValueError(f"{name} is traced by JAX, and decides how many steps there are: close over it, or make it one "
+                             "of the static_argnames of jax.jit")  # fmt: skip
         positive(name, value)
     if substeps is not None:
         count("substeps", substeps, 1, MAX_SUBSTEPS)

@@ -55,7 +55,7 @@ class Trajectory(Shown, eqx.Module):
         known.append(("seeds", str(int(np.prod(self.output.shape[:-1], dtype=int)))))
         if is_concrete(self.output):
             low, high = np.min(np.asarray(self.output)), np.max(np.asarray(self.output))
-            known.append(("range", f"{low:.4g} to {high:.4g} {unit}"))
+            known.append(("range", f"{low + 0.0:.4g} to {high + 0.0:.4g} {unit}"))
         return facts(f"trajectory of {name} [{unit}]", known)
 
     @property
