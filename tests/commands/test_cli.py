@@ -364,6 +364,22 @@ def test_what_was_fitted_can_be_explored(fitted, tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:.*K_w is negative")  # so it is in this made-up spectrum
+def test_what_to_measure_next_is_told_of_a_fit(fitted, tmp_path):
+    _, folder = fitted
+    outcome = run("identifiability", folder / "fit.json", "--out", tmp_path)
+    assert outcome.exit_code == 0 and "most would be learnt from" in outcome.stdout
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["fit.json", "identifiability.json", "identifiability.png"]
+    found = jm.identifiability(jm.load_result(folder / "fit.json"))
+    kept = json.loads((tmp_path / "identifiability.json").read_text())
+    assert kept["present"]["determined"] == found.present.determined
+    assert [design["name"] for design in kept["designs"]] == [design.name for design in found.designs]
+    assert strict(run("identifiability", tmp_path / "fit.json", "--out", tmp_path, "--force", "--json").stdout) == kept
+    wrong = run("identifiability", folder / "fit.json", "--segments", 12, "--out", tmp_path / "new")
+    assert wrong.exit_code == 2 and "is a fit; its task, parameters and target stay" in wrong.stderr
+
+
+@pytest.mark.slow
 def test_what_was_fitted_can_be_simulated(fitted, tmp_path):
     import xarray
 
@@ -563,6 +579,7 @@ OVERWRITES = {
     "simulate": ("ensemble", ["simulate", "zagrodny-slifkin"], ["trajectories.nc"]),
     "analyse": ("load_recording", ["analyse", "{csv}", "--save-target", "{out}/held.toml"], ["analysis.json", "held.toml"]),
     "posterior": ("fit", ["posterior", "{csv}", "--segments", "9"], ["fit.json", "posterior.nc", "posterior.json"]),
+    "identifiability": ("fit", ["identifiability", "{csv}", "--segments", "9"], ["fit.json", "identifiability.json"]),
     "compare": ("compare_noise", ["compare", "{csv}"], ["compare.json"]),
     "reproduce": ("reproduce", ["reproduce"], ["claims.json"]),
 }  # fmt: skip
@@ -775,8 +792,14 @@ def test_a_designed_motion(tmp_path):
         assert wrong.exit_code == 2 and message in wrong.stderr
 
 
+def test_a_motion_is_designed_for_a_fit_and_not_for_a_spectrum(tmp_path):
+    wrong = run("design", "vastus-lateralis-26mvc", "--out", tmp_path)
+    assert wrong.exit_code == 2 and "jaxmuscle fit vastus-lateralis-26mvc --out out/fit" in wrong.stderr
+
+
 COMMANDS = sorted(typer.main.get_group(app).commands)
-DRAWING = {"analyse", "analyze", "compare", "design", "fit", "posterior", "simulate", "steadiness", "study"}
+DRAWING = {"analyse", "analyze", "compare", "design", "fit", "identifiability", "posterior", "simulate", "steadiness",
+           "study"}  # fmt: skip
 
 
 @pytest.mark.parametrize("name", COMMANDS)

@@ -50,6 +50,7 @@ COMMANDS = {
     "steadiness": ("trial.edf", []),
     "posterior": ("fit.json", []),
     "compare": ("target.toml", []),
+    "identifiability": ("fit.json", []),
     "design": ("fit.json", []),
     "design a preset": ("preset.toml", []),
     "simulate": ("preset.toml", []),

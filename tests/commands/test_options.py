@@ -19,6 +19,7 @@ VALID = {
     "fit": ["t.csv", "--segments", "12"], "simulate": ["zagrodny-slifkin"], "merge": ["none.zarr"], "analyse": ["r.csv"],
     "ensemble": ["zagrodny-slifkin", "--seeds", "4", "--out", "e.zarr"], "steadiness": ["r.csv"], "compare": ["t.csv"],
     "posterior": ["t.csv", "--segments", "12"], "design": ["zagrodny-slifkin"], "reproduce": [], "speed": [],
+    "identifiability": ["t.csv", "--segments", "12"],
     "study": ["s.csv"], "explore": ["t.csv", "--no-open", "--out", "e.html"],
 }  # fmt: skip
 NUMBERS = ("nan", "inf", "-inf", "1e400", "-1", "9" * 40, "", "text", "1,5", "1e300", "0")

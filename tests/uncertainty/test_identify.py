@@ -355,11 +355,30 @@ def test_the_report_in_words():
 def test_the_numbers_in_the_table_are_those_of_the_report():
     first, second = (line.split() for line in str(report()).splitlines() if line.startswith("  K_w0  "))
     known = [o.quantities["K_w0"] for o in (report().present, *report().designs)]
-    assert first[:4] == second[:4]
-    cells = first[3:] + second[4:]
+    assert first[2] == "1/m" and first[:5] == second[:5]
+    cells = first[4:] + second[5:]
     assert [cell.startswith("(") for cell in cells] == [not k.determined for k in known]
     for cell, k in zip(cells, known, strict=True):
         assert float(cell.strip("()")) == pytest.approx(100 * k.stderr / k.value, rel=0.06)  # two digits
+
+
+def test_without_newtons_values_are_stated_per_newton_as_in_the_fit():
+    found = jm.identifiability(fitted(), designs=())
+    rows = {words[0]: words for words in map(str.split, str(found).splitlines()) if words}
+    stiffness, mean = found.present.quantities["K_w0"], fitted().derived["mean"]
+    assert (stiffness.unit, mean.unit) == ("N/m", "N")
+    assert float(rows["K_w0"][1]) == pytest.approx(stiffness.value / mean.value, rel=5e-3)  # three digits
+    assert rows["K_w0"][2] == "1/m" and "per newton of mean force" in " ".join(str(found).split())
+
+
+@pytest.mark.parametrize("order", [1, -1])
+def test_of_designs_that_determine_as_much_the_one_with_smaller_errors_is_named(order):
+    lengthenings = [jm.uncertainty.Lengthening.flat(1e-3, (0.5, 5.0), seconds) for seconds in (30.0, 240.0)]
+    moved = [jm.Design(f"{x.seconds:g} s", segments=0, lengthening=x) for x in lengthenings]
+    found = jm.identifiability(fitted(), designs=moved[::order])
+    short, long = found.designs[::order]
+    assert (short.determined, len(short.gained)) == (long.determined, len(long.gained))
+    assert "most would be learnt from 240 s:" in " ".join(str(found).split())
 
 
 def test_the_report_as_json(tmp_path):

@@ -15,8 +15,9 @@ import typer
 from rich.console import Console
 
 import jaxmuscle as jm
+from jaxmuscle._common.progress import told
 
-from .options import SAME_NAME, Observed, TaskName
+from .options import SAME_NAME, Observed, TaskName, fixed_values, names_in
 from .signals import interrupted, stays
 
 if TYPE_CHECKING:
@@ -158,6 +159,43 @@ def write_reached(stop: "FitInterrupted", folder: Path) -> None:
     """Where an interrupted fit stood, a preset: to report the fit may take longer than a signal can wait."""
     jm.save_preset(folder / REACHED, stop.tasks[0], description="where a fit stood when it was interrupted")
     stays(f"the best parameters so far are in {folder / REACHED}")
+
+
+def fit_into(folder: Path, target: str, read: dict[str, Any], asked: dict[str, Any], seed: int) -> "FitResult":
+    """The fit of that file, or of a target that is fitted now, which is saved as fit.json. Exit code 1 if it failed."""
+    from jaxmuscle._common.files import remove
+
+    try:
+        result = _fitted(target, read, asked, seed)
+    except jm.fits.FitInterrupted as stop:
+        write_reached(stop, folder)
+        stop.result.save(folder / "fit.json")
+        remove(folder, REACHED)
+        err.print(f"the fit is not finished; what it had reached is in {folder}/fit.json")
+        raise
+    if not result.success:
+        err.print(f"[bold red]failed:[/] the fit did not converge: {plain(result.message)}", highlight=False)
+        raise typer.Exit(NOT_CONVERGED)
+    result.save(folder / "fit.json")
+    remove(folder, REACHED)
+    return result
+
+
+def _fitted(target: str, read: dict[str, Any], asked: dict[str, Any], seed: int) -> "FitResult":
+    path = Path(target)
+    if path.suffix == ".json" and path.is_file() and b'"task_table"' in path.read_bytes():
+        if given := [f"--{name}" for name, value in (asked | read).items() if name != "noise" and value is not None]:
+            raise ValueError(f"{target}: is a fit; its task, parameters and target stay as they are, so leave out "
+                             f"{', '.join(given)}")  # fmt: skip
+        return jm.load_result(path)
+    loaded, model = aim_of(target, asked["task"], read)
+    if loaded.segments is None and loaded.sigma is None:
+        raise ValueError(f"{target}: does not say how much its bins scatter: give --segments, the number of Welch segments "
+                         "that were averaged, or a third column sigma")  # fmt: skip
+    names = names_in(asked["free"])
+    with told(True, f"fitting {loaded.name}") as tell:
+        return jm.fit(model, loaded, free=names, fix=fixed_values(asked["fix"]), noise=asked["noise"], key=seed,
+                   progress=tell)  # fmt: skip
 
 
 def write_fit(result: "FitResult", folder: Path, formats: Iterable[str] = (), *, report: bool = False) -> list[str]:

@@ -62,6 +62,9 @@ def design(
 
 
 def _source(name: str) -> Any:
+    if name in jm.list_targets():
+        raise ValueError(f"{name}: is a spectrum; a motion is designed for the muscle that was fitted to it. Fit first: "
+                         f"jaxmuscle fit {name} --out out/fit, then jaxmuscle design out/fit/fit.json")  # fmt: skip
     return jm.load_result(name) if Path(name).suffix == ".json" else jm.load_preset(name)
 
 

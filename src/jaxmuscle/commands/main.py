@@ -19,6 +19,7 @@ from .design import design
 from .ensemble import ensemble, merge
 from .explore import explore
 from .fit import fit
+from .identifiability import identifiability
 from .options import Json
 from .posterior import posterior
 from .reproduce import reproduce
@@ -38,6 +39,7 @@ app.command()(analyse)
 app.command("analyze", hidden=True)(analyse)
 app.command()(steadiness)
 app.command()(posterior)
+app.command()(identifiability)
 app.command()(design)
 app.command()(compare)
 app.command()(reproduce)

@@ -11,16 +11,14 @@ from jaxmuscle._common.progress import told
 from .console import (
     CONVERGED,
     NOT_CONVERGED,
-    REACHED,
-    aim_of,
     err,
+    fit_into,
     out,
     plain,
     record,
     reporting,
     show,
     writable,
-    write_reached,
 )
 from .options import (
     Fix,
@@ -34,13 +32,10 @@ from .options import (
     Seed,
     Segments,
     TargetTask,
-    fixed_values,
     formats_of,
-    names_in,
 )
 
 if TYPE_CHECKING:
-    from jaxmuscle.fits import FitResult
     from jaxmuscle.uncertainty import Posterior
 
 
@@ -77,25 +72,12 @@ def posterior(
     """
     with reporting(as_json):
         from jaxmuscle._common.environment import keep_compiled_programs
-        from jaxmuscle._common.files import remove
 
         keep_compiled_programs()
         taken_up = Path(target).resolve() == (output / "fit.json").resolve()
         writable(output, *["fit.json"] * (not taken_up), "posterior.nc", "posterior.json", force=force)
         asked = {"task": task, "noise": None if noise is None else str(noise), "free": free, "fix": fix}
-        try:
-            result = _fitted(target, {"segments": segments, "quantity": quantity}, asked, seed)
-        except jm.fits.FitInterrupted as stop:
-            write_reached(stop, output)
-            stop.result.save(output / "fit.json")
-            remove(output, REACHED)
-            err.print(f"the fit is not finished; what it had reached is in {output}/fit.json")
-            raise
-        if not result.success:
-            err.print(f"[bold red]failed:[/] the fit did not converge: {plain(result.message)}", highlight=False)
-            raise typer.Exit(NOT_CONVERGED)
-        result.save(output / "fit.json")
-        remove(output, REACHED)
+        result = fit_into(output, target, {"segments": segments, "quantity": quantity}, asked, seed)
         try:
             with told(True, f"posterior of {result.target.name}") as tell:
                 found = jm.posterior(result, key=seed, chains=chains, draws=draws, warmup=warmup, progress=tell)
@@ -108,24 +90,6 @@ def posterior(
         record(output / "posterior.json")
         _show(found, output)
     raise typer.Exit(CONVERGED if found.success else NOT_CONVERGED)
-
-
-def _fitted(target: str, read: dict[str, Any], asked: dict[str, Any], seed: int) -> "FitResult":
-
-    path = Path(target)
-    if path.suffix == ".json" and path.is_file() and b'"task_table"' in path.read_bytes():
-        if any(v is not None for v in read.values()) or any(asked[n] is not None for n in ("task", "free", "fix")):
-            raise ValueError(f"{target}: is a fit; its task, parameters and target stay as they are, so leave out --task, "
-                             "--free, --fix, --segments and --quantity")  # fmt: skip
-        return jm.load_result(path)
-    loaded, model = aim_of(target, asked["task"], read)
-    if loaded.segments is None and loaded.sigma is None:
-        raise ValueError(f"{target}: does not say how much its bins scatter: give --segments, the number of Welch segments "
-                         "that were averaged, or a third column sigma")  # fmt: skip
-    names = names_in(asked["free"])
-    with told(True, f"fitting {loaded.name}") as tell:
-        return jm.fit(model, loaded, free=names, fix=fixed_values(asked["fix"]), noise=asked["noise"], key=seed,
-                   progress=tell)  # fmt: skip
 
 
 def _write(found: "Posterior", folder: Path, formats: list[str]) -> None:

@@ -20,6 +20,10 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure, SubFigure
 
 SHOWN = 2.0  # times the even density: where a design moves the most
+ASSUMED = (
+    "  assumed: the masses are known. A fit of the record also fits m_z, so its error of K_z0 is larger",
+    "  assumed: no reflex. A reflex can change K_w0 by 10 to 45 %, and the fit does not notice: call it muscle plus reflex",
+)
 OF_MUSCLE = tuple(BASE.values())
 
 
@@ -132,13 +136,19 @@ class DesignedInput(Printed, Result, eqx.Module):
         most = " and ".join(f"{100 * share:.0f} % at {a:.2g} to {b:.2g} Hz" for a, b, share in self.moves)
         rows = [f"    {n:<22}" + "".join(f"{self.percent(n, e):>10.2g}" for e in (self.now, self.flat, self.stderr))
                 for n in self.told]  # fmt: skip
+        names = " and ".join(filter(None, [", ".join(self.quantity[:-1]), self.quantity[-1]]))
+        variance = (
+            f"relative variance of {names}" if len(self.quantity) == 1 else f"sum of the relative variances of {names}"
+        )
         return folded([
             f"designed input: one record of {self.lengthening.seconds:g} s would tell {best}",
-            f"  a flat input of {1e3 * self.even.rms:.3g} mm rms: {flat}; its variance is {self.gain:.2g} times as large",
+            f"  a flat input of {1e3 * self.even.rms:.3g} mm rms: {flat}; with it the {variance} is {self.gain:.2g} times "
+            "as large",
             f"  lengthening of the muscle: {1e3 * self.rms:.3g} mm rms, peak {1e3 * self.peak:.3g} mm, "
             f"{1e3 * self.speed:.3g} mm/s, {low:.2g} to {high:.2g} Hz",
             f"  most of the motion: {most}" if most else "  the density is nearly even",
             "  expected standard errors, in percent of the value:",
             f"    {'':<22}{'now':>10}{'flat':>10}{'designed':>10}",
             *rows,
+            *ASSUMED,
         ])  # fmt: skip

@@ -61,9 +61,10 @@ def identifiability(
     possible = [(d.name, more) for d, (more, failed) in zip(tried, added, strict=True) if failed is None]
     pairs = [here.outlook(a + TOGETHER + b, here.information + x + y, present=present)
              for (a, x), (b, y) in itertools.combinations(possible, 2)]  # fmt: skip
-    pairs.sort(key=lambda pair: (-len(pair.gained), sum(np.log(k.left) for k in pair.quantities.values())))
+    pairs.sort(key=lambda pair: (-len(pair.gained), pair.log_left))
     notices = tuple(n for n in result.notices if " ambiguous: " in n)
-    return IdentifiabilityReport(problem.title, problem.coordinates.names, present, alone, tuple(pairs), notices)
+    mean_force = result.derived["mean"].value if result.per_newton else None
+    return IdentifiabilityReport(problem.title, problem.coordinates.names, present, alone, tuple(pairs), notices, mean_force)
 
 
 def standard_designs(result: FitResult, target: Target | None = None) -> tuple[Design, ...]:

@@ -13,6 +13,7 @@ from jaxmuscle._common.cards import Printed, Result
 from jaxmuscle._common.files import write_json
 from jaxmuscle._common.tables import frame
 from jaxmuscle._common.text import WIDTH
+from jaxmuscle.fits._result_text import RELATIVE
 from jaxmuscle.objective._covariance import DETERMINED, spelt
 
 if TYPE_CHECKING:
@@ -21,7 +22,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure, SubFigure
 
 
-COLUMNS = 5
+COLUMNS = 4
 PAIRS_TOLD = 3
 TOGETHER = " together with "
 SAME = 1e-6
@@ -80,6 +81,11 @@ class Outlook(Printed, Result, eqx.Module):
     gained: tuple[str, ...]
     failed: str | None
 
+    @property
+    def log_left(self) -> float:
+        """Sum over all quantities of the logarithm of what is left of the prior's error: the lower, the more is known."""
+        return float(sum(np.log(known.left) for known in self.quantities.values()))
+
     def __str__(self) -> str:
         if self.failed is not None:
             return f"{self.name} is impossible: {self.failed}"
@@ -103,7 +109,9 @@ class Outlook(Printed, Result, eqx.Module):
 class IdentifiabilityReport(Printed, Result, eqx.Module):
     """What the data of a fit determine (`present`), and what they would with further `designs` or `pairs` of these.
 
-    `target` and `free` name the data and the fitted parameters; the pairs are sorted, best first; `notices` of the fit.
+    `target` and `free` name the data and the fitted parameters; the pairs are sorted, best first; `notices` of the fit;
+    `mean_force` [N] of the fitted muscle where the data have no newtons: print states values per newton of it, as the fit
+    does, and `to_dict` in newtons.
     """
 
     target: str
@@ -112,6 +120,7 @@ class IdentifiabilityReport(Printed, Result, eqx.Module):
     designs: tuple[Outlook, ...]
     pairs: tuple[Outlook, ...]
     notices: tuple[str, ...]
+    mean_force: float | None = None
 
     @property
     def telling_pairs(self) -> tuple[Outlook, ...]:
@@ -220,16 +229,28 @@ def _table(report: IdentifiabilityReport) -> list[str]:
     possible = [(letter(i), d) for i, d in enumerate(report.designs) if d.failed is None]
     wide = max(24, *(1 + len(name) for name in names))
     lines = ["  standard error in percent, by data and prior; in brackets: not determined"]
+    if report.mean_force is not None:
+        lines += _wrapped("no mean force in newtons was given: forces, stiffness and damping are stated per newton of mean "
+                          f"force (that of the fitted muscle is {report.mean_force:.3g} N)", 4, "  ")  # fmt: skip
     for start in range(0, max(len(possible), 1), COLUMNS):
         block = possible[start : start + COLUMNS]
-        heads = ["value", "prior", "now", *(label for label, _ in block)]
-        lines.append(f"  {'':<{wide}}{heads[0]:>9}" + "".join(f"{head:>6}" for head in heads[1:]))
+        heads = ["prior", "now", *(label for label, _ in block)]
+        lines.append(f"  {'':<{wide}}{'value':>9} {'unit':<5}" + "".join(f"{head:>6}" for head in heads))
         for name in names:
             now = report.present.quantities[name]
             cells = [f"({_cell(now, now.prior_sd)})", *(_shown(o.quantities[name]) for o in
                                                         (report.present, *(d for _, d in block)))]  # fmt: skip
-            lines.append(f"  {name:<{wide}}{now.value:>9.3g}" + "".join(f"{cell:>6}" for cell in cells))
+            value, unit = _stated(now, None if name == "mean" else report.mean_force)
+            lines.append(f"  {name:<{wide}}{value:>9.3g} {unit:<5}" + "".join(f"{cell:>6}" for cell in cells))
     return lines
+
+
+def _stated(known: Known, mean_force: float | None) -> tuple[float, str]:
+    """Value and unit as the fit prints them."""
+    value, unit = known.value, known.unit
+    if mean_force is not None and unit in RELATIVE:
+        value, unit = value / mean_force, RELATIVE[unit]
+    return value, "" if unit == "1" else unit
 
 
 def _shown(known: Known) -> str:
@@ -246,9 +267,17 @@ def _sentences(report: IdentifiabilityReport) -> list[str]:
     lines = []
     for outlook in (*report.designs, *report.telling_pairs[:PAIRS_TOLD]):
         lines += _wrapped(str(outlook), 4, "  - ")
-    best = max((*report.designs, *report.pairs), key=lambda o: (o.determined, len(o.gained)), default=None)
-    if best is not None and best.failed is None:
+    best = _most(report)
+    if best is not None:
         count = len(report.free) - best.determined
         rest = f"{count} of {len(report.free)} combinations stay open" if count else "nothing stays open"
         lines += _wrapped(f"most would be learnt from {best.name}: {rest}", 4, "  - ")
     return lines
+
+
+def _most(report: IdentifiabilityReport) -> Outlook | None:
+    """What determines most; among equals one measurement before two, then that with the smaller errors."""
+    possible = [(outlook, alone) for outlooks, alone in ((report.designs, True), (report.pairs, False))
+                for outlook in outlooks if outlook.failed is None]  # fmt: skip
+    ranks = {o.name: (o.determined, len(o.gained), alone, -o.log_left) for o, alone in possible}
+    return max((o for o, _ in possible), key=lambda o: ranks[o.name], default=None)

@@ -1,0 +1,50 @@
+"""`jaxmuscle identifiability`."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+import jaxmuscle as jm
+
+from .console import fit_into, out, plain, record, reporting, writable
+from .options import Force, Formats, Json, Output, Quantity, Seed, Segments, TargetTask, formats_of
+
+
+def identifiability(
+    target: Annotated[str, typer.Argument(help="A fit.json, a bundled spectrum, or the file of a spectrum or recording.")],
+    task: TargetTask = None,
+    segments: Segments = None,
+    quantity: Quantity = None,
+    seed: Seed = 0,
+    output: Output = Path("out"),
+    formats: Formats = None,
+    force: Force = False,
+    as_json: Json = False,
+) -> None:
+    """What should you measure next? Say what the data determine, and what further measurements would.
+
+    Fits first (unless given a fit.json). The further measurements are the usual ones: the mean force, the displacement under
+    a load, a moved insertion, another force level, a longer recording. Writes DIR/identifiability.json,
+    DIR/identifiability.png and DIR/fit.json.
+
+    Examples:
+
+        jaxmuscle identifiability out/fit/fit.json --out out/next
+
+        jaxmuscle identifiability my-spectrum.csv --segments 12 --out out/next
+    """
+    with reporting(as_json):
+        from jaxmuscle._common.environment import keep_compiled_programs
+        from jaxmuscle._common.figures import write_figure
+
+        keep_compiled_programs()
+        taken_up = Path(target).resolve() == (output / "fit.json").resolve()
+        writable(output, *["fit.json"] * (not taken_up), "identifiability.json", force=force)
+        asked = {"task": task, "noise": None, "free": None, "fix": None}
+        found = jm.identifiability(fit_into(output, target, {"segments": segments, "quantity": quantity}, asked, seed))
+        found.save(output / "identifiability.json")
+        figures = write_figure(found.plot(), output, "identifiability", formats_of(formats))
+        record(output / "identifiability.json")
+        out.print(plain(found), highlight=False, soft_wrap=True)
+        out.print(f"Written: {output}/{', '.join(['identifiability.json', *figures, 'fit.json'])}", highlight=False)
