@@ -108,13 +108,12 @@ def _write(found: "Comparison", folder: Path, formats: list[str]) -> list[str]:
 
 def _unsettled(found: "Comparison") -> str:
     """Whose search did not come to its end, and what may help: the parameters that the data say least about."""
-    from jaxmuscle.model._parameters import RESONANCE
-
     rows = [row for row in found.rows if not row.success]
     words = f"the search did not come to its end for {'; '.join(row.label for row in rows)}. Do not use these rows"
-    own = [n for n in RESONANCE if all(n in found.tasks[row.noise, row.harmonic].parameter_names for row in rows)]
-    name = own[-1] if own else "c_z"
-    value = float(found.tasks[rows[0].noise, rows[0].harmonic][name])
+    tasks = [found.tasks[row.noise, row.harmonic] for row in rows]
+    common = set[str].intersection(*(set(task.parameter_names) for task in tasks))
+    name = "resonance_width" if "resonance_width" in common else "c_z"
+    value = float(tasks[0][name])
     return f"{words}. Hold a parameter of theirs, for example --fix {name}={value:.2g}, or leave it out of --free"
 
 
