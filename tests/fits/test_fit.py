@@ -115,11 +115,7 @@ def test_welch_operator_refuses_a_window_shorter_than_a_segment():
 )
 @pytest.mark.slow
 def test_moments_are_those_of_a_plain_ensemble(x64, task, colour_free):
-    """But for the cross term of line and noise, whose expectation is zero.
-
-    Normals have single precision (docs/engine.md). Two programs may round them differently, by 6e-8, and powers by twice
-    that.
-    """
+    """But for the cross term of line and noise, whose expectation is zero."""
     key, seeds, dt = jax.random.key(3), 16, 2.5e-3
     runs = jm.ensemble(task, key, seeds=seeds, dt=dt)
     quiet = np.asarray(jm.simulate(references.quiet(task), key, dt=dt).output)
@@ -135,11 +131,11 @@ def test_moments_are_those_of_a_plain_ensemble(x64, task, colour_free):
     output = np.asarray(runs.output)
     line, random = powers(quiet), powers(output - quiet)
     np.testing.assert_allclose(moments.line, line, rtol=1e-9)
-    np.testing.assert_allclose(moments.power, line + random.mean(axis=0), rtol=1.2e-7)
-    np.testing.assert_allclose(moments.mean, output[:, 500:1500].mean(), rtol=6e-8)
+    np.testing.assert_allclose(moments.power, line + random.mean(axis=0), rtol=1e-9)
+    np.testing.assert_allclose(moments.mean, output[:, 500:1500].mean(), rtol=1e-12)
     passed, still = (scipy.signal.sosfilt(task.settings.sections, x)[..., 500:1500] for x in (output - quiet, quiet))
     variance = still.var() + passed.var(axis=1).mean()
-    np.testing.assert_allclose(moments.variance, variance, rtol=1.2e-7)
+    np.testing.assert_allclose(moments.variance, variance, rtol=1e-9)
     cross = powers(output) - line - random
     references.assert_standard_normal(cross.mean(axis=0) / (cross.std(axis=0, ddof=1) / np.sqrt(seeds)))
     assert np.isclose(float(moments.variation), np.sqrt(variance) / abs(output[:, 500:1500].mean()))
