@@ -224,9 +224,9 @@ def test_the_command_writes_a_folder_for_each_and_the_table(tmp_path):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("person,group\na,b\n", "needs a header with the columns target and group"),
-        ("target,group\n", "needs a header with the columns target and group, and a line per target"),
-        ("target,group\na,\n", "line 2: give a target and its group"),
+        ("person,group\na,b\n", "has no columns target and group"),
+        ("target,group\n", "has no columns target and group"),
+        ("target,group\na,\n", "line 2: a cell is empty; give a target and its group"),
         ("target,group\na,b\na,c\n", "line 3: a is in group b already"),
         ("target,group\nsomebody,b\n", "no target is called somebody"),
     ],
@@ -241,6 +241,6 @@ def test_bad_groups(text, message, tmp_path):
 def test_groups_and_seeds_do_not_go_with_everything(tmp_path):
     path = tmp_path / "groups.csv"
     path.write_text("target,group\na,b\n")
-    assert "--groups needs several targets" in command("fdi-abduction-45mvc", "--groups", path).stderr
+    assert "--groups compares several spectra" in command("fdi-abduction-45mvc", "--groups", path).stderr
     both = command("fdi-abduction-45mvc", "vastus-lateralis-26mvc", "--seeds", 8)
     assert both.exit_code == 2 and "leave out --method, --seeds and --quick" in both.stderr

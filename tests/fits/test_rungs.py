@@ -69,7 +69,7 @@ def test_other_rungs_are_refused(rung):
 def test_a_task_that_stands_on_a_rung_is_not_lifted_again():
     with pytest.raises(ValueError, match="already"):
         jm.on_rung(jm.on_rung(TASK, 1), 2)
-    with pytest.raises(ValueError, match="without activation and resonance"):
+    with pytest.raises(ValueError, match="has no activation or resonance yet"):
         jm.fit(jm.on_rung(TASK, 1), drawn(expected(TASK), 12, 1), rungs=2)
     with pytest.raises(ValueError, match="the highest is 3"):
         jm.fit(TASK, drawn(expected(TASK), 12, 1), rungs=4)

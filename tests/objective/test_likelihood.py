@@ -190,7 +190,7 @@ def test_a_recording_prefers_the_muscle_that_made_it():
 
 
 def test_what_has_no_likelihood():
-    with pytest.raises(ValueError, match="states no segments"):
+    with pytest.raises(ValueError, match="does not state its segments"):
         jm.log_likelihood(jm.Isometric(), jm.Target("bare", np.linspace(2, 1, 30)))
     with pytest.raises(ValueError, match="below half the sampling rate"):
         jm.log_likelihood(jm.Isometric().replace(harmonic_frequency=60.0), jm.load_target("vastus-lateralis-26mvc"))
