@@ -107,7 +107,7 @@ def _write(found: "Comparison", folder: Path, formats: list[str]) -> list[str]:
 
 
 def _unsettled(found: "Comparison") -> str:
-    """Whose search did not come to its end, and what may help: the parameters that the data say least about."""
+    """Whose search did not come to its end, and what may help: holding a parameter that the data say little about."""
     rows = [row for row in found.rows if not row.success]
     words = f"the search did not come to its end for {'; '.join(row.label for row in rows)}. Do not use these rows"
     tasks = [found.tasks[row.noise, row.harmonic] for row in rows]

@@ -18,7 +18,7 @@ STATE = 4  # the column of a fit's card that says whether the data determine a n
 PARAMETERS = ("name", "value", "95 % interval", "unit", "what it is")
 FIGURES = {
     "fit": "Points: target, with the range of one standard deviation. Blue line: fit. Bars: residuals, up where the target "
-    "lies above the fit; the grey bands are one and two standard deviations.",
+    "lies above the fit; the grey bands are one and two standard deviations. Orange bars are beyond them.",
     "stiffness": "Points: measured dynamic stiffness with two standard errors either way. Blue line: fit.",
     "cohort": "What the data of at least half of the targets determine, with standard errors. Spectra: every target (thin), "
     "the geometric mean of each group with its standard error (thick).",
@@ -42,7 +42,7 @@ def fit_report(result: "FitResult", figure: Any, folder: Path) -> None:
         pages.picture(figure, FIGURES["fit" if result.only.fitted.size else "stiffness"]),
         pages.heading("What it means"),
         pages.items(card.remarks),
-        *([pages.paragraph("The data do not notice if:"), pages.items(result.undetermined)] if result.undetermined else []),
+        *([pages.paragraph("The data leave open:"), pages.items(result.undetermined)] if result.undetermined else []),
         pages.heading("What to do next"),
         pages.items(_after_a_fit(result, folder / "fit.json")),
     ]
@@ -206,7 +206,7 @@ def _after_a_fit(result: "FitResult", path: Path) -> list[str]:
     place, other = shlex.quote(str(path)), shlex.quote(str(path.parent / "compare"))
     if not result.adequate:
         return [
-            "Look at the residuals: red bars are where the model misses the data.",
+            "Look at the residuals: orange bars are where the model misses the data.",
             *([f"Try other noises: `jaxmuscle compare {place} --out {other}`."] if result.only.fitted.size else []),
             "Look for drift and tremor in the recording: `jaxmuscle analyse RECORDING`.",
             "Report that the model does not describe the data, and no number of the model.",
@@ -215,7 +215,7 @@ def _after_a_fit(result: "FitResult", path: Path) -> list[str]:
     return [
         f"How sure is each number? `jaxmuscle posterior {place}` draws from the posterior.",
         f"Move the parameters yourself: `jaxmuscle explore {place}`.",
-        f"What should you measure to know the rest? In Python: `jm.identifiability(jm.load_result({str(path)!r}))`.",
+        f"What should you measure to know the rest? `jaxmuscle identifiability {place}`.",
         'In a paper, give the numbers under "What the data determine" with their intervals.',
         "Name those that the data do not determine.",
     ]

@@ -54,8 +54,8 @@ class Trajectory(Shown, eqx.Module):
         known = [("task", type(self.task).__name__), ("time", f"0 to {(samples - 1) / self.rate:g} s at {self.rate:g} Hz")]
         known.append(("seeds", str(int(np.prod(self.output.shape[:-1], dtype=int)))))
         if is_concrete(self.output):
-            low, high = np.min(np.asarray(self.output)), np.max(np.asarray(self.output))
-            known.append(("range", f"{low + 0.0:.4g} to {high + 0.0:.4g} {unit}"))
+            low, high = (found(np.asarray(self.output)) + 0.0 for found in (np.min, np.max))  # -0 is shown as 0
+            known.append(("range", f"{low:.4g} to {high:.4g} {unit}"))
         return facts(f"trajectory of {name} [{unit}]", known)
 
     @property
