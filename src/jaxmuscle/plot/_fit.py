@@ -6,7 +6,6 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from matplotlib import rcParams
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure, SubFigure
 
@@ -16,7 +15,6 @@ from ._components import parts_of_power
 from ._spectra import target
 from ._stiffness import gain, phase, stiffness_residuals
 from ._style import (
-    BLACK,
     BLUE,
     COLUMN,
     GREY,
@@ -25,9 +23,11 @@ from ._style import (
     canvas,
     fitted_to,
     heading,
+    ink,
     key,
     named,
     output_label,
+    shade,
     styled,
     without_legend,
 )
@@ -169,16 +169,16 @@ def _residuals(ax: Axes, part: Any, p: float | None = None) -> None:
     reach = float(np.max(np.abs(residual), where=np.isfinite(residual), initial=3.0 if known else 0.1)) * 1.1
     ax.set(ylim=(-reach, reach), ylabel="Residual (SD)" if known else "Residual (ln units)")
     if known:
-        for deviations, shade in ((2, "0.94"), (1, "0.87")):
-            ax.axhspan(-deviations, deviations, color=shade, lw=0, zorder=0)
+        for deviations, grey in ((2, 0.06), (1, 0.13)):
+            ax.axhspan(-deviations, deviations, color=shade(grey), lw=0, zorder=0)
     if not np.isfinite(residual).all():
         _say(ax, "no finite fit")
-    ax.axhline(0, color=BLACK, lw=0.6, zorder=4)
+    ax.axhline(0, color=ink(), lw=0.6, zorder=4)
 
 
 def _closeness(ax: Axes, part: Any, p: float | None) -> None:
     words = "no χ² (spread unknown)" if part.chi2_per_bin is None else f"χ² per bin {part.chi2_per_bin:.2f}"
-    color = rcParams["text.color"] if p is None else DARK_GREEN if p >= 0.01 else VERMILLION
+    color = ink() if p is None else DARK_GREEN if p >= 0.01 else VERMILLION
     words += "" if p is None else f", {probability(p)}"
     ax.set_title(words if np.isfinite(part.fitted).all() else "Residual", color=color)
 
@@ -201,7 +201,7 @@ def _stretch(ax: Axes, part: Any) -> None:
 def _profile(ax: Axes, result: Any) -> None:
     """Which other frequencies of the harmonic the spectrum allows."""
     frequency, rise = map(np.asarray, result.profile)
-    ax.axhspan(0, ALLOWED, color="0.9", lw=0, zorder=0, label="95 % interval of the frequency")
+    ax.axhspan(0, ALLOWED, color=shade(0.1), lw=0, zorder=0, label="95 % interval of the frequency")
     ax.plot(frequency, rise, color=BLUE, marker=".", ms=3)
     ax.axvline(float(result.task["harmonic_frequency"]), color=ORANGE, lw=0.8, ls=(0, (4, 2)), zorder=0)
     ax.set_title("Profile of the harmonic's frequency")

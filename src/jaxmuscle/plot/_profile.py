@@ -7,9 +7,23 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure, SubFigure
 
-from ._style import BLUE, GREY, ORANGE, axes_or_new, canvas, log_axis, styled
+from ._style import (
+    BLUE,
+    COLUMN,
+    GREY,
+    ORANGE,
+    axes_or_new,
+    canvas,
+    fitted_to,
+    heading,
+    key,
+    log_axis,
+    styled,
+    without_legend,
+)
 
 SHOWN = 3.0  # times the threshold
+HEIGHT, ACROSS = 1.7, 2  # inches, panels
 
 
 @styled
@@ -39,7 +53,7 @@ def profile(found: Any, ax: Axes | None = None) -> Axes:
     ax.set_title(f"{found.target}: profile likelihood", pad=18)
     if found.low is None or found.high is None:
         side = "on both sides" if found.low is found.high else "downwards" if found.low is None else "upwards"
-        ax.text(0.99, 0.97, f"open {side}", transform=ax.transAxes, color=GREY, fontsize=7, ha="right", va="top")
+        ax.text(0.99, 0.97, f"open {side}", transform=ax.transAxes, color=GREY, ha="right", va="top")
     ax.legend(frameon=False, loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=3, borderaxespad=0.0)
     return ax
 
@@ -52,20 +66,15 @@ def profiles(profiles: Sequence[Any], ax: Axes | None = None) -> Figure | SubFig
     """
     if not profiles:
         raise ValueError("profiles: is empty; give [jm.profile(result, name) for name in ...]")
-    columns = min(len(profiles), 3)
+    columns = min(len(profiles), ACROSS)
     rows = -(-len(profiles) // columns)
-    fig = canvas(ax, (2.25 * columns, 1.7 * rows + 0.5))
+    fig = canvas(ax, (COLUMN, HEIGHT * rows))
     for number, found in enumerate(profiles, start=1):
         panel = profile(found, fig.add_subplot(rows, columns, number))
         panel.set_title("")
         panel.set_ylabel("Rise of -2 ln L")
-        handles, labels = panel.get_legend_handles_labels()
-        legend = panel.get_legend()
-        if legend is not None:
-            legend.remove()
-        if number == 1:
-            fig.legend(handles, labels, loc="outside lower center", ncols=3, frameon=False)
-    fig.suptitle(profiles[0].target, x=0.02, ha="left", size=9, weight="bold", parse_math=False)
+        without_legend(panel)
+    fitted_to(fig, HEIGHT * rows, heading(fig, profiles[0].target) + key(fig, 3))
     return fig
 
 
