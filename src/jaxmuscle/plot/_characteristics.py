@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 
-from ._style import BLUE, COLUMN, GREEN, GREY, VERMILLION, canvas, fitted_to, key, legend, styled
+from ._style import BLUE, COLUMN, GREEN, GREY, VERMILLION, canvas, fitted_to, key, styled
 
 HEIGHTS = 1.7, 1.7  # inches
 TISSUES = (("w", BLUE, "active tissue", 3.0), ("z", VERMILLION, "passive tissue", 1.5))
@@ -22,16 +22,14 @@ def static(curves: Any, ax: Any = None) -> tuple[Axes, Axes, Axes]:
     """
     if ax is not None and len(ax) != 3:
         raise ValueError(f"ax has {len(ax)} axes: give three, for K(x), C(v) and force against displacement")
-    fig = canvas(None, (COLUMN, sum(HEIGHTS))) if ax is None else None
-    axes = tuple(ax) if fig is None else _places(fig)
-    stiffness, damping, force = axes
+    stiffness, damping, force = _places(canvas(None, (COLUMN, sum(HEIGHTS)))) if ax is None else ax
     _coefficients(curves, stiffness, damping)
     _forces(curves, force)
-    if fig is not None:
-        fitted_to(fig, sum(HEIGHTS), key(fig))
+    if ax is None:
+        fitted_to(force.figure, sum(HEIGHTS), key(force.figure))
     else:
-        for panel in axes:
-            legend(panel, "above")
+        for panel in (stiffness, damping, force):
+            panel.legend(loc="best")
     return stiffness, damping, force
 
 

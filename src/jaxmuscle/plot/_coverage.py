@@ -5,9 +5,7 @@ from typing import Any
 
 import numpy as np
 import scipy.stats
-from jaxtyping import Float
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
 from ._style import COLUMN, GREY, PALETTE, canvas, fitted_to, ink, key, named, shade, styled
 
@@ -43,8 +41,8 @@ def coverage(ranks: Mapping[str, Any], draws: int | None = None, ax: Axes | None
         raise ValueError("ranks: is empty; give {quantity: ranks of the truth, one for each simulation}")
     if not 0 < level < 1:
         raise ValueError(f"level = {level!r} must lie between 0 and 1: 0.95 is usual")
-    fig = canvas(None, (COLUMN, HEIGHT)) if ax is None else None
-    ax = ax if fig is None else fig.add_subplot()
+    own = ax is None
+    ax = canvas(None, (COLUMN, HEIGHT)).add_subplot() if ax is None else ax
     fewest = min(map(len, held.values()))
     low, high = (scipy.stats.binom.ppf(0.5 + side * level / 2, fewest, FINE) / fewest for side in (-1, 1))
     chance = f"{100 * level:g} % by chance, {fewest} simulations"
@@ -56,14 +54,14 @@ def coverage(ranks: Mapping[str, Any], draws: int | None = None, ax: Axes | None
         ax.step(FINE, share, where="post", lw=1.2, zorder=3, label=named(name.replace("_", " "), 30), **style)
     ax.set(xlim=(0, 1), ylim=(0, 1), xlabel="Credibility α of the interval", ylabel="Share that holds the truth")
     ax.set_aspect("equal", adjustable="box")
-    if isinstance(fig, Figure):
-        fitted_to(fig, HEIGHT, key(fig))
+    if own:
+        fitted_to(ax.figure, HEIGHT, key(ax.figure))
     else:
         ax.legend(loc="upper left")
     return ax
 
 
-def _credibility(name: str, ranks: Float[np.ndarray, " simulations"], draws: int | None) -> np.ndarray:
+def _credibility(name: str, ranks: np.ndarray, draws: int | None) -> np.ndarray:
     """The credibility from which on a central interval holds the truth, of every simulation, sorted."""
     top = 1 if draws is None else draws
     if ranks.ndim != 1 or not len(ranks):

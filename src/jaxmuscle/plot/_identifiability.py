@@ -12,7 +12,7 @@ from ._style import BLUE, COLUMN, GREY, VERMILLION, canvas, fitted_to, heading, 
 TEXT, DOTS, ROW = 0.14, 0.15, 0.2  # inches: a line of words, its dots, a row of the table
 NAMES, CELL = 1.3, 0.28  # inches: the names of quantities, the narrowest column
 LEAST, EDGE = 1e-2, 5e-3
-WRAP, WIDEST = 54, 20  # letters
+WRAP, WIDEST = 60, 20  # letters
 PAIRS = 3
 
 

@@ -31,10 +31,10 @@ def profile(found: Any, ax: Axes | None = None) -> Axes:
     """Draws a profile likelihood with its interval and the parabola of the curvature. Returns the axes (`ax` or new)."""
     ax = axes_or_new(ax)
     ax.plot(found.values, found.rise, color=BLUE, marker="o", ms=2.5, lw=1.2, label="profile")
-    ax.axhline(found.threshold, color=GREY, lw=0.8, ls=(0, (4, 2)), label=f"{100 * found.level:g} %")
-    for low, high in found.intervals:
+    ax.axhline(found.threshold, color=GREY, lw=0.8, ls=(0, (4, 2)), label=f"{100 * found.level:g} % threshold")
+    for number, (low, high) in enumerate(found.intervals):
         ends = found.values[0] if low is None else low, found.values[-1] if high is None else high
-        ax.axvspan(*ends, color=BLUE, alpha=0.1, lw=0)
+        ax.axvspan(*ends, color=BLUE, alpha=0.1, lw=0, label=f"{100 * found.level:g} % interval" if not number else None)
     wide = np.all(found.values > 0) and found.values[-1] > 10 * found.values[0]
     if wide:
         x = np.geomspace(found.values[0], found.values[-1], 200)
@@ -50,11 +50,11 @@ def profile(found: Any, ax: Axes | None = None) -> Axes:
     if wide:
         log_axis(ax)
     ax.set_xlabel(found.name + ("" if found.unit == "1" else f" ({found.unit})"))
-    ax.set_title(f"{found.target}: profile likelihood", pad=18)
+    ax.set_title(f"{found.target}: profile likelihood", pad=32, parse_math=False)
     if found.low is None or found.high is None:
         side = "on both sides" if found.low is found.high else "downwards" if found.low is None else "upwards"
         ax.text(0.99, 0.97, f"open {side}", transform=ax.transAxes, color=GREY, ha="right", va="top")
-    ax.legend(frameon=False, loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=3, borderaxespad=0.0)
+    ax.legend(frameon=False, loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=2, borderaxespad=0.0)
     return ax
 
 
@@ -74,7 +74,7 @@ def profiles(profiles: Sequence[Any], ax: Axes | None = None) -> Figure | SubFig
         panel.set_title("")
         panel.set_ylabel("Rise of -2 ln L")
         without_legend(panel)
-    fitted_to(fig, HEIGHT * rows, heading(fig, profiles[0].target) + key(fig, 3))
+    fitted_to(fig, HEIGHT * rows, heading(fig, profiles[0].target) + key(fig))
     return fig
 
 

@@ -43,6 +43,7 @@ STYLE: dict[str, Any] = {
     "figure.dpi": 160.0,
 }
 COLUMN = 4.4  # inches: in a column of 85 mm letters of 8 points are those of 6
+ON_DARK = 1.8  # times as strong is a grey on a dark page, to be seen as well
 LINE = 0.17  # inches
 SIZE = (COLUMN, 3.0)
 LOCK = threading.RLock()  # pyplot and rcParams are those of all threads
@@ -78,6 +79,7 @@ def ink() -> str:
 def shade(strength: float) -> tuple[float, float, float]:
     """A grey between the page (0) and the letters (1), for areas behind lines; right on a white and on a dark page."""
     page, letters = (np.array(to_rgb(matplotlib.rcParams[name])) for name in ("axes.facecolor", "text.color"))
+    strength *= 1.0 if page.mean() > letters.mean() else ON_DARK
     red, green, blue = page + strength * (letters - page)
     return float(red), float(green), float(blue)
 
