@@ -269,28 +269,30 @@ def _levels(problem: FitProblem, made: PosteriorDensity, offsets: np.ndarray) ->
         weight, variation = map(np.asarray, _weights(made, s, offsets, i))
         column = int(np.argmax(np.where(loose, [n != "harmonic_amplitude" for n in base], -1.0)))
         along = np.where(loose, 1 / c.sd, 0.0)
-        levels.append(Level(s[column], np.asarray(c.sd[column]), variation, along, weight, column, i))
+        levels.append(Level(np.asarray(s[column]), np.asarray(c.sd[column]), variation, along, weight, column, i))
         open_now = open_now & ~loose
     return tuple(levels)
 
 
 @kept
-def _levelling(made: PosteriorDensity, s: Array) -> Array:
+def _levelling(made: PosteriorDensity, s: Array | np.ndarray) -> Array:
     """How coordinates change with those that are counted from levels."""
-    return jax.jacfwd(lambda s: made.levelled(s)[0])(s)
+    return jax.jacfwd(lambda s: made.levelled(s)[0])(jnp.asarray(s))
 
 
 @kept
-def _weights(made: PosteriorDensity, s: Array, offsets: Array, part: int) -> tuple[Array, Array]:
+def _weights(
+    made: PosteriorDensity, point: Array | np.ndarray, offsets: Array | np.ndarray, part: int
+) -> tuple[Array, Array]:
     """Of the frequencies of the band that acts on a part; the log coefficient of variation with these."""
-    band = made.band_of(part)
-    weight = jnp.ones(1) if band is None else jax.nn.softmax(made.heights(band, s, offsets, {}))
+    band, s = made.band_of(part), jnp.asarray(point)
+    weight = jnp.ones(1) if band is None else jax.nn.softmax(made.heights(band, s, jnp.asarray(offsets), {}))
     return weight, made.log_variation(s, part, weight)[0]
 
 
 @kept
-def _tables(settings: SpectrumSettings, frequency: Array, samples: Array) -> LineTable:
-    return jax.vmap(lambda f: line_table(settings, WINDOW, f, samples))(frequency)
+def _tables(settings: SpectrumSettings, frequency: Array | np.ndarray, samples: np.ndarray) -> LineTable:
+    return jax.vmap(lambda f: line_table(settings, WINDOW, f, samples))(jnp.asarray(frequency))
 
 
 def _band(problem: FitProblem, peak: Maximum, name: str) -> Band:
