@@ -1,5 +1,7 @@
 """The command `jaxmuscle`, also as `python -m jaxmuscle`."""
 
+import gc
+import os
 import signal
 
 if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
@@ -10,6 +12,9 @@ from jaxmuscle.commands.signals import heard
 
 def main() -> None:
     """Entry point of the console script: signals are heard before anything large is imported."""
+    # A fit's matrices are small: OpenBLAS's other threads would spin between them, for half as long as the fit computes.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    gc.set_threshold(50_000)  # what is imported and loaded stays: to look through it again and again is of no use
     with heard():
         from jaxmuscle.commands.main import main as command
 

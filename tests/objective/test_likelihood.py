@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 import scipy.signal
 import scipy.stats
-from scipy.special import gammaln
+from scipy.special import digamma, gammaln
 
 import jaxmuscle as jm
 from jaxmuscle._common.arrays import as_arrays
-from jaxmuscle.objective._likelihood import _log_gamma, likeliest_offset, log_density, log_marginal, measured_bins
+from jaxmuscle.objective._likelihood import _gamma_level, likeliest_offset, log_density, log_marginal, measured_bins
 from jaxmuscle.response._expected import expected_moments
 from jaxmuscle.spectra._bin_law import bin_rows, welch_law
 
@@ -73,9 +73,31 @@ def test_without_correlation_the_density_of_proportional_powers_is_a_closed_form
     assert float(found) == pytest.approx(expected, abs=1e-6)
 
 
-def test_log_gamma():
+def test_gamma_level():
     a = np.geomspace(0.5, 1e4, 200)
-    np.testing.assert_allclose(_log_gamma(jnp.asarray(a)), gammaln(a), rtol=1e-12, atol=2e-7)
+    level, slope = _gamma_level(jnp.asarray(a))
+    np.testing.assert_allclose(level, a * np.log(a) - gammaln(a), rtol=1e-12, atol=2e-7)
+    np.testing.assert_allclose(slope, np.log(a) + 1 - digamma(a), rtol=1e-12, atol=2e-6)
+
+
+def test_slopes_by_hand_are_those_of_differences():
+    """With a line that fills some bins, one beyond the share that still scatters, and bins that are left out."""
+    target = jm.load_target("vastus-lateralis-26mvc")
+    bins = measured_bins(target, mask=np.arange(30) % 7 > 0)
+    noise = np.asarray(jm.expected_spectrum(jm.task_for(target)).power)
+    line = noise * np.geomspace(1e-3, 1e2, 30)
+    line[3] = 1e5 * noise[3]
+    point = (noise + line, line, jnp.asarray(0.1))
+
+    def moved(which, i, step):
+        return log_density(bins, *(jnp.asarray(x).at[i].add(step) if k == which else x for k, x in enumerate(point)))
+
+    slopes = jax.grad(lambda at: log_density(bins, *at))(point)
+    for which, scale in enumerate((noise, noise, np.ones(()))):
+        for i in np.ndindex(scale.shape):
+            step = 1e-5 * scale[i]
+            expected = float(moved(which, i, step) - moved(which, i, -step)) / (2 * step)
+            assert float(slopes[which][i]) == pytest.approx(expected, rel=1e-5, abs=1e-6)
 
 
 def test_scale_of_the_model_does_not_count():

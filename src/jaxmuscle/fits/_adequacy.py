@@ -21,7 +21,7 @@ from ._refit import STRENGTHS, Refit, refit_of
 
 ADEQUATE = 0.01
 REPLICATES = 999
-CHUNK = 500
+CHUNK = 200
 Rows = Float[np.ndarray, "replicates residuals"]
 
 

@@ -42,11 +42,11 @@ class Refit(NamedTuple):
         """`|(1 - U Uᵀ) (r - change)|²` with the penalty, less `|r|²`."""
         residuals = residuals @ self.narrow
         lines, size, fitted = self.taken.shape
-        basis = np.moveaxis(self.taken, 1, 0).reshape(size, -1)
         held = np.einsum("la,lak->lk", self.change, self.taken)
-        inside = (residuals @ basis).reshape(len(residuals), lines, fitted) - held
-        outside = np.sum(self.change**2, axis=1) + self.penalty - 2 * residuals @ self.change.T
-        return outside - np.sum(inside**2, axis=2)
+        away = self.change - np.einsum("lak,lk->la", self.taken, held)
+        inside = (residuals @ np.moveaxis(self.taken, 1, 0).reshape(size, -1)).reshape(len(residuals), lines, fitted)
+        level = np.sum(self.change**2, axis=1) + self.penalty - np.sum(held**2, axis=1)
+        return level - 2 * residuals @ away.T - np.einsum("rlk,rlk->rl", inside, inside)
 
     def left(self, residuals: Float[np.ndarray, "rows all"], line: np.ndarray | int = -1) -> Float[np.ndarray, "rows all"]:
         """What is left of every row with its line."""

@@ -9,6 +9,7 @@ import numpy as np
 from jaxmuscle._common.environment import versions
 from jaxmuscle._common.errors import SimulationError
 from jaxmuscle._common.keys import fold_in
+from jaxmuscle._common.programs import kept
 from jaxmuscle.ensembles._ensemble import runs_for_means
 from jaxmuscle.model._noises import with_active_noise
 from jaxmuscle.model._tasks import AbstractTask
@@ -256,7 +257,10 @@ def further_of(part: PartResiduals, moments: Moments) -> dict[str, float]:
     """Residuals of a target's coefficient of variation and mean by name."""
     names = [name for name, given in (("coefficient_of_variation", part.data.variation), ("mean", part.data.mean))
              if given is not None]  # fmt: skip
-    return dict(zip(names, map(float, further_residuals(moments, part.data)), strict=False))
+    return dict(zip(names, map(float, np.asarray(_further(moments, part.data))), strict=False))
+
+
+_further = kept(further_residuals)
 
 
 def of_several(parts: dict[str, FittedPart]) -> tuple[str, ...]:

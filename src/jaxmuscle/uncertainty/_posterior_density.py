@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxmuscle._common.programs import kept
 from jaxmuscle._common.types import Scalar
 from jaxmuscle.model._parameters import amplitude_names
 from jaxmuscle.model._signals import Constant
@@ -25,7 +26,7 @@ from jaxmuscle.response._input_response import parts_of_stiffness
 from jaxmuscle.response._linearised import Linearisation, linearise
 from jaxmuscle.response._transfer import harmonic_system, polynomial, polynomials
 from jaxmuscle.spectra._bin_law import trial_samples
-from jaxmuscle.spectra._settings import WINDOW
+from jaxmuscle.spectra._settings import WINDOW, SpectrumSettings
 
 PER_BIN = 3
 BEYOND = 2.0  # bins
@@ -237,17 +238,17 @@ def density_about(
     columns = tuple(i for i, name in enumerate(names) if name not in summed)
     s, offsets = coordinates.from_theta(peak.theta[best]), tuple(i for i, b in enumerate(likelihood.bins) if b is not None)
     stretch = np.append(coordinates.stretch(s), np.ones(len(likelihood.bins)))
-    kept = [*columns, *(len(names) + i for i in offsets)]
-    covariance = np.linalg.pinv(peak.curvature[best] * stretch[:, None] * stretch, hermitian=True)[np.ix_(kept, kept)]
+    sampled = [*columns, *(len(names) + i for i in offsets)]
+    covariance = np.linalg.pinv(peak.curvature[best] * stretch[:, None] * stretch, hermitian=True)[np.ix_(sampled, sampled)]
     scale = np.linalg.cholesky(covariance + 1e-10 * np.diag(np.diag(covariance)))
-    centre = np.append(s, peak.offset[best])[kept]
+    centre = np.append(s, peak.offset[best])[sampled]
     made = PosteriorDensity(likelihood, bands, s, centre, scale, (), columns, offsets)
     levels = _levels(problem, made, peak.offset[best])
     if levels:
         made = dataclasses.replace(made, levels=levels)
-        turn = np.eye(len(kept))
+        turn = np.eye(len(sampled))
         inner = np.ix_(range(len(columns)), range(len(columns)))
-        slope = np.asarray(jax.jit(jax.jacfwd(lambda s: made.levelled(s)[0]))(jnp.asarray(s)))
+        slope = np.asarray(_levelling(made, s))
         turn[inner] = slope[np.ix_(columns, columns)]
         made = dataclasses.replace(made, scale=np.linalg.solve(turn, scale))
     return made, peak, best
@@ -260,24 +261,38 @@ def _levels(problem: FitProblem, made: PosteriorDensity, offsets: np.ndarray) ->
     amplitudes = {name for part in problem.parts for name in amplitude_names(part.task)}
     amplitude = [name in amplitudes for name in base]
     open_now = np.array(amplitude) & c.positive & ~np.isfinite(c.low)
-    s, levels = jnp.asarray(made.point), []
+    s, levels = np.asarray(made.point), []
     for i, part in enumerate(problem.parts):
         loose = open_now & np.isin(np.arange(len(base)), part.columns)
         if part.variation is None or not loose.any() or not isinstance(part.task.harmonic.envelope, Constant):
             continue
-        band = made.band_of(i)
-
-        @jax.jit
-        def seen(s: Array, i: int = i, band: Band | None = band) -> tuple[Array, Array]:
-            weight = jnp.ones(1) if band is None else jax.nn.softmax(made.heights(band, s, jnp.asarray(offsets), {}))
-            return weight, made.log_variation(s, i, weight)[0]
-
-        weight, variation = map(np.asarray, seen(s))
+        weight, variation = map(np.asarray, _weights(made, s, offsets, i))
         column = int(np.argmax(np.where(loose, [n != "harmonic_amplitude" for n in base], -1.0)))
         along = np.where(loose, 1 / c.sd, 0.0)
         levels.append(Level(np.asarray(s[column]), np.asarray(c.sd[column]), variation, along, weight, column, i))
         open_now = open_now & ~loose
     return tuple(levels)
+
+
+@kept
+def _levelling(made: PosteriorDensity, s: Array | np.ndarray) -> Array:
+    """How coordinates change with those that are counted from levels."""
+    return jax.jacfwd(lambda s: made.levelled(s)[0])(jnp.asarray(s))
+
+
+@kept
+def _weights(
+    made: PosteriorDensity, point: Array | np.ndarray, offsets: Array | np.ndarray, part: int
+) -> tuple[Array, Array]:
+    """Of the frequencies of the band that acts on a part; the log coefficient of variation with these."""
+    band, s = made.band_of(part), jnp.asarray(point)
+    weight = jnp.ones(1) if band is None else jax.nn.softmax(made.heights(band, s, jnp.asarray(offsets), {}))
+    return weight, made.log_variation(s, part, weight)[0]
+
+
+@kept
+def _tables(settings: SpectrumSettings, frequency: Array | np.ndarray, samples: np.ndarray) -> LineTable:
+    return jax.vmap(lambda f: line_table(settings, WINDOW, f, samples))(jnp.asarray(frequency))
 
 
 def _band(problem: FitProblem, peak: Maximum, name: str) -> Band:
@@ -291,11 +306,9 @@ def _band(problem: FitProblem, peak: Maximum, name: str) -> Band:
     frequency = _grid(problem, peak, name)
     tables = []
     for part in (problem.parts[i] for i in acting):
-        settings, samples = part.target.settings, jnp.asarray(trial_samples(part.target))
-        compiled = jax.jit(jax.vmap(lambda f, settings=settings, n=samples: line_table(settings, WINDOW, f, n)))
-        table = compiled(jnp.asarray(frequency))
-        table = table._replace(level=table.level[:, part.chosen], turning=table.turning[:, part.chosen])
-        tables.append(jax.tree.map(np.asarray, table))
+        table = _tables(part.target.settings, frequency, np.asarray(trial_samples(part.target)))
+        table = jax.tree.map(np.asarray, table)
+        tables.append(table._replace(level=table.level[:, part.chosen], turning=table.turning[:, part.chosen]))
     return Band(frequency, _log_weight(problem, frequency, name), tuple(tables), name, tuple(acting))
 
 
