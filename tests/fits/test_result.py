@@ -229,7 +229,7 @@ def test_text_shows_what_is_known_and_what_is_not():
         "products and ratios known roughly: k_w / c_w",
         "not determined: do not interpret these values (per newton of mean force): k_w",
         "the data leave open: - stiffness and damping can all be multiplied by one number",
-        'stiffness and damping are stated per newton of mean force. In newtons, as in result['K_w0'], in to_dataframe() and '
+        "stiffness and damping are stated per newton of mean force. In newtons, as in result['K_w0'], in to_dataframe() and "
         "in fit.json, they are those of a model muscle that pulls with 2.5 N: divide by that",
         "note: a notice",
     ):
