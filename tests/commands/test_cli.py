@@ -612,6 +612,46 @@ def test_a_fit_that_is_taken_up_is_no_obstacle(tmp_path, monkeypatch):
     assert "posterior.json: is there already" in run("posterior", tmp_path / "fit.json", "--out", tmp_path).stderr
 
 
+def made_comparison(target, *, success):
+    """Two models; the search of the second one ended as told."""
+    task = jm.on_rung(jm.Isometric(), 2)
+    scores = np.linspace(-2.0, -1.0, len(target.bins))
+    rows = [
+        jm.comparison.ComparedModel(
+            noise, False, -10.0, 4.0, aic, aic - 28.0, weight, float(scores.sum()), 0.0, 0.0, 1.0, 0.4, settled, scores
+        )
+        for noise, aic, weight, settled in (("band-limited", 28.0, 0.9, True), ("tremor", 32.0, 0.1, success))
+    ]
+    tasks = {("band-limited", False): jm.Isometric(), ("tremor", False): task}
+    fitted = {(row.noise, row.harmonic): np.asarray(target.proportional_power) for row in rows}
+    return jm.comparison.Comparison(target, tuple(rows), {}, tasks, fitted, 12.0, 3, 0)
+
+
+@pytest.mark.parametrize("success", [True, False])
+def test_the_spectrum_of_a_fit_is_compared(success, tmp_path, monkeypatch):
+    """`compare` takes a fit.json and says which search did not come to its end, in words and in the figure."""
+    result, asked = made_result(), []
+
+    def compared(task, target, **options):
+        asked.append((task, target))
+        return made_comparison(target, success=success)
+
+    result.save(tmp_path / "fit.json")
+    monkeypatch.setattr(jm, "compare_noise", compared)
+    outcome = run("compare", tmp_path / "fit.json", "--out", tmp_path / "out")
+    ((task, target),) = asked
+    assert_equal(target, result.target)
+    assert type(task) is type(result.task)
+    unsettled = "the search did not come to its end for tremor, no harmonic. Do not use these rows"
+    assert (outcome.exit_code, unsettled in outcome.output) == ((0, False) if success else (1, True))
+    assert success or "Hold a parameter of theirs, for example --fix resonance_width=" in outcome.output
+    figure = made_comparison(target, success=success).plot()
+    marks = [text.get_text() for ax in figure.axes for text in ax.texts]
+    assert ("not settled" in marks) is not success
+    refused = run("compare", tmp_path / "fit.json", "--segments", "12", "--out", tmp_path / "out", "--force")
+    assert refused.exit_code == 2 and "--segments: the spectrum of a fit states this already" in refused.stderr
+
+
 def test_a_fit_is_replaced(tmp_path, monkeypatch):
     for seed, force in ((1, ()), (2, ("--force",))):
         monkeypatch.setattr(jm, "fit", lambda *_, seed=seed, **__: made_result(seed=seed))
