@@ -814,11 +814,13 @@ def test_a_designed_motion(tmp_path):
         "--rate",
         "50",
     )
-    result = run("design", preset, *asked, "--out", tmp_path / "out", "--json")
+    result = run("design", preset, *asked, "--durations", "20,40", "--error", "10", "--out", tmp_path / "out", "--json")
     assert result.exit_code == 0
     found = jm.design_input(jm.Isometric(), ("K_w0", "C_w0"), rms=5e-4, peak=9e-4, band=(0.2, 4.0), seconds=20.0, rate=50.0)
     table = json.loads(result.stdout)
     assert table == json.loads((tmp_path / "out" / "design.json").read_text())
+    assert [row["seconds"] for row in table["by_seconds"]] == [20.0, 40.0] and table["needed"]["error"] == 0.1
+    assert table["by_seconds"][0]["stderr"]["K_w0"] == pytest.approx(found.stderr["K_w0"])
     assert table["gain"] == pytest.approx(found.gain) and table["quantity"] == ["K_w0", "C_w0"]
     signal = np.loadtxt(tmp_path / "out" / "motor.csv", delimiter=",", skiprows=3)
     np.testing.assert_allclose(signal[:, 1], 1e3 * found.displacement, rtol=1e-6, atol=1e-9)
@@ -827,6 +829,7 @@ def test_a_designed_motion(tmp_path):
         (("--out", tmp_path / "out"), "motor.csv: is there already; overwrite it with --force"),
         (("--band", "5", "--out", tmp_path / "new"), "--band 5: give lowest and highest frequency in Hz, as --band 0.1:5"),
         (("--quantity", "K", "--out", tmp_path / "new"), "quantity 'K' is unknown"),
+        (("--durations", "30;60", "--out", tmp_path / "new"), "--durations 30;60: give lengths of the record in s, as"),
     ):
         wrong = run("design", preset, *arguments)
         assert wrong.exit_code == 2 and message in wrong.stderr
