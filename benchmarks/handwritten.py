@@ -11,7 +11,12 @@ import numpy as np
 import scipy.linalg
 from jaxtyping import Array, Float
 
-from jaxmuscle.model import AbstractTask
+from jaxmuscle.model import AbstractNoise, AbstractTask
+
+
+def drawn(noise: AbstractNoise, key: Any, seeds: int, steps: int) -> Float[Array, "seeds steps channels"]:
+    """Normals of every seed as jaxmuscle draws them; few at a time, which stay in the cache."""
+    return jax.lax.map(lambda i: noise.draw(jax.random.fold_in(key, i), steps), jnp.arange(seeds), batch_size=8)
 
 
 def _heun(slope: Callable[[Any, Any, Any], Any], t: Any, dt: float, y: Any, u: tuple[Any, Any]) -> Any:

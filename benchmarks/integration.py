@@ -8,12 +8,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from handwritten import band_scan, filter_matrices, stock_diffrax, white_scan
+from handwritten import band_scan, drawn, filter_matrices, stock_diffrax, white_scan
 from measure import DTYPES, Program, Row, Unequal, require_equal, seconds, speed_ratio, speeds
 
 import jaxmuscle as jm
 from jaxmuscle._common.arrays import as_arrays
-from jaxmuscle.simulation._batch import draw, respond
+from jaxmuscle.simulation._batch import respond
 from jaxmuscle.simulation._grid import Grid
 
 SEEDS, DT, EVERY, STEPS = 64, 1e-3, 10, 15_000
@@ -76,7 +76,7 @@ def white(dtype: str, repetitions: int) -> list[Row]:
     def seeds_last(task, normals):
         return jnp.moveaxis(white_scan(task, size * jnp.moveaxis(normals, 0, -1), DT, EVERY), -1, 0)
 
-    given = eqx.filter_jit(lambda key: draw(noise, key, jnp.arange(SEEDS), STEPS))
+    given = eqx.filter_jit(lambda key: drawn(noise, key, SEEDS, STEPS))
     return _against_scan(f"white, {dtype}", noise, given, {SCAN: vmapped, LAST: seeds_last}, repetitions, 0.75)
 
 
@@ -91,7 +91,7 @@ def band_limited(dtype: str, repetitions: int) -> list[Row]:
     def seeds_last(task, normals):
         return jnp.moveaxis(band_scan(task, jnp.moveaxis(normals, 0, -1), matrices, DT, EVERY), -1, 0)
 
-    given = eqx.filter_jit(lambda key: draw(noise, key, jnp.arange(SEEDS), STEPS))
+    given = eqx.filter_jit(lambda key: drawn(noise, key, SEEDS, STEPS))
     return _against_scan(f"band-limited, {dtype}", noise, given, {SCAN: vmapped, LAST: seeds_last}, repetitions, 0.5)
 
 

@@ -6,13 +6,14 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from handwritten import drawn
 from integration import DT, SEEDS, STEPS
 from measure import DTYPES, Row, require_equal, seconds
 
 import jaxmuscle as jm
 from jaxmuscle._common.arrays import as_arrays
 from jaxmuscle.model._parameters import DEFAULT_FREE
-from jaxmuscle.simulation._batch import draw, respond
+from jaxmuscle.simulation._batch import respond
 from jaxmuscle.simulation._grid import Grid
 
 GRADIENT_SEEDS = 8
@@ -43,7 +44,7 @@ def gradients(repetitions: int) -> list[Row]:
     """Row 5, second part: Jacobians of the 30-bin spectrum with respect to 8 log parameters, on given normals."""
     with jax.enable_x64(True):
         task, grid = as_arrays(jm.Isometric()), Grid(DT, STEPS, 10)
-        normals = draw(task.noise, jax.random.key(0), jnp.arange(GRADIENT_SEEDS), STEPS)
+        normals = drawn(task.noise, jax.random.key(0), GRADIENT_SEEDS, STEPS)
 
         def spectrum(theta, normals):
             scaled = {n: task[n] * jnp.exp(theta[i]) for i, n in enumerate(DEFAULT_FREE)}

@@ -31,7 +31,6 @@ from jaxmuscle.objective._residuals import residual_sigma
 from jaxmuscle.objective._starts import contenders, halton
 from jaxmuscle.response._equilibrium import slowest_rate
 from jaxmuscle.response._expected import Moments
-from jaxmuscle.simulation._batch import draw
 from jaxmuscle.simulation._grid import Grid
 from jaxmuscle.spectra._bin_law import bin_statistics
 from jaxmuscle.spectra._settings import WINDOW
@@ -101,28 +100,24 @@ def test_welch_operator_refuses_a_window_shorter_than_a_segment():
 
 
 @pytest.mark.parametrize(
-    ("task", "colour_free"),
+    "task",
     [
-        (jm.Isometric(settings=jm.SpectrumSettings(sampling="filtered")), False),
-        (
-            jm.PrescribedForce(
-                noise=jm.OrnsteinUhlenbeckNoise(), F_ext=2.0, settings=jm.SpectrumSettings(sampling="average")
-            ),
-            True,
+        jm.Isometric(
+            noise=jm.BandLimitedNoise() + jm.ResonantNoise(0.02), settings=jm.SpectrumSettings(sampling="filtered")
         ),
+        jm.PrescribedForce(noise=jm.OrnsteinUhlenbeckNoise(), F_ext=2.0, settings=jm.SpectrumSettings(sampling="average")),
     ],
     ids=["isometric", "force"],
 )
 @pytest.mark.slow
-def test_moments_are_those_of_a_plain_ensemble(x64, task, colour_free):
+def test_moments_are_those_of_a_plain_ensemble(x64, task):
     """But for the cross term of line and noise, whose expectation is zero."""
     key, seeds, dt = jax.random.key(3), 16, 2.5e-3
     runs = jm.ensemble(task, key, seeds=seeds, dt=dt)
-    quiet = np.asarray(jm.simulate(references.quiet(task), key, dt=dt).output)
+    quiet = np.asarray(jm.simulate(task.with_parts(noise=jm.BandLimitedNoise(0.0)), key, dt=dt).output)
     grid = Grid(dt, 6000, 4, runs.substeps)
     chosen = np.array([0, 3, 10, 29])
-    normals = draw(task.noise, key, jnp.arange(seeds), grid.steps)
-    model = MonteCarlo.of(as_arrays(task), normals, grid, chosen, WINDOW, colour_free=colour_free, control=False)
+    model = MonteCarlo.of(task.settings, key, seeds, grid, chosen, WINDOW, control=False)
     moments = eqx.filter_jit(model.moments)(as_arrays(task))
 
     def powers(signal):
@@ -140,19 +135,6 @@ def test_moments_are_those_of_a_plain_ensemble(x64, task, colour_free):
     references.assert_standard_normal(cross.mean(axis=0) / (cross.std(axis=0, ddof=1) / np.sqrt(seeds)))
     assert np.isclose(float(moments.variation), np.sqrt(variance) / abs(output[:, 500:1500].mean()))
     np.testing.assert_allclose(moments.proportional, moments.power / moments.power.sum())
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name, value", [("resonance_frequency", 5.0), ("resonance_width", 0.5), ("noise_cutoff", 20.0)])
-def test_paths_follow_the_colour_of_every_part_of_a_sum(x64, name, value):
-    """Free, a frequency, width or cutoff moves the paths: the moments are those of paths made with it."""
-    task = jm.Isometric(noise=jm.BandLimitedNoise() + jm.ResonantNoise(0.02))
-    moved, target = task.replace(**{name: value}), simple_target()
-    models = [part_of(setup_of(t, target, (free,)), seeds=2).model for t, free in ((task, name), (moved, "c_w"))]
-    free, fixed = (eqx.filter_jit(model.moments)(as_arrays(moved)) for model in models)
-    np.testing.assert_allclose(free.power, fixed.power, rtol=1e-9)
-    before = eqx.filter_jit(models[0].moments)(as_arrays(task))
-    assert np.max(np.abs(before.power / free.power - 1)) > 0.01
 
 
 # --- coordinates
@@ -364,7 +346,8 @@ def test_gradients_of_the_residuals_are_differences(x64, residual):
     evaluate = eqx.filter_jit(whole)
     seen = expand(objective, np.asarray(objective.theta(s))[None]).row(0)
     forward = jax.jacfwd(lambda s: _residuals(s, (objective, objective.data, seen))[0])(s)
-    np.testing.assert_allclose(forward, eqx.filter_jit(jax.jacfwd(whole))(s), rtol=1e-9, atol=1e-12)
+    # Normals have single precision, which two programs round differently: 6e-8 of each of thousands.
+    np.testing.assert_allclose(forward, eqx.filter_jit(jax.jacfwd(whole))(s), rtol=1e-6, atol=6e-8)
     h = 1e-4
     central = np.stack([(evaluate(s + h * e) - evaluate(s - h * e)) / (2 * h) for e in np.eye(3)], axis=1)
     assert np.all(np.isfinite(forward))
@@ -506,6 +489,7 @@ def test_free_by_default():
         ({"free": ["c_w"], "priors": {"k_w": 1.0}}, "priors: .*'k_w'"),
         ({"free": ["c_w"], "bounds": {"k_w": (1.0, 2.0)}}, "bounds: .*'k_w'"),
         ({"free": ["c_w"], "bounds": {"c_w": (1.0, 2.0)}}, "c_w = 60.0 .* must lie inside its bounds"),
+        ({"increments": "strong"}, r"increments = 'strong': .*gaussian.*weak"),
         ({"dt": 3e-3}, "dt = 0.003 s does not divide the sampling interval 0.01"),
     ],
 )
@@ -784,11 +768,13 @@ def test_what_a_fit_says_about_itself():
 
 
 @pytest.mark.slow
-def test_monte_carlo_agrees_with_the_linear_fit():
+@pytest.mark.parametrize("increments", ["gaussian", "weak"])
+def test_monte_carlo_agrees_with_the_linear_fit(increments):
     """The control variate leaves 32 paths the error of tens of thousands, so both minima are the same."""
     arguments: dict[str, Any] = {"free": ("c_w", "noise_K_w", "harmonic_frequency"), "starts": BATCH, "check_seeds": 16}
     linear = jm.fit(jm.Isometric(), simple_target(), **arguments)
-    simulated = jm.fit(jm.Isometric(), simple_target(), method="montecarlo", **arguments)
+    simulated = jm.fit(jm.Isometric(), simple_target(), method="montecarlo", increments=increments, **arguments)
+    assert simulated.settings["increments"] == increments
     for name, estimate in linear.parameters.items():
         if estimate.free and estimate.stderr is not None:
             # Both stop within a thousandth of the cost, some 0.1 standard errors, and correct with different seeds.
@@ -796,14 +782,29 @@ def test_monte_carlo_agrees_with_the_linear_fit():
 
 
 @pytest.mark.slow
+def test_weak_increments_change_a_fit_by_its_monte_carlo_error_only(x64):
+    """The nonlinear correction and the check are means over seeds; the path that is shown is not."""
+    gaussian, weak = quick_fit(), quick_fit(increments="weak")
+    known = [name for name, estimate in (gaussian.parameters | gaussian.derived).items() if estimate.stderr]
+    assert len(known) > 3
+    for name in known:
+        assert abs(weak[name].value - gaussian[name].value) < 0.2 * gaussian[name].stderr, name
+    assert not np.array_equal(weak.fitted, gaussian.fitted)
+    # 16 seeds with a control variate: the ratio of two means of nearly linear spectra.
+    np.testing.assert_allclose(weak.fitted, gaussian.fitted, rtol=0.02)
+    key = jax.random.fold_in(jax.random.key(0), 1)
+    shown = jm.simulate(jm.settled(weak.task), key).output
+    np.testing.assert_array_equal(weak.only.stretch[1], np.asarray(shown)[-501:])
+
+
+@pytest.mark.slow
 def test_controlled_moments_are_those_of_a_controlled_ensemble(x64):
     task, key, seeds, dt = jm.Isometric(), jax.random.key(3), 16, 2.5e-3
     still = jm.settled(task)
     runs = jm.ensemble(still, key, seeds=seeds, dt=dt, control=True)
-    normals = draw(task.noise, key, jnp.arange(seeds), 6000)
     chosen = np.array([0, 3, 10, 29])
     grid = Grid(dt, 6000, 4, runs.substeps, reverse=False)
-    model = MonteCarlo.of(as_arrays(task), normals, grid, chosen, WINDOW, colour_free=False, control=True)
+    model = MonteCarlo.of(task.settings, key, seeds, grid, chosen, WINDOW, control=True)
     moments = eqx.filter_jit(model.moments)(as_arrays(task))
     np.testing.assert_allclose(moments.power, runs.mean_spectrum().power[chosen], rtol=1e-9)
 

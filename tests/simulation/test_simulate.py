@@ -16,7 +16,8 @@ from jaxmuscle._common.arrays import is_concrete
 from jaxmuscle._common.types import Scalar
 from jaxmuscle.model import Decay, RampHold, Sampled, SmoothStep
 from jaxmuscle.model._noise import Realisation
-from jaxmuscle.simulation._batch import draw, respond
+from jaxmuscle.model._stream import Draws, Stream
+from jaxmuscle.simulation._batch import respond, streams_of
 from jaxmuscle.simulation._grid import Grid
 from jaxmuscle.simulation._simulate import schedule
 
@@ -214,9 +215,9 @@ def test_other_keys_and_seeds_are_other_noise():
 
 @pytest.mark.slow
 def test_seed_i_folds_i_into_the_key():
-    noise = jm.BandLimitedNoise()
-    for i, normals in zip((3, 70), draw(noise, KEY, jnp.array([3, 70]), 10), strict=True):
-        np.testing.assert_array_equal(normals, noise.draw(jax.random.fold_in(KEY, i), 10))
+    found = streams_of(KEY, jnp.array([3, 70]), Draws())
+    for i, words in zip((3, 70), found.words, strict=True):
+        np.testing.assert_array_equal(words, Stream.of(jax.random.fold_in(KEY, i)).words)
 
 
 @pytest.mark.slow

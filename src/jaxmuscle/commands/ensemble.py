@@ -13,7 +13,7 @@ import jaxmuscle as jm
 from jaxmuscle._common.progress import told
 
 from .console import NOT_CONVERGED, err, out, record, reporting, task_of
-from .options import Force, Json, Observe, OtherTask, Preset, Seed
+from .options import Force, Increments, Json, Observe, OtherTask, Preset, Seed
 
 if TYPE_CHECKING:
     from jaxmuscle.ensembles import Pace, PartReport
@@ -26,11 +26,6 @@ Threads = Annotated[int | None, typer.Option(min=1, max=1024, help="How many cor
 class Precision(StrEnum):
     single = "float32"
     double = "float64"
-
-
-class Increments(StrEnum):
-    gaussian = "gaussian"
-    weak = "weak"
 
 
 class Generator(StrEnum):

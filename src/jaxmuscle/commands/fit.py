@@ -28,6 +28,7 @@ from .options import (
     Force,
     Formats,
     Free,
+    Increments,
     Json,
     MethodName,
     Noise,
@@ -85,6 +86,10 @@ def fit(
     seeds: Annotated[
         int | None,
         typer.Option(min=1, help="How many noise paths are simulated: 32 by default, 48 if the fit must simulate."),
+    ] = None,
+    increments: Annotated[
+        Increments | None,
+        typer.Option(help="Random numbers of what is simulated; weak ones are faster.", show_default="gaussian"),
     ] = None,
     seed: Seed = 0,
     segments: Segments = None,
@@ -174,9 +179,9 @@ def fit(
 
             unused(reading, "axis", window=window, what="recordings; these are spectra")
 
-            if method != MethodName.linear or seeds is not None or quick:
+            if method != MethodName.linear or seeds is not None or increments is not None or quick:
                 raise ValueError("several spectra are fitted in one go, without simulation: leave out "
-                                 "--method, --seeds and --quick, or fit them one at a time")  # fmt: skip
+                                 "--method, --seeds, --increments and --quick, or fit them one at a time")  # fmt: skip
             options |= {"rung": rungs or 0}
             raise typer.Exit(fit_together(target, read, task, groups, output, options, formats_of(formats), force=force))
         if groups is not None:
@@ -185,6 +190,7 @@ def fit(
             )
         options |= {"method": str(method), "seeds": seeds, "rungs": rungs}
         options |= {"check_seeds": 0} if quick else {}
+        options |= {} if increments is None else {"increments": str(increments)}
         if any(recorded):
             if segments is not None or dataset is not None:
                 raise ValueError("--segments and --dataset belong to spectra, and these are recordings: leave them out")

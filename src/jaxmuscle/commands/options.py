@@ -20,6 +20,11 @@ class MethodName(StrEnum):
     montecarlo = "montecarlo"
 
 
+class Increments(StrEnum):
+    gaussian = "gaussian"
+    weak = "weak"
+
+
 class ResidualName(StrEnum):
     log = "log"
     linear = "linear"

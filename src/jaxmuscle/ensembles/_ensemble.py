@@ -174,6 +174,18 @@ def ensemble(  # pyright: ignore[reportInconsistentOverload]
         return _in_memory(layout, tell)
 
 
+def runs_for_means(task: AbstractTask, key: Key, seeds: int, draws: Draws) -> Trajectory:
+    """Seeds 0 to seeds - 1 as `ensemble` simulates them, with weak numbers, too: for means over the seeds alone."""
+    plan = plan_of(task, DURATION, DT, None, None, None)
+    cut = cut_of(task, seeds, plan, None, shared=False)
+    linear = companions(task, DURATION, None)
+    layout = laid_out(task, key_of(key), range(seeds), plan, linear, cut=cut, states=True, spectrum=False, draws=draws,
+                      threads=None)  # fmt: skip
+    found = _in_memory(layout, lambda pace: None)
+    assert isinstance(found, Trajectory)
+    return found
+
+
 def _levels(reduce: bool | tuple[float, ...]) -> tuple[float, ...] | None:
     """Levels of the quantiles, None if nothing is reduced."""
     if reduce is False:

@@ -44,6 +44,7 @@ def fit(
     rungs: int | None = None,
     progress: bool | Callable[[str, float], None] = False,
     optimiser: Any = None,
+    increments: str = "gaussian",
     answer: Callable[[FitResult], None] | None = None,
 ) -> FitResult:
     """Find the parameters whose expected spectrum is the target's: Levenberg-Marquardt from many starts.
@@ -76,8 +77,9 @@ def fit(
     function of (text, share); `rungs`, how many richer models may be tried where the base model does not describe the data
     (`on_rung`; 3, or 0 where `noise` or `free` is given); `optimiser`, what makes the steps instead of
     `optimistix.LevenbergMarquardt`: another of optimistix's Gauss-Newton solvers, `optimistix.Dogleg(1e-9, 1e-9)` say
-    (for others there is `problem`); `answer`, a function that gets the result as soon as the search ends, before
-    simulated check, profile and p-value.
+    (for others there is `problem`); `increments`, "weak" for the faster random numbers of `ensemble` in all that is
+    simulated here, of which only means over the seeds are taken; `answer`, a function that gets the result as soon as the
+    search ends, before simulated check, profile and p-value.
 
     **Returns:** a `FitResult`; a fit that fails is one, too, and says why.
 
@@ -92,7 +94,7 @@ def fit(
             free=free, fix=fix, method=method, residual=residual, starts=starts, seeds=seeds, check_seeds=check_seeds,
             key=key, bounds=bounds, priors=priors, coefficient_of_variation=coefficient_of_variation,
             mean_force=mean_force, max_steps=max_steps, dt=dt, progress=tell, rungs=rungs,
-            optimiser=optimiser,
+            optimiser=optimiser, increments=increments,
         )  # fmt: skip
         task = with_noise(task, noise, fix)
         if recordings:

@@ -99,6 +99,7 @@ class SettingsTable(Table, kw_only=True):
     check_seeds: Annotated[Count, _told("New seeds with which the fit was checked")]
     max_steps: Annotated[Count, _told("Largest number of steps of each descent")]
     dt: Annotated[Annotated[float, Meta(gt=0)], _told("Step of the noise [s]")]
+    increments: Annotated[Literal["gaussian", "weak"], _told("Random numbers of what was simulated")] = "gaussian"
     coefficient_of_variation: Annotated[bool | dict[str, bool], _told("Whether it was data; of several targets by name")]
     mean_force: Annotated[
         tuple[float, float] | dict[str, tuple[float, float] | None] | None, _told("Mean and its error [N] as data, or null")

@@ -56,6 +56,7 @@ def fit_joint(
     coefficient_of_variation: bool = True,
     mean_force: Mapping[str, tuple[float, float]] | None = None,
     max_steps: int = 40,
+    increments: str = "gaussian",
     progress: bool | Callable[[str, float], None] = False,
 ) -> FitResult:
     """Fit several spectra of the same person with shared parameters: two force levels, or force and displacement.
@@ -75,7 +76,7 @@ def fit_joint(
     one target's (default as in `fit`); `fix` {name or "name@target": value}; `noise` of all tasks; `starts`; `seeds` of the
     nonlinear correction (0: none); `check_seeds`, fresh seeds of the nonlinear model for each reported spectrum (0: linear
     response times the correction); `bounds`, `priors`, `key`, `residual`, `coefficient_of_variation`, `max_steps`,
-    `progress` as in `fit`; `mean_force` {target: (value, sd)}, by default what the
+    `increments`, `progress` as in `fit`; `mean_force` {target: (value, sd)}, by default what the
     targets state in newtons, if no `tasks` are given: all tasks are then carried by one number to the first, with a free
     P_w each.
 
@@ -86,7 +87,7 @@ def fit_joint(
     """
     options = FitOptions(free=free, fix=fix, residual=residual, starts=starts, seeds=seeds, check_seeds=check_seeds, key=key,
                          bounds=bounds, priors=priors, coefficient_of_variation=coefficient_of_variation,
-                         max_steps=max_steps)  # fmt: skip
+                         max_steps=max_steps, increments=increments)  # fmt: skip
     loaded = _loaded(targets)
     for argument, named in (("tasks", tasks or {}), ("mean_force", mean_force or {})):
         for name in named:

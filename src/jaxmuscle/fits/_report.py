@@ -9,7 +9,7 @@ import numpy as np
 from jaxmuscle._common.environment import versions
 from jaxmuscle._common.errors import SimulationError
 from jaxmuscle._common.keys import fold_in
-from jaxmuscle.ensembles._ensemble import ensemble
+from jaxmuscle.ensembles._ensemble import runs_for_means
 from jaxmuscle.model._noises import with_active_noise
 from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.objective._arguments import Plan, base_of
@@ -21,6 +21,7 @@ from jaxmuscle.objective._residuals import PartResiduals, further_residuals
 from jaxmuscle.response._expected import Moments, check_power, expected_moments
 from jaxmuscle.response._linearised import settled
 from jaxmuscle.response._second_order import negative_coefficients, second_order
+from jaxmuscle.simulation._simulate import simulate
 from jaxmuscle.spectra._bin_law import bin_statistics, standardised, trial_samples
 from jaxmuscle.spectra._settings import WINDOW
 
@@ -171,11 +172,14 @@ class _Made(NamedTuple):
 def _simulated(problem: FitProblem, part: Part, task: AbstractTask, seeds: int) -> _Made:
     """Of fresh seeds of the nonlinear model."""
     still = settled(task) if problem.control else task
-    runs = ensemble(still, fold_in(problem.key, 1), seeds=seeds)
+    key = fold_in(problem.key, 1)
+    runs = runs_for_means(still, key, seeds, problem.draws)
     each, expected = controlled_moments(runs, part.target)
     each = each._replace(power=np.asarray(each.power)[:, part.chosen])
     start = round((runs.time[-1] - STRETCH) * runs.rate)
-    stretch = runs.time[start:], np.asarray(runs.output[0])[start:]
+    # A path of weak numbers is none to look at.
+    output = runs.output[0] if problem.draws.increments == "gaussian" else simulate(still, key).output
+    stretch = runs.time[start:], np.asarray(output)[start:]
     return _Made(each, None if expected is None else np.asarray(expected.power)[part.chosen], stretch)
 
 

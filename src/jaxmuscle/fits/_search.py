@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from jaxmuscle._common.errors import SimulationError
 from jaxmuscle._common.keys import fold_in
-from jaxmuscle.ensembles._ensemble import ensemble
+from jaxmuscle.ensembles._ensemble import runs_for_means
 from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.objective._arguments import Plan
 from jaxmuscle.objective._consequences import BATCH
@@ -248,7 +248,7 @@ def correction_at(problem: FitProblem, part: Part, task: AbstractTask) -> Moment
     if not len(part.target.bins):
         return part.ones
     try:
-        runs = ensemble(settled(task), fold_in(problem.key, 2), seeds=problem.seeds)
+        runs = runs_for_means(settled(task), fold_in(problem.key, 2), problem.seeds, problem.draws)
     except (SimulationError, ValueError):
         return None  # the check on fresh seeds meets the same error and reports it
     each, expected = controlled_moments(runs, part.target)

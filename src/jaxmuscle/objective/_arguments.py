@@ -26,6 +26,7 @@ from jaxmuscle.model._parameters import (
     unknown_parameter,
     usually_free,
 )
+from jaxmuscle.model._stream import Draws
 from jaxmuscle.model._tasks import AbstractTask, Isometric, Observed, PrescribedForce, PrescribedLength
 from jaxmuscle.response._expected import check_line
 from jaxmuscle.response._linearised import has_response
@@ -142,6 +143,7 @@ class FitOptions:
     rungs: int | None = None
     progress: Tell = nothing
     optimiser: Any = None
+    increments: str = "gaussian"
 
     def __post_init__(self) -> None:
         check_named(self.free, self.fix, self.bounds, self.priors)
@@ -158,6 +160,7 @@ class FitOptions:
             if getattr(self, name) is not None:
                 count(name, getattr(self, name), least, MOST)
         check_key(self.key)
+        Draws.of("hash", self.increments)
         positive("dt", self.dt)
         check_data(self.coefficient_of_variation, self.mean_force)
 
@@ -231,9 +234,10 @@ def planned(task: AbstractTask, target: Target, options: FitOptions) -> Plan:
     part = Part("", task, target, coordinates, tuple(range(len(names))), variation, mean)
     key, prior = key_of(options.key), np.array([0.0 if sds[n] is None else 1.0 for n in names])
     problem = FitProblem((part,), coordinates, prior, options.residual, options.method, options.dt, key, counts["seeds"],
-                         control, options.progress, options.optimiser)  # fmt: skip
+                         control, options.progress, options.optimiser, Draws.of("hash", options.increments))  # fmt: skip
     settings = {
         **settings_of(problem, bounds), **counts, "max_steps": options.max_steps, "dt": options.dt,
+        "increments": options.increments,
         "coefficient_of_variation": variation is not None,
         "mean_force": None if mean is None else list(mean), "carried": options.carried,
         "spectrum": target.settings.to_dict(), "steps_per_sample": problem.steps_per_sample,

@@ -7,17 +7,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from jaxmuscle.model._noise import Realisation
 from jaxmuscle.model._resonant_noise import ResonantNoise
+from jaxmuscle.model._stream import Draws, Stream
 from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.response._equilibrium import slowest, slowest_rate
 from jaxmuscle.response._expected import Moments, expected_moments, response
 from jaxmuscle.response._input_response import parts_of_stiffness
 from jaxmuscle.response._linearised import Linearisation, LinearTask, settled
 from jaxmuscle.response._transfer import half_power_frequency
-from jaxmuscle.simulation._batch import respond
+from jaxmuscle.simulation._batch import streams_of
 from jaxmuscle.simulation._grid import Grid
 from jaxmuscle.spectra._bin_law import bin_rows
 from jaxmuscle.spectra._settings import SpectrumSettings, samples_in
@@ -83,15 +83,15 @@ class Linear(eqx.Module):
 
 
 class MonteCarlo(eqx.Module):
-    """Mean spectrum of a task over fixed noise paths (common random numbers).
+    """Mean spectrum of a task over noise paths that stay the same (common random numbers).
 
-    `noise` holds normals, or unit paths when no free parameter changes them. With `control` the task starts settled and
-    the linearised task runs on the same paths as control variate. Without it the first entry of `noise` is zero, which
+    They are drawn while the task is integrated, from the random numbers of each seed. With `control` the task starts settled
+    and the linearised task runs on the same paths as control variate. Without it the first of the seeds has no noise, which
     gives the harmonic's own response; that is taken off every seed before the spectrum and its power added after: the
     cross term between line and noise has expectation zero, yet for fixed paths it makes the cost ripple with the frequency.
     """
 
-    noise: Any
+    streams: Stream
     operator: Float[Array, "parts samples"]
     chosen: np.ndarray
     samples: Int[Array | np.ndarray, ""]
@@ -101,54 +101,54 @@ class MonteCarlo(eqx.Module):
     points: Float[Array | np.ndarray, " points"] | None = None
 
     @classmethod
-    def of(cls, task: AbstractTask, normals: Any, grid: Grid, chosen: np.ndarray, window: tuple[float, float], *,
-           colour_free: bool, control: bool, samples: int | None = None,
-           points: Any = None) -> "MonteCarlo":  # fmt: skip
-        """Prepare for the task's settings; `chosen` are the positions of the compared bins among the settings' bins.
+    def of(cls, settings: SpectrumSettings, key: PRNGKeyArray, seeds: int, grid: Grid, chosen: np.ndarray,
+           window: tuple[float, float], *, control: bool, draws: Draws = Draws(),  # noqa: B008
+           samples: int | None = None, points: Any = None) -> "MonteCarlo":  # fmt: skip
+        """On seeds 0 to `seeds - 1` of the key; `chosen` are the positions of the compared bins among the settings' bins.
 
         With a control variate the variance is that of a recording of so many `samples`, by default as many as simulated.
         """
-        if not control:
-            normals = jax.tree.map(lambda z: jnp.concatenate([jnp.zeros_like(z[:1]), z]), normals)
-        noise = normals if colour_free else jax.jit(jax.vmap(lambda z: task.noise.realise(z, grid.dt)))(normals)
-        operator = welch_operator(task.settings, grid.steps // grid.every + 1, window)
-        samples = samples_in(window, task.settings) if samples is None else samples
-        return cls(noise, jnp.asarray(operator), chosen, jnp.asarray(samples), grid, window, control, points)
+        numbers = jnp.arange(seeds) if control else jnp.maximum(jnp.arange(seeds + 1) - 1, 0)
+        streams = streams_of(key, numbers, draws)
+        operator = welch_operator(settings, grid.steps // grid.every + 1, window)
+        samples = samples_in(window, settings) if samples is None else samples
+        return cls(streams, jnp.asarray(operator), chosen, jnp.asarray(samples), grid, window, control, points)
 
     @property
     def seeds(self) -> int:
         """How many noise paths there are."""
-        return jax.tree.leaves(self.noise)[0].shape[0] - (not self.control)
+        return len(self.streams.words) - (not self.control)
 
     def moments(self, task: AbstractTask) -> Moments:
         """Moments of the task's output."""
+        from jaxmuscle.simulation._integrator import integrated  # and diffrax, which a linear fit does without
+
         settings = task.settings
         start, stop = (round(edge * settings.rate) for edge in self.window)
 
-        def outputs(task):
-            def one(entry):
-                path = entry if isinstance(entry, Realisation) else task.noise.realise(entry, self.grid.dt)
-                return respond(task, path, self.grid, settings.sampling)[1]
+        def outputs(loud, *tasks):
+            def one(stream, loud):
+                own = tasks if loud is None else tuple(_with_noise_times(loud, each) for each in tasks)
+                return integrated(own, stream, self.grid, settings.sampling, states=False).outputs
 
-            return jax.vmap(one)(self.noise)
-
-        task = settled(task) if self.control else task
+            return jax.vmap(one)(self.streams, loud)
 
         def swing(seen):
             return jnp.var(lowpass(seen, settings)[..., start:stop], axis=-1)
 
-        seen = outputs(task)
-        mean = jnp.mean(seen[int(not self.control) :, start:stop])
         if self.control:
+            task = settled(task)
             exact, system = response(task, settings, self.window, self.samples)
-            beside = outputs(LinearTask.of(task, system))
+            seen, beside = outputs(None, task, LinearTask.of(task, system))
             power = exact.power[self.chosen] + jnp.mean(self._power(seen, settings) - self._power(beside, settings), 0)
-            spread = jnp.mean(swing(seen) - swing(beside))
+            mean, spread = jnp.mean(seen[:, start:stop]), jnp.mean(swing(seen) - swing(beside))
             resonant = tuple(own[self.chosen] for own in exact.resonant)
             half = half_power_frequency(task, system)
             stiffness = () if self.points is None else parts_of_stiffness(task, system, self.points)
             return Moments(power, exact.line[self.chosen], mean, exact.variance + spread, slowest(system.A), half, resonant,
                            stiffness)  # fmt: skip
+        (seen,) = outputs(jnp.minimum(jnp.arange(self.seeds + 1.0), 1.0), task)
+        mean = jnp.mean(seen[1:, start:stop])
         quiet, noisy = seen[:1], seen[1:] - seen[:1]
         line, random = jnp.mean(self._power(quiet, settings), 0), jnp.mean(self._power(noisy, settings), 0)
         variance = swing(quiet[0]) + jnp.mean(swing(noisy))
@@ -159,3 +159,9 @@ class MonteCarlo(eqx.Module):
         bins = settings.last_bin - settings.first_bin + 1
         parts = (outputs @ self.operator.T).reshape(len(outputs), -1, bins)
         return jnp.sum(parts**2, axis=1)[:, self.chosen]
+
+
+def _with_noise_times(factor: Array, task: AbstractTask) -> AbstractTask:
+    """The task with all noise amplitudes times a factor."""
+    return eqx.tree_at(lambda t: [part.amplitude for part in t.noise.components], task,
+                       [factor * part.amplitude for part in task.noise.components])  # fmt: skip

@@ -12,13 +12,12 @@ from jaxtyping import Float
 
 from jaxmuscle._common.arrays import all_concrete, as_arrays, as_numbers, is_concrete
 from jaxmuscle.data._target import Target
-from jaxmuscle.model._parameters import paths_of
 from jaxmuscle.model._resonant_noise import ResonantNoise
+from jaxmuscle.model._stream import Draws
 from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.response._equilibrium import fastest_rate
 from jaxmuscle.response._expected import Moments, log_variation_sd
 from jaxmuscle.response._linearised import has_response
-from jaxmuscle.simulation._batch import draw
 from jaxmuscle.simulation._grid import Grid
 from jaxmuscle.simulation._simulate import DURATION, MAX_RATE_STEP, steps_per_sample
 from jaxmuscle.spectra._bin_law import bin_statistics, samples_of, trial_samples
@@ -132,7 +131,8 @@ class Part:
 class FitProblem:
     """What a fit is about, its arguments checked: one target, or several of one person with what they share.
 
-    `control`: whether all tasks have a linear response; `optimiser`, which makes the steps (None: Levenberg-Marquardt).
+    `control`: whether all tasks have a linear response; `optimiser`, which makes the steps (None: Levenberg-Marquardt);
+    `draws`, which random numbers what is simulated for expectations takes.
     """
 
     parts: tuple[Part, ...]
@@ -146,6 +146,7 @@ class FitProblem:
     control: bool
     tell: Callable[[str, float], None]
     optimiser: Any = None
+    draws: Draws = Draws()  # noqa: RUF009
 
     @classmethod
     def shared(cls, problems: "Mapping[str, FitProblem]", names: Mapping[str, Mapping[str, str]]) -> "FitProblem":
@@ -237,14 +238,12 @@ class FitProblem:
                          optimiser=self.optimiser)  # fmt: skip
 
     def _paths(self, part: Part, seeds: int) -> MonteCarlo:
-        task, settings, every = as_arrays(part.task), part.target.settings, self.steps_per_sample
+        settings, every = part.target.settings, self.steps_per_sample
         part.task.check_step(self.dt)
         grid = Grid(self.dt, every * round(DURATION * settings.rate), every, 1, reverse=False)
-        normals = draw(task.noise, jax.random.fold_in(self.key, 0), jnp.arange(seeds), grid.steps)
-        shaping = {n for n, path in paths_of(task).items() if path[0] == "noise" and "amplitude" not in path}
-        colour = not shaping.isdisjoint(part.coordinates.names)
-        return MonteCarlo.of(task, normals, grid, part.chosen, WINDOW, colour_free=colour, control=self.control,
-                             samples=trial_samples(part.target), points=part.points)  # fmt: skip
+        return MonteCarlo.of(settings, jax.random.fold_in(self.key, 0), seeds, grid, part.chosen, WINDOW,
+                             control=self.control, draws=self.draws, samples=trial_samples(part.target),
+                             points=part.points)  # fmt: skip
 
     def finer(self, objective: Residuals, points: Float[np.ndarray, "points free"]) -> Residuals:
         """The residuals with as many sub-steps as the stiffest of the points asks for; never fewer than they have."""

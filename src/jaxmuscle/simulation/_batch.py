@@ -12,7 +12,7 @@ from jaxtyping import Array, Integer, PRNGKeyArray
 
 from jaxmuscle._common.environment import usable_cores
 from jaxmuscle._common.programs import kept
-from jaxmuscle.model._noise import AbstractNoise, Realisation
+from jaxmuscle.model._noise import Realisation
 from jaxmuscle.model._stream import Draws, Stream
 from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.spectra._decimation import at_every
@@ -22,8 +22,7 @@ from jaxmuscle.spectra._welch import lowpass, welch
 
 from ._grid import Grid
 
-DRAWN = 8
-LANES = 1024
+LANES = 512  # XLA splits the loops of wider arrays among all cores, which other seeds need
 THREADED = ("cpu",)  # backends whose devices are cores
 
 
@@ -56,11 +55,6 @@ def threads_of(wanted: int | None) -> int:
     if jax.default_backend() not in THREADED:
         return 2
     return usable_cores() if wanted is None else wanted
-
-
-def draw(noise: AbstractNoise, key: PRNGKeyArray, seeds: Integer[Array, " seeds"], steps: int) -> Any:
-    """Normals of every seed; seed i depends on nothing but the key and i. Few at a time, which stay in the cache."""
-    return jax.lax.map(lambda i: noise.draw(jax.random.fold_in(key, i), steps), seeds, batch_size=DRAWN)
 
 
 def respond(task: AbstractTask, source: Stream | Realisation, grid: Grid, sampling: str) -> tuple[Array, Array]:
@@ -112,7 +106,7 @@ def run_seeds(task: Any, linear: Any, key: Any, seeds: Any, recipe: Recipe, mesh
         task, linear, key = eqx.combine(arrays, rest)
 
         def block(seeds):
-            return _responses(task, linear, _streams(key, seeds, recipe), recipe)
+            return _responses(task, linear, streams_of(key, seeds, recipe.draws), recipe)
 
         count = blocks(len(seeds), recipe.lanes)
         if count == 1 or len(seeds) % count:
@@ -131,7 +125,7 @@ def run_points(tasks: Any, linears: Any, key: Any, seeds: Any, recipe: Recipe, m
     def local(moving, key, seeds):
         def one(moving):
             task, linear = eqx.combine(moving, rest)
-            return _responses(task, linear, _streams(key, seeds, recipe), recipe)
+            return _responses(task, linear, streams_of(key, seeds, recipe.draws), recipe)
 
         return jax.vmap(one)(moving)
 
@@ -139,8 +133,9 @@ def run_points(tasks: Any, linears: Any, key: Any, seeds: Any, recipe: Recipe, m
     return _shared(local, mesh, (P("lanes"), P(), P()))(moving, key, seeds)
 
 
-def _streams(key: PRNGKeyArray, seeds: Integer[Array, " seeds"], recipe: Recipe) -> Stream:
-    return jax.vmap(lambda i: Stream.of(jax.random.fold_in(key, i), recipe.draws))(seeds)
+def streams_of(key: PRNGKeyArray, seeds: Integer[Array, " seeds"], draws: Draws) -> Stream:
+    """Random numbers of every seed; those of seed i depend on nothing but the key and i."""
+    return jax.vmap(lambda i: Stream.of(jax.random.fold_in(key, i), draws))(seeds)
 
 
 def _shared(local: Any, mesh: Mesh | None, specs: tuple) -> Any:

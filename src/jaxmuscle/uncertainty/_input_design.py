@@ -82,8 +82,9 @@ def design_input(
         require_positive(name, np.float64(1.0) if value is None else value, unit)
     require(0 <= spread <= 1, f"spread = {spread} must be a share, from 0 to 1")
     durations = [float(one) for one in durations]
-    for name, value, unit in (*(("durations", one, "s") for one in durations), ("error", error, "(relative)")):
-        require_positive(name, 1.0 if value is None else value, unit)
+    for one in durations:
+        require_positive("durations", one, "s")
+    require(error is None or 0 < error < 1, f"error = {error} must be a share between 0 and 1, 0.1 for 10 %")
     check_key(key)
     require(seconds * rate <= MOST, f"seconds = {seconds} at rate = {rate} Hz are more than {MOST} samples: make it shorter")
     frequency, samples = lines_in(band, seconds), round(seconds * rate)
@@ -112,10 +113,10 @@ def design_input(
     own = even.of_motion(motion)
     known = experiment.here.values
     values, units = {n: value for n, (value, _) in known.items()}, {n: unit for n, (_, unit) in known.items()}
-    errors = [experiment.errors(p) for p in (None, even.power, own.power)]
+    now, flat, best = (experiment.errors(p) for p in (None, even.power, own.power))
     longer = {one: experiment.errors(own.power, one / seconds) for one in durations}
     needed = None if error is None else (float(error), seconds * experiment.times_for(own.power, error))
-    return DesignedInput(quantities, own, even, motion, float(rate), values, units, *errors, longer, needed)
+    return DesignedInput(quantities, own, even, motion, float(rate), values, units, now, flat, best, longer, needed)
 
 
 class Experiment(NamedTuple):
@@ -182,7 +183,7 @@ class Experiment(NamedTuple):
         return rms**2 * np.maximum(found.x, 0) @ steps
 
     def errors(self, power: Float[np.ndarray, " lines"] | None, times: float = 1.0) -> dict[str, float]:
-        """Standard errors of all quantities with a motion, for a record so many `times` as long; without the record if None."""
+        """Standard errors of all quantities with a motion, if the record is so many `times` as long; without it if None."""
         record = 0.0 if power is None else self.apart - self.start + np.tensordot(power, self.lines, 1)
         known = self.start + times * record
         after = np.linalg.pinv(known, hermitian=True)
