@@ -6,6 +6,7 @@
 Truths are drawn from the prior of the fit itself (simulation-based calibration, Talts et al. 2018, arXiv:1804.06788), about
 muscles whose perturbations are a third of the default, so that nearly all respond linearly. Interrupted runs go on where
 they stopped; `--first` and `--recordings` split a run over processes with files of their own, `--merge` joins them.
+`--figure FILE` draws the coverage at every credibility.
 """
 
 import argparse
@@ -33,6 +34,7 @@ CHAINS, DRAWS, WARMUP, RANKED = 2, 150, 150, 60
 MIXED = 1.05  # R-hat
 HELD = 0.8  # share of its bin above which the harmonic's frequency is judged
 SHOWN = ("corner_frequency", "harmonic_share", "harmonic_frequency", "high_frequency_floor", "coefficient_of_variation")
+JUDGED = (*SHOWN, *(name for name in DEFAULT_FREE if name not in SHOWN))
 
 
 def base() -> jm.model.AbstractTask:
@@ -70,7 +72,8 @@ def true_values(task: jm.model.AbstractTask, target: jm.Target) -> tuple[dict[st
     share = np.asarray(seen.moments[0].line / seen.moments[0].power)[0]
     nearest = np.argmin(np.abs(np.asarray(target.frequency) - values["harmonic_frequency"]))
     inside = values["harmonic_frequency"] <= target.frequency[-1] + target.settings.resolution / 2
-    return values | {name: float(task[name]) for name in problem.coordinates.names}, float(share[nearest]) if inside else 0.0
+    values |= {name: float(task[name]) for name in problem.coordinates.names}
+    return {name: values[name] for name in JUDGED}, float(share[nearest]) if inside else 0.0
 
 
 def judged(number: int, target: jm.Target, result: jm.fits.FitResult, length: tuple[int, int]) -> dict:
@@ -84,7 +87,8 @@ def judged(number: int, target: jm.Target, result: jm.fits.FitResult, length: tu
     found = jm.posterior(result, key=number, chains=CHAINS, draws=length[0], warmup=length[1])
     row |= {"divergences": found.divergences, "r_hat": max(d[0] for d in found.diagnostics.values())}
     row["p_value"] = found.replicates.p_value
-    for name, draws in found.quantities.items():
+    for name in JUDGED:
+        draws = found.quantities[name]
         step = max(1, draws.size // RANKED)
         thin = draws.ravel()[step - 1 :: step]
         row["posterior"][name] = [*np.quantile(draws, [0.025, 0.975]).tolist(), int(np.sum(thin < true[name])), thin.size]
@@ -116,19 +120,29 @@ def run(numbers: list[int], seconds: float, out: Path, length: tuple[int, int] =
     return table["rows"]
 
 
+def places(rows: list[dict], name: str) -> list[float]:
+    """Where the truth lies in its posterior: its rank among the draws as a share."""
+    return [(r["posterior"][name][2] + 0.5) / (r["posterior"][name][3] + 1) for r in rows]
+
+
+def figure(rows: list[dict], path: Path) -> None:
+    """Coverage at every credibility."""
+    ax = jm.plot.coverage({name: places(rows, name) for name in SHOWN})
+    ax.get_figure(root=True).savefig(path, dpi=130)
+
+
 def report(rows: list[dict]) -> str:
     """Coverage of 95 % intervals with its binomial error, and uniformity of the truth's rank among the draws."""
     lines = [
         "| quantity | posterior: covered | within 3 s.e. of 95 % | ranks: p | curvature: covered | stated |",
         "|---|---|---|---|---|---|",
     ]
-    for name in (*SHOWN, *(n for n in DEFAULT_FREE if n not in SHOWN)):
+    for name in JUDGED:
         chosen = [r for r in rows if name != "harmonic_frequency" or r["share"] >= HELD]
         inside = [r["posterior"][name][0] <= r["true"][name] <= r["posterior"][name][1] for r in chosen]
         stated = [r for r in chosen if name in r["curvature"]]
         near = [abs(r["curvature"][name][0] - r["true"][name]) <= 1.96 * r["curvature"][name][1] for r in stated]
-        ranks = [(r["posterior"][name][2] + 0.5) / (r["posterior"][name][3] + 1) for r in rows]
-        p = scipy.stats.kstest(ranks, "uniform").pvalue
+        p = scipy.stats.kstest(places(rows, name), "uniform").pvalue
         fine = abs(np.mean(inside) - 0.95) <= 3 * np.sqrt(0.95 * 0.05 / len(inside)) if inside else False
         curvature = f"{100 * np.mean(near):.1f} %" if near else "-"
         lines.append(f"| {name} | {100 * np.mean(inside):.1f} % of {len(inside)} | {'yes' if fine else 'NO'} | {p:.2g} | "
@@ -149,6 +163,7 @@ def main() -> None:
     parser.add_argument("--warmup", type=int, default=WARMUP)
     parser.add_argument("--out", type=Path, default=Path("out/calibration.json"))
     parser.add_argument("--merge", type=Path, nargs="*", help="print the table of these files instead")
+    parser.add_argument("--figure", type=Path, help="draw the coverage at every credibility, of all recordings")
     given = parser.parse_args()
     if given.merge:
         rows = [row for path in given.merge for row in json.loads(path.read_text())["rows"]]
@@ -160,6 +175,8 @@ def main() -> None:
     mixed = [row for row in rows if row["r_hat"] <= MIXED]
     print(report(mixed), f"\n\nChains that had mixed (R-hat <= {MIXED}): {len(mixed)} of {len(rows)}. All of them:\n")
     print(report(rows))
+    if given.figure:
+        figure(rows, given.figure)
 
 
 if __name__ == "__main__":

@@ -78,6 +78,7 @@ for task, run in zip(sweep, jm.ensemble(sweep, key, seeds=100), strict=True):
 SURE = """
 found = jm.posterior(result, target, key=jax.random.key(2))
 corner = jm.profile(result, "corner_frequency")
+refits = jm.bootstrap(result)
 """
 PEOPLE = """
 import numpy as np
@@ -163,8 +164,10 @@ SECTIONS = (
               "perturbed-design.md"),
         Shown("gallery/goodness.png", "jm.goodness(result).plot()",
               "Is the model right? Residuals against what is usual", "goodness.md"),
-        Shown("gallery/bootstrap.png", "jm.bootstrap(result).plot()",
+        Shown("gallery/bootstrap.png", "refits.plot()",
               "Are the stated errors right? Refits of simulated data", "goodness.md"),
+        Shown("gallery/coverage.png", "refits.plot_coverage()",
+              "Do intervals of every level hold as often as they say?", "uncertainty.md#the-coverage-curve"),
         Shown("gallery/comparison.png", "jm.compare_noise(jm.Isometric(), target).plot()",
               "Which noise? Models compared", "noise-colour.md"),
     )),

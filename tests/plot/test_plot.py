@@ -9,10 +9,11 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 import scipy.special
-from matplotlib.colors import to_rgba
+from matplotlib.colors import to_rgb, to_rgba
 
 from jaxmuscle import plot
 from jaxmuscle._common.figures import write_figure
+from jaxmuscle.checks._recovery import Bootstrap, Recovery
 from jaxmuscle.data._target import Target, load_target
 from jaxmuscle.model._resonant_noise import ResonantNoise
 from jaxmuscle.model._tasks import Isometric, PrescribedForce, PrescribedLength, PrescribedMotion
@@ -20,6 +21,7 @@ from jaxmuscle.model._white_noise import BandLimitedNoise
 from jaxmuscle.plot import _fit as _plot_fit
 from jaxmuscle.plot import _numbers as _plot_numbers
 from jaxmuscle.plot import _steadiness as _plot_steadiness
+from jaxmuscle.response._characteristics import static_characteristics
 from jaxmuscle.simulation._trajectory import Trajectory
 from jaxmuscle.spectra._bin_law import welch_law
 from jaxmuscle.spectra._settings import SpectrumSettings
@@ -265,7 +267,8 @@ def result(**changes):
             "m_w": estimate(0.5, "kg", free=False),
         },
         "derived": {"corner_frequency": estimate(1.23, "Hz", 0.16)},
-        "chi2_per_bin": 1.18,
+        "chi2_per_bin": 1.21,  # of the simulated mean: the verdict has its own
+        "closeness": "chi2 per bin 1.18",
         "rms_log_error": 0.31,
         "frequency_hz": f,
         "fitted": fitted,
@@ -363,9 +366,9 @@ def test_fit_draws_the_simulated_stretch():
     ("changes", "title", "closeness", "colour"),
     [
         ({}, "vastus-lateralis-26mvc", "χ² per bin 1.18, p = 0.2", _plot_fit.DARK_GREEN),
-        ({"adequate": False, "adequacy_p": 1e-9, "chi2_per_bin": 5.5},
+        ({"adequate": False, "adequacy_p": 1e-9, "closeness": "chi2 per bin 5.50"},
          "vastus-lateralis-26mvc\nDoes not describe the data", "χ² per bin 5.50, p <= 0.001", plot.VERMILLION),
-        ({"adequate": None, "adequacy_p": None}, "vastus-lateralis-26mvc", "χ² per bin 1.18", "black"),
+        ({"adequate": None, "adequacy_p": None}, "vastus-lateralis-26mvc", "χ² per bin 1.21", "black"),
     ],
 )  # fmt: skip
 def test_fit_shows_its_verdict_by_a_label_and_a_colour_and_no_prose(changes, title, closeness, colour):
@@ -491,7 +494,7 @@ def test_end_values_of_starts_are_drawn_over_those_of_the_best():
     drawn = [line.get_xydata().tolist() for line in ax.lines]  # the best last, above the others
     assert drawn == [[[2, 0], [1, 1]], [[0.5, 0], [2, 1]], [[1, 0], [1, 1]]]
     assert [tick.get_text() for tick in ax.get_yticklabels()] == ["k_w", "c_w"]  # a negative value has no logarithm
-    assert ax.get_xscale() == "log" and ax.lines[-1].get_color() == "#000000"
+    assert ax.get_xscale() == "log" and ax.lines[-1].get_color() == "black"
     bar = ax.figure.axes[1]
     assert bar.get_ylabel() == "Rise of χ²" and bar.get_ylim() == pytest.approx((0.0, 10.0))
     assert ax.lines[0].get_color() == plt.get_cmap("viridis")(1.0)
@@ -592,6 +595,58 @@ def small_words(figure):
     return small, out, touch
 
 
+def designed():
+    """A motion with the errors of the usual quantities, as far as its figure reads it."""
+    told, f, time = ["K_w0", "K_z0", "C_w0", "C_z0"], np.linspace(0.1, 5, 50), np.arange(3000) / 50
+    lines = types.SimpleNamespace(power=np.linspace(1e-7, 1e-10, 50), seconds=60.0)
+    errors = [dict(zip(told, 100.0 * np.array([0.81, 0.36, 0.044, 0.0083]) / k, strict=True)) for k in (1, 5, 9)]
+    return types.SimpleNamespace(
+        told=told, frequency=f, time=time, displacement=1e-3 * np.sin(time), even=lines, lengthening=lines, now=errors[0],
+        flat=errors[1], stderr=errors[2], percent=lambda name, known: known[name],
+    )  # fmt: skip
+
+
+def identified():
+    """A report of the bundled measurements, two of them together; two directions now are far too small to be drawn."""
+    told = ["harmonic_frequency", "K_w0", "half_power_frequency", "coefficient_of_variation", "high_frequency_floor"]
+    names = ["the mean force, known to 2 %", "60 s with the insertion moved by 0.1 mm rms to 10 Hz", "a second force level"]
+    size = np.array([300.0, 20.0, 4.0, 1.5, 0.02, 1e-7, 1e-9])
+
+    def outlook(name, factor):
+        known = {t: types.SimpleNamespace(left=0.1 * k, determined=k < 3, percent=f"{0.98 + k:.2f} %") for k, t in
+                 enumerate(told)}  # fmt: skip
+        return types.SimpleNamespace(name=name, failed=None, singular_values=size * factor, quantities=known)
+
+    designs = [outlook(name, 10.0**i) for i, name in enumerate(names)]
+    return types.SimpleNamespace(
+        target="vastus-lateralis-26mvc", designs=designs, present=outlook("now", 1.0), together=" and ", told=told,
+        telling_pairs=[outlook(f"{names[0]} and {names[1]}", 1e9)], letter=lambda i: "ABC"[i], threshold=3.0,
+    )  # fmt: skip
+
+
+def judged():
+    """A fit against replicates of it."""
+    rng, aim = np.random.default_rng(5), load_target("vastus-lateralis-26mvc")
+    reference = {
+        "chi2_per_bin": rng.gamma(9, 0.09, 999),
+        "runs": rng.integers(8, 20, 999),
+        "largest": rng.gamma(20, 0.1, 999),
+    }
+    part = types.SimpleNamespace(
+        target=aim, residual=np.resize([0.5, -1.5, 2.5, -0.5], 30), residuals=rng.normal(size=(999, 30)),
+        reference=reference, observed={"chi2_per_bin": 1.18, "runs": 14, "largest": 2.37}, foretold=True,
+        p_values={"chi2_per_bin": 0.0791, "runs": 0.66, "largest": 0.0251, "all": 0.0412},
+    )  # fmt: skip
+    return types.SimpleNamespace(parts={"a": part})
+
+
+def refitted(names=("corner_frequency", "high_frequency_floor", "coefficient_of_variation", "band_0.5_1")):
+    """Fifty refits that scatter as stated."""
+    values = 1.0 + 0.1 * scipy.stats.norm.ppf((np.arange(50) + 0.5) / 50)
+    each = {name: Recovery(name, "1", 1.0, 0.1, values, np.full(50, 0.1)) for name in names}
+    return types.SimpleNamespace(target="vastus-lateralis-26mvc", quantities=each, replicates=51, failed={3: "no"})
+
+
 @pytest.mark.parametrize(
     "draw",
     [
@@ -600,11 +655,107 @@ def small_words(figure):
         lambda: plot.components(result()).figure,
         lambda: plot.groups(cohort_of()),
         lambda: plot.cohort(cohort_of()),
+        lambda: plot.steadiness(steady(5)),
+        lambda: plot.designed_input(designed()),
+        lambda: plot.identifiability(identified()),
+        lambda: plot.goodness(judged()),
+        lambda: plot.bootstrap(refitted()),
+        lambda: plot.static(static_characteristics(Isometric()))[0].figure,
+        lambda: plot.coverage({"corner_frequency": np.arange(20), "k_w": np.arange(20)}, draws=19).figure,
     ],
-    ids=["simulation", "fit", "components", "groups", "cohort"],
-)
+    ids=["simulation", "fit", "components", "groups", "cohort", "steadiness", "designed_input", "identifiability",
+         "goodness", "bootstrap", "static", "coverage"],
+)  # fmt: skip
 def test_words_are_legible_in_a_column_of_a_journal_and_do_not_touch(draw):
     assert small_words(draw()) == ([], [], [])
+
+
+def test_small_singular_values_are_counted_and_the_legend_says_so():
+    figure = plot.identifiability(identified())
+    upper = figure.axes[0]
+    assert key(figure) == ["determined", "not determined", "so many below 0.01"]
+    counts = [text.get_text() for text in upper.texts if text.get_text().isdigit()]
+    assert counts == ["2", "2", "2", "2"]  # with two measurements together none is too small
+    shares = [text.get_text() for text in upper.texts if text.get_text().endswith(" of 7")]
+    assert shares == ["3 of 7", "3 of 7", "4 of 7", "4 of 7", "6 of 7"]
+
+
+@pytest.mark.parametrize("style", ["default", "dark_background"])
+def test_points_of_a_target_stand_out_and_its_band_does_not_on_a_white_and_on_a_dark_page(style):
+    with plt.style.context(style):
+        ax = plot.target(load_target("vastus-lateralis-26mvc"))
+        colours = ax.get_facecolor(), ax.lines[0].get_color(), ax.collections[0].get_facecolor()[0]
+        page, points, area = (np.array(to_rgb(colour)) for colour in colours)
+        legend = np.array(to_rgb(ax.get_legend().get_frame().get_facecolor()))
+    assert np.all(np.abs(points - page) == 1) and np.array_equal(legend, page)
+    assert np.all((np.abs(area - page) > 0.1) & (np.abs(area - page) < 0.4))
+
+
+# --- coverage
+
+
+def share(ax, name, level):
+    """The drawn share of simulations whose interval of that credibility holds the truth."""
+    line = named(ax, name)
+    return float(line.get_ydata()[np.searchsorted(line.get_xdata(), level + 1e-9, side="right") - 1])
+
+
+@pytest.mark.parametrize(("scale", "name"), [(1.0, "right"), (0.5, "too narrow"), (2.0, "too wide")])
+def test_the_coverage_of_normal_posteriors_is_that_of_their_closed_form(scale, name):
+    """Errors N(0, 1) under posteriors of standard deviation `scale`: C(α) = 2 Φ(scale Φ⁻¹((1 + α)/2)) - 1."""
+    count = 2000
+    off = scipy.stats.norm.ppf((np.arange(count) + 0.5) / count)
+    ax = plot.coverage({name: scipy.stats.norm.cdf(off / scale)})
+    for level in (0.25, 0.5, 0.9):
+        expected = 2 * scipy.stats.norm.cdf(scale * scipy.stats.norm.ppf((1 + level) / 2)) - 1
+        assert share(ax, name, level) == pytest.approx(expected, abs=3 / count)  # a step of the curve is 2 / count
+    assert ax.get_xlim() == ax.get_ylim() == (0, 1) and ax.get_xlabel() and ax.get_ylabel()
+
+
+def test_uniform_ranks_lie_on_the_diagonal_in_the_binomial_band():
+    draws, times = 99, 2
+    ax = plot.coverage({"k_w": np.repeat(np.arange(draws + 1), times)}, draws=draws)
+    low, high = band_at(ax, 0.5)
+    count = times * (draws + 1)
+    assert (low, high) == tuple(scipy.stats.binom.ppf((0.025, 0.975), count, 0.5) / count)
+    for level in np.linspace(0.1, 0.9, 9):
+        assert share(ax, "k w", level) == pytest.approx(level, abs=1 / (draws + 1) + 1e-9)
+
+
+def band_at(ax, level):
+    points = ax.collections[0].get_paths()[0].vertices
+    here = points[np.isclose(points[:, 0], level), 1]
+    return here.min(), here.max()
+
+
+def test_the_band_holds_calibrated_shares_as_often_as_it_says():
+    rng = np.random.default_rng(6)
+    ax = plot.coverage({"k_w": rng.uniform(size=100)}, level=0.9)
+    low, high = band_at(ax, 0.3)
+    inside = np.mean([low <= np.mean(np.abs(2 * u - 1) <= 0.3) <= high for u in rng.uniform(size=(4000, 100))])
+    # Whole counts: at least 90 %, and at most the two counts at its ends more; 4 standard errors of 4000.
+    assert 0.9 - 4 * 0.005 < inside < 0.9 + 0.07
+
+
+@pytest.mark.parametrize(
+    ("ranks", "draws", "message"),
+    [({}, None, "ranks: is empty"), ({"k_w": [0, 11]}, 10, r"ranks\['k_w'\]: must lie between 0 and 10 \(of 10 draws"),
+     ({"k_w": [3]}, None, "without draws= they are shares"), ({"k_w": [[0]]}, 1, r"has shape \(1, 1\)")],
+)  # fmt: skip
+def test_ranks_that_are_none_are_refused(ranks, draws, message):
+    with pytest.raises(ValueError, match=message):
+        plot.coverage(ranks, draws)
+    with pytest.raises(ValueError, match=r"level = 95\.0"):
+        plot.coverage({"k_w": [0.5]}, level=95.0)
+
+
+def test_a_bootstrap_draws_the_coverage_of_its_own_intervals():
+    quantities = refitted().quantities
+    found = Bootstrap("mine", {}, dict(quantities), 50, {}, "simulated", 0)
+    ax = found.plot_coverage()
+    assert [line.get_label() for line in ax.lines[1:]] == [n.replace("_", " ") for n in quantities if "band" not in n]
+    near, known = quantities["corner_frequency"].inside
+    assert share(ax, "corner frequency", 0.95) == near / known
 
 
 def test_several_profiles_share_a_figure_and_a_legend():
@@ -618,7 +769,7 @@ def test_several_profiles_share_a_figure_and_a_legend():
     figure.canvas.draw()
     assert [ax.get_xlabel() for ax in figure.axes] == ["n100 (Hz)", "n50 (Hz)", "n25 (Hz)", "n12 (Hz)"]
     assert all(ax.get_ylabel() for ax in figure.axes)
-    assert key(figure) == ["profile", "95 %", "by curvature"] and figure.get_suptitle() == "mine"
+    assert key(figure) == ["profile", "95 % threshold", "95 % interval", "by curvature"] and figure.get_suptitle() == "mine"
     for ax, found in zip(figure.axes, each, strict=True):
         np.testing.assert_array_equal(named(ax, "profile").get_ydata(), found.rise)
     with pytest.raises(ValueError, match="profiles: is empty"):

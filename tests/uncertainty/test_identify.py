@@ -404,7 +404,7 @@ def test_the_figure():
         assert "K_w0" in names and "k_w" not in names
         texts = [text.get_text() for text in lower.texts]
         columns = len(texts) // len(names)
-        assert texts[names.index("K_z0") * columns + 2] == report().designs[1].quantities["K_z0"].percent
+        assert texts[names.index("K_z0") * columns + 2] == report().designs[1].quantities["K_z0"].percent.removesuffix(" %")
         assert [label.get_text() for label in lower.get_xticklabels()][:3] == ["now", "A", "B"]
         assert upper.get_xscale() == "log"
     finally:

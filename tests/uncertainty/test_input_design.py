@@ -307,8 +307,8 @@ def test_in_words():
 def test_the_figure():
     figure = designed().plot()
     try:
-        density_axes, errors, motion = figure.axes
-        assert [label.get_text() for label in errors.get_xticklabels()] == ["K_w0", "K_z0", "C_w0", "C_z0"]
+        density_axes, motion, errors = figure.axes
+        assert [label.get_text() for label in errors.get_yticklabels()] == ["K_w0", "K_z0", "C_w0", "C_z0"]
         assert np.max(np.abs(motion.lines[0].get_ydata())) <= 1e3 * designed().peak
         assert density_axes.get_yscale() == "log"
     finally:

@@ -17,6 +17,8 @@ from jaxmuscle._common.environment import versions
 from jaxmuscle._common.files import write_text
 from jaxmuscle._common.tables import frame
 from jaxmuscle._common.text import folded
+from jaxmuscle.objective._arguments import base_of
+from jaxmuscle.objective._consequences import BANDS
 
 if TYPE_CHECKING:
     import pandas
@@ -83,6 +85,12 @@ class Recovery(eqx.Module):
         """Their share; NaN where no refit states an interval."""
         near, known = self.inside
         return near / known if known else math.nan
+
+    @property
+    def places(self) -> Float[np.ndarray, " intervals"]:
+        """Where the true value lies in each refit's own normal law: its probability below the value that was simulated."""
+        known = np.isfinite(self.stderrs) & (self.stderrs > 0)
+        return scipy.stats.norm.cdf((self.true - self.values[known]) / self.stderrs[known])
 
     @property
     def verdict(self) -> str:
@@ -204,3 +212,8 @@ class Bootstrap(Printed, Result, eqx.Module):
     def plot(self, ax: "Axes | None" = None) -> "Figure | SubFigure":
         """The refits of every quantity, with the true value and the interval that the fit states."""
         return plot.bootstrap(self, ax)
+
+    def plot_coverage(self, ax: "Axes | None" = None) -> "Axes":
+        """How often the refits' own intervals hold the true value, at every level that they may state."""
+        places = {name: q.places for name, q in self.quantities.items() if base_of(name) not in BANDS}
+        return plot.coverage({name: each for name, each in places.items() if len(each)}, ax=ax)

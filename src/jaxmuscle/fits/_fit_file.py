@@ -43,7 +43,7 @@ class EstimateTable(Table, kw_only=True):
 class AdequacyTable(Table, kw_only=True):
     """Whether the model describes the data: `adequacy`."""
 
-    chi2: Annotated[float, _told("Chi² of the fit, over all residuals")]
+    chi2: Annotated[float, _told("Chi² of the verdict: of the model as it was fitted, over all residuals")]
     expected: Annotated[float, _told("Chi² to expect if the model is right")]
     p: Annotated[Share, _told("p-value: share of the model's own data with a larger chi²")]
     misfit: Annotated[str, _told("Where the data lie furthest from the model")]
@@ -117,7 +117,7 @@ class SpectrumTable(Table, kw_only=True):
 
     frequency_hz: Annotated[list[float], _told("Frequencies [Hz]")]
     target: Annotated[list[float], _told("Proportional power of the target")]
-    fitted: Annotated[Numbers, _told("Proportional power of the fit")]
+    fitted: Annotated[Numbers, _told("Proportional power of the fit: mean of new simulations, if there are some")]
     harmonic_share: Annotated[Numbers, _told("Share of the harmonic in each bin")]
     residual: Annotated[Numbers, _told("Target against fit, in standard deviations")]
     deviation: Annotated[Numbers | None, _told("Standard deviation of the log power, null where it is unknown")]
@@ -137,7 +137,9 @@ class PartTable(Table, kw_only=True):
     target: Annotated[str, _told("Name of the target")]
     provenance: Annotated[str, _told("Where its numbers are from")]
     task: Annotated[str, _told("Name of the task")]
-    chi2_per_bin: Annotated[float | None, _told("Chi² over bins less one")]
+    chi2_per_bin: Annotated[
+        float | None, _told("Chi² of spectrum.residual over bins less one; the verdict has adequacy.chi2")
+    ]
     rms_log_error: Annotated[float | None, _told("Standard deviation of the log of target over fit")]
     spectrum: Annotated[SpectrumTable, _told("Spectra")]
     stretch: Annotated[StretchTable, _told("A few simulated seconds")]

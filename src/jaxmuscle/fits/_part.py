@@ -79,14 +79,14 @@ class Start(eqx.Module):
 class FittedPart(eqx.Module):
     """What a fit found of one target.
 
-    Its fitted `task`; `chi2_per_bin` (None without knowledge of the spread) and `rms_log_error`; on the target's bins the
-    `fitted` proportional power (of fresh seeds where they were simulated), `harmonic_share` of each bin's power, `residual`
-    and `deviation` [standard deviations, log power]; `components`, what share of each bin's power the parts of the model
-    have in linear response: the `relaxation` of the active tissue under its noise, the `floor` from noise on the passive
-    one, the `harmonic`, the `tremor`, `resonance_2`; `stretch`, time and output of a few simulated seconds; `check`, how far
-    linear response and nonlinear simulation differ; `further`, residuals of the coefficient of variation and of the mean, as
-    far as they are data [standard deviations, model above data]; `stiffness`, the fitted dynamic stiffness [N/m] at the
-    frequencies of the target's.
+    Its fitted `task`; `chi2_per_bin` about `fitted` (None without knowledge of the spread) and `rms_log_error`; on the
+    target's bins the `fitted` proportional power (of fresh seeds where they were simulated), `harmonic_share` of each bin's
+    power, `residual` and `deviation` [standard deviations, log power]; `components`, what share of each bin's power the
+    parts of the model have in linear response: the `relaxation` of the active tissue under its noise, the `floor` from
+    noise on the passive one, the `harmonic`, the `tremor`, `resonance_2`; `stretch`, time and output of a few simulated
+    seconds; `check`, how far linear response and nonlinear simulation differ; `further`, residuals of the coefficient of
+    variation and of the mean, as far as they are data [standard deviations, model above data]; `stiffness`, the fitted
+    dynamic stiffness [N/m] at the frequencies of the target's.
     """
 
     target: Target

@@ -113,7 +113,10 @@ class FitResult(Result, eqx.Module):
 
     task = of_only("task", "The fitted task.")
     target = of_only("target", "The target.")
-    chi2_per_bin = of_only("chi2_per_bin", "`Σ residual² / (bins - 1)`, None without knowledge of the spread.")
+    chi2_per_bin = of_only(
+        "chi2_per_bin",
+        "`Σ residual² / (bins - 1)` about `fitted`, None without knowledge of the spread. The verdict has `adequacy.chi2`.",
+    )
     rms_log_error = of_only("rms_log_error", "Standard deviation of the log of target over fit.")
     fitted = of_only("fitted", "Fitted proportional power on the target's bins.")
     harmonic_share = of_only("harmonic_share", "The harmonic's share of each bin's power.")
@@ -134,16 +137,26 @@ class FitResult(Result, eqx.Module):
         return None if self.adequacy is None else self.adequacy.p
 
     @property
+    def data(self) -> int:
+        """Numbers that the fit compares, of all targets."""
+        return sum(part.data for part in self.parts.values())
+
+    @property
+    def closeness(self) -> str:
+        """Chi² of the verdict, `adequacy.chi2`, over `data`, in words; empty where that cannot be judged."""
+        if self.adequacy is None:
+            return ""
+        each = "bin" if all(part.stiffness is None for part in self.parts.values()) else "datum"
+        return f"chi2 per {each} {self.adequacy.chi2 / self.data:.2f}"
+
+    @property
     def verdict(self) -> str:
         """In one sentence, whether the fit may be believed."""
         if not self.success:
             return f"not fitted: {self.message}"
         if self.adequacy is None:
             return "cannot be judged: the target does not say how much its powers scatter (give segments or sigma)"
-        data = sum(part.data for part in self.parts.values())
-        each = "bin" if all(part.stiffness is None for part in self.parts.values()) else "datum"
-        chi2, expected = self.adequacy.chi2 / data, self.adequacy.expected / data
-        found = f"chi2 per {each} {chi2:.2f} (expected {expected:.2f}), {probability(self.adequacy.p)}"
+        found = f"{self.closeness} (expected {self.adequacy.expected / self.data:.2f}), {probability(self.adequacy.p)}"
         if self.adequacy.adequate:
             return f"describes the data: {found}"
         return f"does not describe the data: {found}; {self.adequacy.misfit}"

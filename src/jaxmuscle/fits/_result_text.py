@@ -58,7 +58,7 @@ def text_of(result: "FitResult") -> str:
     lines += [f"  {sentence}" for sentence in result.advice]
     lines += [f"  note: {notice}" for notice in result.notices]
     if single and result.rms_log_error is not None:
-        lines.append(f"  {_closeness(result.only, judged=result.adequacy is not None)}")
+        lines.append(f"  {_closeness(result.only, verdict=result.closeness)}")
     lines += [f"  {'' if single else f'{name}: '}{words}" for name, p in result.parts.items() for words in _stiffness(p)]
     lines += [f"  {sentence}" for sentence in result.remarks]
     every, shown = result.as_shown(result.found), result.as_shown(result.determined)
@@ -134,11 +134,11 @@ def _head(result: "FitResult") -> str:
     return f"{result.target.name} ({result.target.provenance}), {result.only.model}, method {result.method}"
 
 
-def _closeness(part: FittedPart, before: str = "", *, judged: bool = False) -> str:
-    """χ² per bin and rms error, as far as they are known; the first line has χ² where that of one spectrum is `judged`."""
-    said = (
-        [] if part.chi2_per_bin is None or (judged and part.stiffness is None) else [f"chi2 per bin {part.chi2_per_bin:.2f}"]
-    )
+def _closeness(part: FittedPart, before: str = "", *, verdict: str = "") -> str:
+    """χ² per bin and rms error of the fitted line, as far as they are known; no χ² that the verdict tells already."""
+    own = "" if part.chi2_per_bin is None else f"chi2 per bin {part.chi2_per_bin:.2f}"
+    mean = " (mean of new simulations)" if verdict.startswith("chi2 per bin") else ""
+    said = [] if own in ("", verdict) else [own + mean]
     off = part.rms_log_error
     said += [] if off is None else [f"rms log error {off:.3f} (bins are off by a factor of {np.exp(off):.2f})"]
     return before * bool(said) + ", ".join(said)

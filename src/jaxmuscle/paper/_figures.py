@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from jaxmuscle._common.files import replacing
-from jaxmuscle.plot._style import BLACK, BLUE, GREEN, GREY, PALETTE, VERMILLION, styled
+from jaxmuscle.plot._style import BLUE, GREEN, GREY, PALETTE, VERMILLION, ink, styled
 from jaxmuscle.simulation._trajectory import Trajectory
 from jaxmuscle.spectra._measures import peaks
 from jaxmuscle.spectra._settings import WINDOW
@@ -209,7 +209,7 @@ def fig8(found: Reproduction) -> Figure:
             x, y = (np.asarray(spectra[k].power) / np.sum(spectra[k].power) for k in (i, j))
             ax.loglog(x, y, ".", color=BLUE, ms=2.0 if title == "FFT" else 4.0, alpha=0.5 if title == "FFT" else 1.0)
             ends = [min(x.min(), y.min()), max(x.max(), y.max())]
-            ax.plot(ends, ends, color=BLACK, lw=0.6)
+            ax.plot(ends, ends, color=ink(), lw=0.6)
             ax.set_title(f"{title}: ρ = {value:.3f}", fontweight="normal")
             ax.set_aspect("equal", adjustable="datalim")
             _decades(ax, ends)

@@ -1,5 +1,6 @@
 """Figures of the two checks of a fit: its residuals against their reference, and refits against the stated errors."""
 
+import textwrap
 from typing import Any
 
 import numpy as np
@@ -7,33 +8,42 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure, SubFigure
 from matplotlib.ticker import MaxNLocator
 
-from ._style import BLACK, BLUE, GREY, SKY, VERMILLION, canvas, styled
+from ._numbers import in_words
+from ._style import BLUE, COLUMN, GREY, SKY, VERMILLION, canvas, fitted_to, heading, ink, key, shade, styled
 
-TITLES = {"chi2_per_bin": "χ² per bin", "runs": "Runs of equal sign", "largest": "Largest |residual| (SD)"}
+TITLES = {"chi2_per_bin": "χ² per bin", "runs": "Runs of\nequal sign", "largest": "Largest\n|residual| (SD)"}
 SMALL_P = 0.05
 HISTOGRAM, BINS = 15, 24  # refits from which on they are drawn as a histogram; its bins
-WIDTH, HEIGHT, ACROSS = 3.4, 2.2, 2  # inches, inches, panels
-PALE = "0.80"
+HEIGHTS = 1.8, 1.7  # inches: residuals, references
+HEIGHT, ACROSS = 1.85, 2  # inches, panels
+REFERENCE = "replicates, each fitted"
 
 
 @styled
 def goodness(found: Any, ax: Axes | None = None) -> Figure | SubFigure:
-    """Draws residuals with what is usual in each bin, and the three checks with their reference distributions."""
-    fig = canvas(ax, (7.2, 4.6 * len(found.parts)))
-    places = fig.subfigures(len(found.parts), 1, squeeze=False)[:, 0] if len(found.parts) > 1 else [fig]
-    for place, part in zip(places, found.parts.values(), strict=True):
-        _goodness(place, part)
+    """Draws residuals with what is usual in each bin, and the three checks with their reference distributions.
+
+    Grey is what replicates of the fitted model give, coloured what the target gives: red where less than 5 % of them are as
+    unusual. Letters are legible in a column of 85 mm.
+    """
+    count = len(found.parts)
+    fig = canvas(ax, (COLUMN, sum(HEIGHTS) * count))
+    places = fig.subfigures(count, 1, squeeze=False)[:, 0] if count > 1 else [fig]
+    lines = [_goodness(place, part) for place, part in zip(places, found.parts.values(), strict=True)]
+    fitted_to(fig, sum(HEIGHTS) * count + 0.3 * (count - 1), sum(lines))
     return fig
 
 
-def _goodness(fig: Any, found: Any) -> None:
-    grid = fig.add_gridspec(2, 3, height_ratios=(1.15, 1.0))
+def _goodness(fig: Any, found: Any) -> int:
+    """One target; how many lines of words stand about its panels."""
+    grid = fig.add_gridspec(2, 3, height_ratios=HEIGHTS)
     _residuals(fig.add_subplot(grid[0, :]), found)
     for column, name in enumerate(TITLES):
-        _reference(fig.add_subplot(grid[1, column]), found, name)
-    kind = "Foretold" if found.foretold else "Fitted"
-    title = f"{kind}: {found.target.name}, all three checks together p = {found.p_values['all']:.2g}"
-    fig.suptitle(title, x=0.01, ha="left", fontsize=9, fontweight="bold", parse_math=False)
+        panel = fig.add_subplot(grid[1, column])
+        _reference(panel, found, name)
+        if not column:
+            panel.set_ylabel("Share of replicates")
+    return heading(fig, found.target.name + " (foretold)" * found.foretold) + key(fig)
 
 
 def _residuals(ax: Axes, found: Any) -> None:
@@ -41,16 +51,16 @@ def _residuals(ax: Axes, found: Any) -> None:
     width = float(np.min(np.diff(f)))
     low, high = np.quantile(found.residuals, [0.025, 0.975], axis=0)
     edges = np.append(f - width / 2, f[-1] + width / 2)
-    ax.stairs(high, edges, baseline=low, fill=True, color="0.90", zorder=1, label="95 % of fitted replicates")
+    ax.stairs(high, edges, baseline=low, fill=True, color=shade(0.1), zorder=1, label="95 % of the replicates")
     out = (r < low) | (r > high)
-    ax.bar(f[~out], r[~out], 0.6 * width, color=BLUE, zorder=3, label="residual")
+    ax.bar(f[~out], r[~out], 0.6 * width, color=BLUE, zorder=3, label="target over fit")
     if out.any():
         ax.bar(f[out], r[out], 0.6 * width, color=VERMILLION, zorder=3, label=f"outside ({out.sum()} of {len(f)} bins)")
-    ax.axhline(0, color=BLACK, lw=0.6, zorder=4)
+    ax.axhline(0, color=ink(), lw=0.6, zorder=4)
     reach = 1.15 * max(float(np.abs(r).max()), float(high.max()), float(-low.min()))
-    ax.set(xlim=(edges[0], edges[-1]), ylim=(-reach, reach), xlabel="Frequency (Hz)", ylabel="Residual (SD of log power)")
-    ax.set_title("Target above (+) or below (–) fit")
-    ax.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=3, borderaxespad=0.0)
+    ax.set(xlim=(edges[0], edges[-1]), ylim=(-reach, reach), xlabel="Frequency (Hz)", ylabel="Residual (SD)")
+    p = found.p_values["all"]
+    ax.set_title(f"All three checks together: p = {p:.2g}", color=VERMILLION if p < SMALL_P else ink())
 
 
 def _reference(ax: Axes, found: Any, name: str) -> None:
@@ -59,32 +69,22 @@ def _reference(ax: Axes, found: Any, name: str) -> None:
         edges = np.arange(min(values.min(), seen) - 0.5, max(values.max(), seen) + 1)
     else:
         edges = np.linspace(min(values.min(), seen), max(np.quantile(values, 0.999), 1.05 * seen), 30)
-    ax.hist(values, edges, density=True, color=PALE, zorder=1)
+    ax.hist(values, edges, density=True, color=shade(0.25), zorder=1, label=REFERENCE)
     colour = VERMILLION if p < SMALL_P else BLUE
-    ax.axvline(seen, color=colour, lw=1.8, zorder=3)
-    digits = ".0f" if name == "runs" else ".2f"
-    left = seen > 0.5 * (edges[0] + edges[-1])
-    ax.margins(y=0.22)
-    ax.annotate(
-        f"{seen:{digits}}\np = {p:.2g}",
-        (seen, 0.98),
-        xycoords=("data", "axes fraction"),
-        xytext=(-4 if left else 4, 0),
-        textcoords="offset points",
-        va="top",
-        ha="right" if left else "left",
-        color=colour,
-    )
+    ax.axvline(seen, color=colour, lw=1.8, zorder=3, label="value of the target")
     ax.set_yticks([])
     ax.spines["left"].set_visible(False)
+    ax.xaxis.set_major_locator(MaxNLocator(3))
     ax.set_xlabel(TITLES[name])
-    if name == "chi2_per_bin":
-        ax.set_title("Here (line) and among replicates")
+    ax.set_title(f"{seen:{'.0f' if name == 'runs' else '.2f'}}, p = {p:.2g}", color=colour, weight="normal")
 
 
 @styled
 def bootstrap(found: Any, ax: Axes | None = None) -> Figure | SubFigure:
     """Draws the refits of every quantity, the value they were made from and the interval that the fit states.
+
+    Above each: the spread of the refits over the stated error, and how many of their own 95 % intervals hold the value that
+    they were made from; red where the error does not hold. Letters are legible in a column of 85 mm.
 
     **Raises:** `ValueError` if fewer than two refits succeeded.
     """
@@ -93,36 +93,35 @@ def bootstrap(found: Any, ax: Axes | None = None) -> Figure | SubFigure:
         raise ValueError(f"{found.target}: fewer than two refits succeeded, so there is nothing to draw")
     across = min(ACROSS, len(names))
     down = -(-len(names) // across)
-    fig = canvas(ax, (WIDTH * across + 0.2, HEIGHT * down + 0.6))
+    fig = canvas(ax, (COLUMN, HEIGHT * down))
     axes = fig.subplots(down, across, squeeze=False)
+    done = found.replicates - len(found.failed)
+    label = f"{done} refits" + (f" ({len(found.failed)} failed)" if found.failed else "")
     for panel, name in zip(axes.flat, names, strict=False):
-        _refits(panel, found.quantities[name])
+        _refits(panel, found.quantities[name], label)
     for panel in axes.flat[len(names) :]:
         panel.remove()
-    handles, labels = axes.flat[0].get_legend_handles_labels()
-    fig.legend(handles, labels, loc="outside lower center", ncols=4, frameon=False)
-    lost = f", {len(found.failed)} failed" if found.failed else ""
-    fig.suptitle(f"{found.target}: {found.replicates - len(found.failed)} refits of data made from the fit{lost}",
-                 x=0.01, ha="left", fontsize=9, fontweight="bold", parse_math=False)  # fmt: skip
+    for panel in axes[:, 0]:
+        if len(found.quantities[names[0]].values) >= HISTOGRAM:
+            panel.set_ylabel("Refits")
+    fitted_to(fig, HEIGHT * down, heading(fig, found.target) + key(fig))
     return fig
 
 
-def _refits(ax: Axes, q: Any) -> None:
+def _refits(ax: Axes, q: Any, label: str) -> None:
     low, high = q.true - 1.96 * q.stated, q.true + 1.96 * q.stated
     ax.axvspan(low, high, color=SKY, alpha=0.25, lw=0, zorder=0, label="stated 95 % interval")
     if len(q.values) >= HISTOGRAM:
-        ax.hist(q.values, min(BINS, 2 + len(q.values) // 4), color=GREY, alpha=0.75, zorder=2, label="refits")
-        ax.set_ylabel("Refits")
+        ax.hist(q.values, min(BINS, 2 + len(q.values) // 4), color=GREY, alpha=0.75, zorder=2, label=label)
         ax.yaxis.set_major_locator(MaxNLocator(4, integer=True))
     else:
-        ax.plot(q.values, np.arange(len(q.values)) + 1, "o", ms=3.5, color=GREY, zorder=2, label="refits")
+        ax.plot(q.values, np.arange(len(q.values)) + 1, "o", ms=3.5, color=GREY, zorder=2, label=label)
         ax.set(yticks=[], ylim=(0, len(q.values) + 1))
         ax.spines["left"].set_visible(False)
     ax.axvline(q.true, color=BLUE, lw=1.6, zorder=3, label="made from")
-    ax.axvline(float(np.mean(q.values)), color=VERMILLION, lw=1.2, ls="--", zorder=3, label="mean of refits")
-    ax.xaxis.set_major_locator(MaxNLocator(5))
-    ax.set_xlabel(q.name.replace("_", " ") + ("" if q.unit in ("", "1") else f" ({q.unit})"))
+    ax.axvline(float(np.mean(q.values)), color=VERMILLION, lw=1.2, ls="--", zorder=3, label="mean of the refits")
+    ax.xaxis.set_major_locator(MaxNLocator(4))
+    ax.set_xlabel(textwrap.fill(in_words(q.name, q.unit), 26))
     near, known = q.inside
-    share = "" if known == 0 else f"; intervals hold {near}/{known}"
-    ax.set_title(f"spread / stated {q.ratio:.2f} ± {q.ratio_stderr:.2f}{share}", fontsize=7.5, fontweight="normal",
-                 color=BLACK if q.verdict == "holds" else VERMILLION)  # fmt: skip
+    said = f"spread/stated {q.ratio:.2f} ± {q.ratio_stderr:.2f}" + (f"\n{near} of {known} intervals hold" if known else "")
+    ax.set_title(said, weight="normal", color=ink() if q.verdict == "holds" else VERMILLION)

@@ -7,7 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure, SubFigure
 
 from ._spectra import target
-from ._style import BLACK, COLUMN, GREY, PALETTE, canvas, fitted_to, heading, key, styled, without_legend
+from ._style import COLUMN, GREY, PALETTE, canvas, fitted_to, heading, ink, key, shade, styled, without_legend
 
 SPECTRA, ROW = 2.4, 0.24  # inches
 MARK: dict[str, Any] = {"ms": 5.5, "zorder": 3}
@@ -49,11 +49,11 @@ def _spectra(ax: Axes, comparison: Any, colours: dict[str, str]) -> None:
 
 def _criterion(ax: Axes, rows: list[Any], colours: dict[str, str]) -> None:
     """AIC above the lowest; filled with a harmonic, open without."""
-    ax.axvspan(0, rows[0].needed, color="0.85", lw=0, zorder=0)
+    ax.axvspan(0, rows[0].needed, color=shade(0.15), lw=0, zorder=0)
     for i, row in enumerate(rows):
         ax.plot(row.delta_aic, i, "o", color=colours[row.noise], mfc=_face(row, colours), **MARK)
     if len({row.harmonic for row in rows}) > 1:
-        for name, face in (("with harmonic", GREY), ("without", "white")):
+        for name, face in (("with harmonic", GREY), ("without", "none")):
             ax.plot([], [], "o", color=GREY, mfc=face, label=name, **MARK)
         ax.legend(
             loc="lower right", bbox_to_anchor=(1.02, 1.0), ncols=2, borderaxespad=0.0, columnspacing=0.8, handletextpad=0.1
@@ -75,7 +75,7 @@ def _scores(ax: Axes, rows: list[Any], colours: dict[str, str]) -> None:
         ax.set(xticks=[])
         ax.text(0.5, 0.5, "nothing held out:\nno segments", transform=ax.transAxes, ha="center", va="center", color=GREY)
         return
-    ax.axvline(0, color=BLACK, lw=0.6, zorder=1)
+    ax.axvline(0, color=ink(), lw=0.6, zorder=1)
     for i, row in enumerate(rows):
         if not row.success:
             ax.text(0.02, i, "not settled", transform=ax.get_yaxis_transform(), va="center", color=GREY)
@@ -89,8 +89,8 @@ def _scores(ax: Axes, rows: list[Any], colours: dict[str, str]) -> None:
 def _rows(ax: Axes, labels: list[str]) -> None:
     ax.set_yticks(range(len(labels)), labels)
     ax.set_ylim(len(labels) - 0.5, -0.5)
-    ax.grid(axis="y", color="0.9", lw=0.5)
+    ax.grid(axis="y", color=shade(0.1), lw=0.5)
 
 
 def _face(row: Any, colours: dict[str, str]) -> str:
-    return colours[row.noise] if row.harmonic else "white"
+    return colours[row.noise] if row.harmonic else "none"

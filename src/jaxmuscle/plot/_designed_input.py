@@ -6,37 +6,53 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure, SubFigure
 
-from ._style import BLUE, GREY, ORANGE, canvas, log_axis, styled
+from ._style import BLUE, COLUMN, GREY, ORANGE, canvas, fitted_to, key, log_axis, shade, styled
 
 SHOWN = 20.0  # s
+HEIGHTS, ROW = (1.7, 1.5), 0.2  # inches
+NOW, FLAT, DESIGNED = "now, without a motion", "flat motion", "designed motion"
 
 
 @styled
 def designed_input(found: Any, ax: Axes | None = None) -> Figure | SubFigure:
-    """Draws the density of a designed motion, its beginning, and the errors that are expected."""
-    fig = canvas(ax, (7.2, 4.6))
-    density, errors, motion = fig.subplot_mosaic([["density", "errors"], ["motion", "motion"]]).values()
-    f = found.frequency
-    for lines, colour, label in ((found.even, GREY, "flat"), (found.lengthening, BLUE, "designed")):
-        density.step(f, 1e6 * lines.power * lines.seconds, where="mid", color=colour, lw=1.2, label=label)
-    density.set_yscale("log")
-    log_axis(density)
-    density.set(xlabel="Frequency (Hz)", ylabel="Density (mm²/Hz)", title="Motion of the insertion")
-    density.legend(frameon=False)
-    names = found.told
-    place = np.arange(len(names))
-    for i, (known, colour, label) in enumerate(((found.now, ORANGE, "now"), (found.flat, GREY, "flat"),
-                                                (found.stderr, BLUE, "designed"))):  # fmt: skip
-        size = [found.percent(name, known) for name in names]
-        bars = errors.bar(place + 0.27 * (i - 1), size, 0.25, color=colour, label=label)
-        errors.bar_label(bars, [f"{x:.2g}" for x in size], fontsize=6.5, padding=1)
-    errors.set_yscale("log")
-    errors.set_xticks(place, names)
-    errors.set_ylim(0.5 * errors.get_ylim()[0], 8 * errors.get_ylim()[1])
-    errors.set(ylabel="Standard error (%)", title=f"Expected of one record of {found.lengthening.seconds:g} s")
-    errors.legend(frameon=False, ncols=3, loc="upper center", columnspacing=1.0)
+    """Draws a designed motion: its density, its beginning, and the standard errors that are expected with it.
+
+    The flat motion beside it has the same density at all frequencies of the band, and is as large as the same limits allow.
+    Errors are in percent of the value, of one record. Letters are legible in a column of 85 mm.
+    """
+    heights = HEIGHTS[0], HEIGHTS[1], 0.75 + ROW * len(found.told)
+    fig = canvas(ax, (COLUMN, sum(heights)))
+    density, motion, errors = fig.subplots(3, 1, height_ratios=heights)
+    _density(density, found)
     shown = found.time <= SHOWN
     motion.plot(found.time[shown], 1e3 * found.displacement[shown], color=BLUE, lw=0.9)
     motion.axhline(0, color=GREY, lw=0.5)
     motion.set(xlabel="Time (s)", ylabel="Lengthening (mm)", xlim=(0, min(SHOWN, found.lengthening.seconds)))
+    motion.set_title(f"Designed motion, its first {SHOWN:g} s" if found.time[-1] > SHOWN else "Designed motion")
+    _errors(errors, found)
+    fig.align_ylabels([density, motion])
+    fitted_to(fig, sum(heights), key(fig, 3))
     return fig
+
+
+def _density(ax: Axes, found: Any) -> None:
+    for lines, colour, label in ((found.even, GREY, FLAT), (found.lengthening, BLUE, DESIGNED)):
+        ax.step(found.frequency, 1e6 * lines.power * lines.seconds, where="mid", color=colour, lw=1.2, label=label)
+    log_axis(ax)
+    log_axis(ax, "y")
+    ax.set(xlabel="Frequency (Hz)", ylabel="Density (mm²/Hz)", title="Motion of the insertion")
+
+
+def _errors(ax: Axes, found: Any) -> None:
+    """A row for each quantity, a mark for each way to measure it."""
+    names = found.told
+    for known, colour, marker, label in ((found.now, ORANGE, "D", NOW), (found.flat, GREY, "s", FLAT),
+                                         (found.stderr, BLUE, "o", DESIGNED)):  # fmt: skip
+        size = [found.percent(name, known) for name in names]
+        ax.plot(size, np.arange(len(names)), marker, ms=4.5, color=colour, label=label, zorder=3)
+    ax.set_yticks(range(len(names)), names)
+    ax.set_ylim(len(names) - 0.4, -0.6)
+    log_axis(ax)
+    ax.grid(axis="both", color=shade(0.15), lw=0.5)
+    ax.set(xlabel="Standard error (% of the value)")
+    ax.set_title(f"Expected of one record of {found.lengthening.seconds:g} s")

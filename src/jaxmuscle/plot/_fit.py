@@ -6,7 +6,6 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from matplotlib import rcParams
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure, SubFigure
 
@@ -16,18 +15,20 @@ from ._components import parts_of_power
 from ._spectra import target
 from ._stiffness import gain, phase, stiffness_residuals
 from ._style import (
-    BLACK,
     BLUE,
     COLUMN,
+    GREEN,
     GREY,
     ORANGE,
     VERMILLION,
     canvas,
     fitted_to,
     heading,
+    ink,
     key,
     named,
     output_label,
+    shade,
     styled,
     without_legend,
 )
@@ -40,8 +41,9 @@ DARK_GREEN = "#00664A"  # the palette's green is too light for small letters
 def fit(result: Any, ax: Axes | None = None) -> Figure | SubFigure:
     """Draws what a fit found: spectra linear and logarithmic, residuals, simulated output, the harmonic's profile.
 
-    The band around the target is that of `target`. Residuals are in standard deviations of the log power, positive
-    where the target is above the fit; those beyond two are red. Letters are legible in a column of 85 mm. Numbers,
+    The band around the target is that of `target`. The fit is the mean of new simulations, where there are some. Residuals
+    are in standard deviations of the log power, positive where the target is above the fit; those beyond two are red. χ² and
+    p above them are those of the verdict. Letters are legible in a column of 85 mm. Numbers,
     notices and what the data do not determine are what `print(result)` tells.
 
     **Arguments:** `result`, what `jaxmuscle.fit` returns; `ax`, its place. **Returns:** the figure.
@@ -81,7 +83,7 @@ def _panels(result: Any) -> list[tuple[float, tuple[Panel, ...]]]:
     part = result.only
     rows = [
         (1.75, (partial(_spectra, part=part, log=False), partial(_spectra, part=part, log=True))),
-        (1.4, (partial(_residuals, part=part, p=result.adequacy_p), partial(_stretch, part=part))),
+        (1.4, (partial(_residuals, part=part, verdict=(result.closeness, result.adequacy_p)), partial(_stretch, part=part))),
     ] if part.fitted.size else []  # fmt: skip
     rows += _moved(part, "Dynamic stiffness")
     return rows if result.profile is None else [*rows, (1.2, (partial(_profile, result=result),))]
@@ -156,7 +158,7 @@ def _harmonic(ax: Axes, part: Any, frequency: Any, fitted: Any) -> None:
         ax.axvline(where, color=ORANGE, lw=0.8, ls=(0, (4, 2)), zorder=0)
 
 
-def _residuals(ax: Axes, part: Any, p: float | None = None) -> None:
+def _residuals(ax: Axes, part: Any, verdict: tuple[str, float | None] = ("", None)) -> None:
     """Bars, with the range that one and two standard deviations cover if these are known; how close the fit is."""
     frequency, residual = np.asarray(part.frequency_hz), np.asarray(part.residual)
     known = part.deviation is not None
@@ -164,22 +166,24 @@ def _residuals(ax: Axes, part: Any, p: float | None = None) -> None:
     width = 0.7 * np.min(np.diff(frequency), initial=math.inf)
     bars = {"width": width if math.isfinite(width) else 0.1, "zorder": 3}
     ax.bar(frequency, np.where(np.isfinite(residual), residual, 0.0), color=np.where(outside, VERMILLION, BLUE), **bars)
-    _closeness(ax, part, p)
+    _closeness(ax, part, *verdict)
     ax.set(xlabel="Frequency (Hz)", xlim=(0, frequency[-1] + frequency[0]))
     reach = float(np.max(np.abs(residual), where=np.isfinite(residual), initial=3.0 if known else 0.1)) * 1.1
     ax.set(ylim=(-reach, reach), ylabel="Residual (SD)" if known else "Residual (ln units)")
     if known:
-        for deviations, shade in ((2, "0.94"), (1, "0.87")):
-            ax.axhspan(-deviations, deviations, color=shade, lw=0, zorder=0)
+        for deviations, grey in ((2, 0.06), (1, 0.13)):
+            ax.axhspan(-deviations, deviations, color=shade(grey), lw=0, zorder=0)
     if not np.isfinite(residual).all():
         _say(ax, "no finite fit")
-    ax.axhline(0, color=BLACK, lw=0.6, zorder=4)
+    ax.axhline(0, color=ink(), lw=0.6, zorder=4)
 
 
-def _closeness(ax: Axes, part: Any, p: float | None) -> None:
-    words = "no χ² (spread unknown)" if part.chi2_per_bin is None else f"χ² per bin {part.chi2_per_bin:.2f}"
-    color = rcParams["text.color"] if p is None else DARK_GREEN if p >= 0.01 else VERMILLION
-    words += "" if p is None else f", {probability(p)}"
+def _closeness(ax: Axes, part: Any, said: str, p: float | None) -> None:
+    """The verdict of the fit with its χ²; of one target among several the χ² of the line that is drawn."""
+    own = "no χ² (spread unknown)" if part.chi2_per_bin is None else f"χ² per bin {part.chi2_per_bin:.2f}"
+    words = own if p is None else f"{said.replace('chi2', 'χ²')}, {probability(p)}"
+    green = DARK_GREEN if shade(0.0) > shade(1.0) else GREEN
+    color = ink() if p is None else green if p >= 0.01 else VERMILLION
     ax.set_title(words if np.isfinite(part.fitted).all() else "Residual", color=color)
 
 
@@ -201,7 +205,7 @@ def _stretch(ax: Axes, part: Any) -> None:
 def _profile(ax: Axes, result: Any) -> None:
     """Which other frequencies of the harmonic the spectrum allows."""
     frequency, rise = map(np.asarray, result.profile)
-    ax.axhspan(0, ALLOWED, color="0.9", lw=0, zorder=0, label="95 % interval of the frequency")
+    ax.axhspan(0, ALLOWED, color=shade(0.1), lw=0, zorder=0, label="95 % interval of the frequency")
     ax.plot(frequency, rise, color=BLUE, marker=".", ms=3)
     ax.axvline(float(result.task["harmonic_frequency"]), color=ORANGE, lw=0.8, ls=(0, (4, 2)), zorder=0)
     ax.set_title("Profile of the harmonic's frequency")

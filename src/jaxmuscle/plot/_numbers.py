@@ -24,10 +24,18 @@ def quantity(estimate: Any) -> tuple[str, str, str]:
     return f"{value:#.3g}".rstrip("."), error, unit_in_print(estimate.unit, power)
 
 
+DIGITS = str.maketrans("0123456789-", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻")
+
+
+def number_in_print(value: float) -> str:
+    """A number of an axis: `20`, `0.0005`, `5·10⁻⁵`."""
+    digits, _, power = f"{value:g}".partition("e")
+    return f"{digits}·10{str(int(power)).translate(DIGITS)}" if power else digits
+
+
 def unit_in_print(unit: str, power: int = 0) -> str:
-    digits = str.maketrans("0123456789-", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻")
-    raised = re.sub(r"\^(-?\d+)", lambda match: match[1].translate(digits), unit)
-    ten = f"10{str(power).translate(digits)}" if power else ""
+    raised = re.sub(r"\^(-?\d+)", lambda match: match[1].translate(DIGITS), unit)
+    ten = f"10{str(power).translate(DIGITS)}" if power else ""
     return " ".join(part for part in (ten, raised if raised != "1" or not ten else "") if part)
 
 

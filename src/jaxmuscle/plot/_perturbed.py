@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure, SubFigure
 
 from ._stiffness import POINTS, Curve, gain, phase
-from ._style import BLUE, COLUMN, GREY, ORANGE, VERMILLION, canvas, fitted_to, heading, key, legend, styled
+from ._style import BLUE, COLUMN, GREY, ORANGE, VERMILLION, canvas, fitted_to, heading, ink, key, legend, styled
 
 SHOWN = 4.0  # seconds of the window that are drawn larger
 CHANCE = 0.05
@@ -76,7 +76,7 @@ def _response(panels: Sequence[Axes] | np.ndarray, response: Any, line: Curve | 
         k = np.maximum(response.averages, 2.0)
         spread = np.sqrt(2 * response.coherence / k) * (1 - response.coherence)
         ends = [np.minimum(2 * spread, response.coherence), np.minimum(2 * spread, 1 - response.coherence)]
-        coherence.errorbar(f, response.coherence, np.nan_to_num(ends), **POINTS)
+        coherence.errorbar(f, response.coherence, np.nan_to_num(ends), color=ink(), **POINTS)
         chance = 1 - CHANCE ** (1 / (np.maximum(k - 1, 1)))
         coherence.plot(f, chance, color=GREY, lw=0.8, ls="--", label=f"{100 * CHANCE:g} % level without relation")
         legend(coherence, "above")

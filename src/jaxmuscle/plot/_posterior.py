@@ -6,6 +6,8 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure, SubFigure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
 
 from jaxmuscle._common.errors import NotMixedError
 
@@ -30,6 +32,7 @@ MOST, PAIRS = 6, 4  # quantities that are drawn; those of which all pairs have r
 CUT = (0.002, 0.998)
 BANDS = ((0.025, 0.975, 0.18), (0.25, 0.75, 0.35))
 MASS = (0.95, 0.8, 0.5)
+REGIONS = ("#cfe6f5", SKY, BLUE)  # of this mass
 
 
 def chosen(found: Any) -> list[str]:
@@ -81,7 +84,21 @@ def posterior(found: Any, ax: Axes | None = None) -> Figure | SubFigure:
                 panel.set_ylabel(_label(found, names[i]))
     fig.align_labels()
     heading(fig, found.title)
+    if count > 1:
+        fig.legend(handles=_explained(), loc="upper right", frameon=False)
     return fig
+
+
+def _explained() -> list[Any]:
+    """What lines and areas are, in the empty corner."""
+    regions = [Patch(color=color, label=f"region of {100 * mass:g} %") for mass, color in zip(MASS, REGIONS, strict=True)]
+    interval = Patch(color=BLUE, alpha=0.08, label="95 % interval")
+    return [
+        Patch(color=SKY, alpha=0.6, label="density"),
+        Line2D([], [], color=BLUE, lw=1.0, label="median"),
+        interval,
+        *regions,
+    ]
 
 
 def _label(found: Any, name: str) -> str:
@@ -106,7 +123,7 @@ def _pair(ax: Axes, x: np.ndarray, y: np.ndarray, wide: np.ndarray, high: np.nda
     inside = np.cumsum(order) / order.sum()
     levels = np.unique([order[np.searchsorted(inside, mass)] for mass in MASS])
     mid = 0.5 * (xs[1:] + xs[:-1]), 0.5 * (ys[1:] + ys[:-1])
-    ax.contourf(*mid, smooth.T, levels=[*levels, smooth.max() * 1.01], colors=["#cfe6f5", SKY, BLUE][-len(levels) :])
+    ax.contourf(*mid, smooth.T, levels=[*levels, smooth.max() * 1.01], colors=list(REGIONS[-len(levels) :]))
     ax.set_ylim(*high)
     ax.locator_params(nbins=2)
 

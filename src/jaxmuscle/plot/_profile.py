@@ -7,9 +7,23 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure, SubFigure
 
-from ._style import BLUE, GREY, ORANGE, axes_or_new, canvas, log_axis, styled
+from ._style import (
+    BLUE,
+    COLUMN,
+    GREY,
+    ORANGE,
+    axes_or_new,
+    canvas,
+    fitted_to,
+    heading,
+    key,
+    log_axis,
+    styled,
+    without_legend,
+)
 
 SHOWN = 3.0  # times the threshold
+HEIGHT, ACROSS = 1.7, 2  # inches, panels
 
 
 @styled
@@ -17,10 +31,10 @@ def profile(found: Any, ax: Axes | None = None) -> Axes:
     """Draws a profile likelihood with its interval and the parabola of the curvature. Returns the axes (`ax` or new)."""
     ax = axes_or_new(ax)
     ax.plot(found.values, found.rise, color=BLUE, marker="o", ms=2.5, lw=1.2, label="profile")
-    ax.axhline(found.threshold, color=GREY, lw=0.8, ls=(0, (4, 2)), label=f"{100 * found.level:g} %")
-    for low, high in found.intervals:
+    ax.axhline(found.threshold, color=GREY, lw=0.8, ls=(0, (4, 2)), label=f"{100 * found.level:g} % threshold")
+    for number, (low, high) in enumerate(found.intervals):
         ends = found.values[0] if low is None else low, found.values[-1] if high is None else high
-        ax.axvspan(*ends, color=BLUE, alpha=0.1, lw=0)
+        ax.axvspan(*ends, color=BLUE, alpha=0.1, lw=0, label=f"{100 * found.level:g} % interval" if not number else None)
     wide = np.all(found.values > 0) and found.values[-1] > 10 * found.values[0]
     if wide:
         x = np.geomspace(found.values[0], found.values[-1], 200)
@@ -36,11 +50,11 @@ def profile(found: Any, ax: Axes | None = None) -> Axes:
     if wide:
         log_axis(ax)
     ax.set_xlabel(found.name + ("" if found.unit == "1" else f" ({found.unit})"))
-    ax.set_title(f"{found.target}: profile likelihood", pad=18)
+    ax.set_title(f"{found.target}: profile likelihood", pad=32, parse_math=False)
     if found.low is None or found.high is None:
         side = "on both sides" if found.low is found.high else "downwards" if found.low is None else "upwards"
-        ax.text(0.99, 0.97, f"open {side}", transform=ax.transAxes, color=GREY, fontsize=7, ha="right", va="top")
-    ax.legend(frameon=False, loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=3, borderaxespad=0.0)
+        ax.text(0.99, 0.97, f"open {side}", transform=ax.transAxes, color=GREY, ha="right", va="top")
+    ax.legend(frameon=False, loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=2, borderaxespad=0.0)
     return ax
 
 
@@ -52,20 +66,15 @@ def profiles(profiles: Sequence[Any], ax: Axes | None = None) -> Figure | SubFig
     """
     if not profiles:
         raise ValueError("profiles: is empty; give [jm.profile(result, name) for name in ...]")
-    columns = min(len(profiles), 3)
+    columns = min(len(profiles), ACROSS)
     rows = -(-len(profiles) // columns)
-    fig = canvas(ax, (2.25 * columns, 1.7 * rows + 0.5))
+    fig = canvas(ax, (COLUMN, HEIGHT * rows))
     for number, found in enumerate(profiles, start=1):
         panel = profile(found, fig.add_subplot(rows, columns, number))
         panel.set_title("")
         panel.set_ylabel("Rise of -2 ln L")
-        handles, labels = panel.get_legend_handles_labels()
-        legend = panel.get_legend()
-        if legend is not None:
-            legend.remove()
-        if number == 1:
-            fig.legend(handles, labels, loc="outside lower center", ncols=3, frameon=False)
-    fig.suptitle(profiles[0].target, x=0.02, ha="left", size=9, weight="bold", parse_math=False)
+        without_legend(panel)
+    fitted_to(fig, HEIGHT * rows, heading(fig, profiles[0].target) + key(fig))
     return fig
 
 

@@ -7,7 +7,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure, SubFigure
 
 from ._style import (
-    BLACK,
     BLUE,
     COLUMN,
     GREY,
@@ -17,6 +16,7 @@ from ._style import (
     density_unit,
     fitted_to,
     heading,
+    ink,
     key,
     log_axis,
     styled,
@@ -66,7 +66,7 @@ def trials(trials: Any, settings: Any = None, ax: Axes | None = None) -> Figure 
         panel = fig.add_subplot(grid[-1, column])
         for one in each:
             panel.plot(one.frequency, one.power, color=GREY, lw=0.6, label=f"{len(each)} trials" if one is each[0] else None)
-        panel.plot(mean.frequency, mean.power, color=BLACK, lw=1.0, marker="o", ms=2.8, label="mean")
+        panel.plot(mean.frequency, mean.power, color=ink(), lw=1.0, marker="o", ms=2.8, label="mean")
         _spectrum_axes(panel, mean.unit, log)
     words = f"{(trials[0].quantity or 'signal').capitalize()} of {len(trials)} trials"
     more = f", {len(shown)} shown" if len(shown) < len(trials) else ""
@@ -100,7 +100,7 @@ def _spectra(ax: Axes, welch: Any, fft: Any, band: list[Any], label: str, log: b
     ax.plot(fft.frequency, fft.power, color=GREY, lw=0.6, alpha=0.8, label="FFT of the window", zorder=2)
     if band:
         ax.fill_between(f[shown], band[0][shown], band[1][shown], color=BLUE, alpha=0.2, lw=0, label="± 1 SD", zorder=3)
-    ax.plot(f[shown], power[shown], color=BLACK, lw=1.0, marker="o", ms=2.8, label=label, zorder=4)
+    ax.plot(f[shown], power[shown], color=ink(), lw=1.0, marker="o", ms=2.8, label=label, zorder=4)
     _spectrum_axes(ax, welch.unit, log)
 
 

@@ -7,7 +7,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import SymLogNorm
 
-from ._style import styled
+from ._style import COLUMN, styled
 
 
 @styled
@@ -19,7 +19,7 @@ def sensitivity(sensitivity: Any, ax: Axes | None = None) -> Axes:
     table = np.asarray(sensitivity.proportional)
     shown = np.flatnonzero(np.max(np.abs(table), axis=1) > 1e-6)
     if ax is None:
-        ax = plt.figure(figsize=(6.5, 1.3 + 0.22 * len(shown)), layout="constrained").add_subplot()
+        ax = plt.figure(figsize=(COLUMN, 1.6 + 0.2 * len(shown)), layout="constrained").add_subplot()
     frequency = np.asarray(sensitivity.frequency)
     half = 0.5 * (frequency[1] - frequency[0]) if len(frequency) > 1 else 0.5
     edges = np.append(frequency - half, frequency[-1] + half)
@@ -31,7 +31,7 @@ def sensitivity(sensitivity: Any, ax: Axes | None = None) -> Axes:
     ax.set_yticks(np.arange(len(shown)) + 0.5, labels)
     ax.invert_yaxis()
     ax.set_xlabel("Frequency (Hz)")
-    ax.figure.colorbar(mesh, ax=ax, label="d ln p / d ln parameter")
+    ax.figure.colorbar(mesh, ax=ax, location="bottom", fraction=0.04, aspect=40, label="d ln p / d ln parameter")
     if not np.all(sensitivity.relative[shown]):
-        ax.set_title("* d ln p / d parameter, in its own unit", size="small")
+        ax.set_title("* d ln p / d parameter, in its own unit", weight="normal")
     return ax

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Real
 from matplotlib.axes import Axes
 
-from ._style import BLACK, BLUE, GREY, PALETTE, PROPORTIONAL, axes_or_new, density_unit, frequency_axis, legend, styled
+from ._style import BLUE, GREY, PALETTE, PROPORTIONAL, axes_or_new, density_unit, frequency_axis, ink, legend, shade, styled
 
 
 @styled
@@ -83,16 +83,16 @@ def target(target: Any, ax: Axes | None = None, *, log: bool = False) -> Axes:
     if band is not None:
         low, high = band
         label = "± 1 SD (assumed)" if target.provenance == "reconstructed" else "± 1 SD of the estimate"
-        ax.fill_between(frequency[shown], low[shown], high[shown], color="0.86", lw=0, label=label, zorder=1)
+        ax.fill_between(frequency[shown], low[shown], high[shown], color=shade(0.14), lw=0, label=label, zorder=1)
     name = target.name if len(target.name) <= 40 else f"{target.name[:39]}…"
-    style: dict[str, Any] = {"color": BLACK, "lw": 0.6, "marker": "o", "ms": 2.8, "zorder": 3}
+    style: dict[str, Any] = {"color": ink(), "lw": 0.6, "marker": "o", "ms": 2.8, "zorder": 3}
     (line,) = ax.plot(frequency[shown], power[shown], **style)
     name = name.lstrip("_").replace("$", r"\$")  # neither hidden from the legend nor read as mathematics
     line.set_label(f"{name} ({target.provenance})")
     if target.trial_power is not None:
         weights = np.asarray(target.segments)
         each = target.trial_power / (weights @ target.trial_power / weights.sum()).sum()
-        ax.plot(frequency[shown], each.T[shown], color="0.6", lw=0.5, zorder=2)
+        ax.plot(frequency[shown], each.T[shown], color=shade(0.4), lw=0.5, zorder=2)
         ax.lines[-1].set_label(f"{len(each)} trials")
     frequency_axis(ax, log)
     ax.set_ylabel(PROPORTIONAL)

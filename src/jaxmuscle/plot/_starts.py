@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import SymLogNorm
 
-from ._style import BLACK, BLUE, COLUMN, GREY, axes_or_new, legend, log_axis, styled
+from ._style import BLUE, COLUMN, GREY, axes_or_new, ink, legend, log_axis, styled
 
 
 @styled
@@ -57,7 +57,7 @@ def start_values(result: Any, ax: Axes | None = None) -> Axes:
         ax = plt.figure(figsize=(COLUMN, 1.0 + 0.24 * len(names)), layout="constrained").add_subplot()
     norm = SymLogNorm(1.0, vmin=0.0, vmax=max(float(rise.max()), 1.0))
     for i in range(len(ratio) - 1, -1, -1):
-        color = BLACK if i == 0 else plt.get_cmap("viridis")(norm(rise[i]))
+        color = ink() if i == 0 else plt.get_cmap("viridis")(norm(rise[i]))
         ax.plot(ratio[i], rows, marker="o", ms=2.5, lw=1.2 if i == 0 else 0.6, color=color, zorder=2 + (i == 0))
     ax.set_yticks(rows, names)
     ax.set_ylim(len(names) - 0.5, -0.5)

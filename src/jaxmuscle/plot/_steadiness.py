@@ -8,26 +8,28 @@ from matplotlib.figure import Figure, SubFigure
 
 from jaxmuscle._common.text import squared
 
-from ._style import BLUE, SKY, canvas, log_axis, styled
+from ._style import BLUE, COLUMN, SKY, canvas, fitted_to, heading, key, log_axis, styled
 
 VARIATION = "coefficient_of_variation"
 VARIATIONS = {"all": VARIATION, "without\ndrift": f"{VARIATION}_without_drift", "above\n0.5 Hz": f"{VARIATION}_above_0.5"}
 REGULARITY = {
-    "approximate\nentropy": "approximate_entropy",
+    "approx.\nentropy": "approximate_entropy",
     "sample\nentropy": "sample_entropy",
-    "DFA\nexponent": "dfa_exponent",
+    "DFA\nexp. α": "dfa_exponent",
 }
 SPREAD = 0.28
+HEIGHTS = 1.9, 1.8  # inches
 
 
 @styled
 def steadiness(steadiness: Any, ax: Axes | None = None) -> Figure | SubFigure:
     """Draws the steadiness of trials: power by band, coefficients of variation, entropies and DFA exponent.
 
-    Dots are trials, large ones the value of all with its standard error.
+    Dots are trials, large ones the value of all with its standard error. Letters are legible in a column of 85 mm.
     """
-    fig = canvas(ax, (9.0, 3.1))
-    power, variation, regularity = fig.subplots(1, 3, width_ratios=(1.5, 1, 1))
+    fig = canvas(ax, (COLUMN, sum(HEIGHTS)))
+    grid = fig.add_gridspec(2, 2, height_ratios=HEIGHTS)
+    power, variation, regularity = (fig.add_subplot(grid[place]) for place in ((0, slice(None)), (1, 0), (1, 1)))
     bands = {_range(name): name for name in steadiness.measures if name.startswith("power_")}
     _dots(power, steadiness, bands)
     log_axis(power, "y")
@@ -35,17 +37,17 @@ def steadiness(steadiness: Any, ax: Axes | None = None) -> Figure | SubFigure:
     power.set_ylabel(f"Power ({squared(steadiness.unit).replace('^2', '²')})", parse_math=False)
     power.set_title("Power by band")
     _dots(variation, steadiness, VARIATIONS, 100.0)
-    variation.set_ylabel("Standard deviation (% of the mean)")
+    variation.set_ylabel("SD (% of the mean)")
     variation.set_title("Coefficient of variation")
     _dots(regularity, steadiness, REGULARITY)
     regularity.set_ylabel("Value (no unit)")
     regularity.set_title("Regularity")
     for panel in (variation, regularity):
+        panel.margins(y=0.1)
         panel.set_ylim(bottom=0, auto=None)
-    fig.legend(*power.get_legend_handles_labels(), loc="outside upper right", ncols=2, frameon=False)
     count = len(steadiness.trials)
     words = f"{count} trials" if count > 1 else next(iter(steadiness.trials))
-    fig.suptitle(f"Steadiness of {words}", x=0.01, ha="left", fontsize=8.0, parse_math=False)
+    fitted_to(fig, sum(HEIGHTS), heading(fig, f"Steadiness of {words}") + key(fig))
     return fig
 
 

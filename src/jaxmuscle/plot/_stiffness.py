@@ -8,10 +8,10 @@ from jaxtyping import Complex
 from matplotlib.axes import Axes
 from matplotlib.ticker import MultipleLocator
 
-from ._style import BLACK, BLUE, GREY, ORANGE, legend, log_axis
+from ._style import BLUE, GREY, ORANGE, ink, legend, log_axis, shade
 
 Curve = tuple[str, Complex[np.ndarray, " bins"]]
-POINTS: dict[str, Any] = {"fmt": "o", "ms": 2.8, "lw": 0.8, "color": BLACK, "zorder": 3}
+POINTS: dict[str, Any] = {"fmt": "o", "ms": 2.8, "lw": 0.8, "zorder": 3}
 
 
 def gain(ax: Axes, response: Any, curve: Curve | None = None, title: str = "Dynamic stiffness") -> None:
@@ -22,7 +22,7 @@ def gain(ax: Axes, response: Any, curve: Curve | None = None, title: str = "Dyna
     f, known, shown = response.frequency, np.isfinite(response.stderr), _shown(response, curve)
     low = np.minimum(2 * response.stderr, 0.95 * response.gain)  # a bar to 0 has no end on a logarithmic axis
     bars = np.where(known, [low, 2 * response.stderr], 0.0)
-    ax.errorbar(f[shown], response.gain[shown], bars[:, shown], label="± 2 SE", **POINTS)
+    ax.errorbar(f[shown], response.gain[shown], bars[:, shown], label="± 2 SE", color=ink(), **POINTS)
     if curve is not None:
         name, values = curve
         fine, smooth = _smooth(f, values)
@@ -44,7 +44,7 @@ def phase(ax: Axes, response: Any, curve: Curve | None = None) -> None:
         turned = np.degrees(np.unwrap(np.angle(smooth)))
         ax.plot(fine, turned, color=BLUE, lw=1.2, zorder=2)
         values = values + 360 * np.rint((np.interp(f, fine, turned) - values) / 360)  # the turn nearest to the curve
-    ax.errorbar(f[shown], values[shown], bars[shown], **POINTS)
+    ax.errorbar(f[shown], values[shown], bars[shown], color=ink(), **POINTS)
     ax.axhline(0, color=GREY, lw=0.6)
     ax.set_ylabel("Phase (deg)")
     low, high = ax.get_ylim()
@@ -55,13 +55,13 @@ def phase(ax: Axes, response: Any, curve: Curve | None = None) -> None:
 def stiffness_residuals(ax: Axes, part: Any) -> None:
     """Measured less fitted stiffness in standard errors, of the real and of the imaginary part."""
     f, off = part.target.stiffness.known.frequency, part.stiffness_residual
-    for deviations, shade in ((2, "0.94"), (1, "0.87")):
-        ax.axhspan(-deviations, deviations, color=shade, lw=0, zorder=0)
+    for deviations, grey in ((2, 0.06), (1, 0.13)):
+        ax.axhspan(-deviations, deviations, color=shade(grey), lw=0, zorder=0)
     for values, marker, colour, name in ((np.real(off), "o", BLUE, "real (spring, mass)"),
                                          (np.imag(off), "^", ORANGE, "imaginary (damping)")):  # fmt: skip
         ax.plot(f, values, color=colour, lw=0.6, marker=marker, ms=3.5, label=name, zorder=3)
     reach = 1.1 * float(np.max(np.abs([np.real(off), np.imag(off)]), initial=3.0))
-    ax.axhline(0, color=BLACK, lw=0.6, zorder=2)
+    ax.axhline(0, color=ink(), lw=0.6, zorder=2)
     log_axis(ax)
     ax.set(xlabel="Frequency (Hz)", ylabel="Residual (SE)", ylim=(-reach, reach))
     ax.set_title("Stiffness")

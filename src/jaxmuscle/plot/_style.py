@@ -7,15 +7,19 @@ from typing import Any, Literal, ParamSpec, TypeVar, cast
 
 import matplotlib
 import matplotlib.pyplot as plt
+import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure, SubFigure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from jaxmuscle._common.text import printable
 
+from ._numbers import number_in_print
+
 # Okabe & Ito 2008, Color Universal Design: told apart with any common form of colour vision.
 BLUE, VERMILLION, GREEN, PURPLE = "#0072B2", "#D55E00", "#009E73", "#CC79A7"
-ORANGE, SKY, BLACK, GREY = "#E69F00", "#56B4E9", "#000000", "#767676"
+ORANGE, SKY, GREY = "#E69F00", "#56B4E9", "#767676"
 PALETTE = (BLUE, VERMILLION, GREEN, PURPLE, ORANGE, SKY)
 
 STYLE: dict[str, Any] = {
@@ -32,13 +36,14 @@ STYLE: dict[str, Any] = {
     "xtick.major.width": 0.6,
     "ytick.major.width": 0.6,
     "legend.fontsize": 8.0,
-    "legend.facecolor": "white",
+    "legend.facecolor": "inherit",
     "legend.edgecolor": "none",
     "legend.framealpha": 0.85,
     "lines.linewidth": 1.5,
     "figure.dpi": 160.0,
 }
 COLUMN = 4.4  # inches: in a column of 85 mm letters of 8 points are those of 6
+ON_DARK = 1.8  # times as strong is a grey on a dark page, to be seen as well
 LINE = 0.17  # inches
 SIZE = (COLUMN, 3.0)
 LOCK = threading.RLock()  # pyplot and rcParams are those of all threads
@@ -64,6 +69,19 @@ def styled(draw: Callable[P, R]) -> Callable[P, R]:
                 params.update(before)
 
     return inside
+
+
+def ink() -> str:
+    """The colour of letters, for lines and points that are to stand out: black, or white on a dark page."""
+    return matplotlib.rcParams["text.color"]
+
+
+def shade(strength: float) -> tuple[float, float, float]:
+    """A grey between the page (0) and the letters (1), for areas behind lines; right on a white and on a dark page."""
+    page, letters = (np.array(to_rgb(matplotlib.rcParams[name])) for name in ("axes.facecolor", "text.color"))
+    strength *= 1.0 if page.mean() > letters.mean() else ON_DARK
+    red, green, blue = page + strength * (letters - page)
+    return float(red), float(green), float(blue)
 
 
 def canvas(ax: Axes | None, size: tuple[float, float], **pads: float) -> Figure | SubFigure:
@@ -100,7 +118,7 @@ def named(name: str, most: int) -> str:
 def heading(fig: Figure | SubFigure, words: str, *, bad: str = "") -> int:
     """What is drawn, and below it in red what forbids to believe it; how many lines."""
     text = "\n".join(filter(None, (named(words, 50), bad)))
-    color = VERMILLION if bad else matplotlib.rcParams["text.color"]
+    color = VERMILLION if bad else ink()
     fig.suptitle(text, x=0.02, ha="left", size=9, weight="bold", color=color, parse_math=False)
     return 1 + bool(bad)
 
@@ -114,10 +132,10 @@ def key(fig: Figure | SubFigure, columns: int = 2) -> int:
     return -(-len(named) // columns)
 
 
-def fitted_to(fig: Figure | SubFigure, panels: float, lines: int) -> None:
+def fitted_to(fig: Figure | SubFigure, panels: float, lines: int, width: float = COLUMN) -> None:
     """A figure of its own becomes as high as its panels and so many lines of words need."""
     if isinstance(fig, Figure):
-        fig.set_size_inches(COLUMN, panels + 0.3 + LINE * lines)
+        fig.set_size_inches(width, panels + 0.3 + LINE * lines)
 
 
 def without_legend(ax: Axes) -> Axes:
@@ -157,7 +175,7 @@ def frequency_axis(ax: Axes, log: bool) -> None:
 def log_axis(ax: Axes, which: Literal["x", "y"] = "x") -> None:
     """A logarithmic abscissa or ordinate with plain numbers, as many as have room."""
     ax.set(**{f"{which}scale": "log"})
-    (low, high), axis = (ax.get_xlim(), ax.xaxis) if which == "x" else (ax.get_ylim(), ax.yaxis)
-    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if high < 1e3 * low else (1.0,)))
-    axis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:g}"))
+    (low, high), axis, decades = (ax.get_xlim(), ax.xaxis, 1e3) if which == "x" else (ax.get_ylim(), ax.yaxis, 1e2)
+    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if high < decades * low else (1.0,)))
+    axis.set_major_formatter(FuncFormatter(lambda x, _: number_in_print(x)))
     axis.set_minor_formatter(NullFormatter())
