@@ -612,6 +612,46 @@ def test_a_fit_that_is_taken_up_is_no_obstacle(tmp_path, monkeypatch):
     assert "posterior.json: is there already" in run("posterior", tmp_path / "fit.json", "--out", tmp_path).stderr
 
 
+def made_comparison(target, *, success):
+    """Two models; the search of the second one ended as told."""
+    task = jm.on_rung(jm.Isometric(), 2)
+    scores = np.linspace(-2.0, -1.0, len(target.bins))
+    rows = [
+        jm.comparison.ComparedModel(
+            noise, False, -10.0, 4.0, aic, aic - 28.0, weight, float(scores.sum()), 0.0, 0.0, 1.0, 0.4, settled, scores
+        )
+        for noise, aic, weight, settled in (("band-limited", 28.0, 0.9, True), ("tremor", 32.0, 0.1, success))
+    ]
+    tasks = {("band-limited", False): jm.Isometric(), ("tremor", False): task}
+    fitted = {(row.noise, row.harmonic): np.asarray(target.proportional_power) for row in rows}
+    return jm.comparison.Comparison(target, tuple(rows), {}, tasks, fitted, 12.0, 3, 0)
+
+
+@pytest.mark.parametrize("success", [True, False])
+def test_the_spectrum_of_a_fit_is_compared(success, tmp_path, monkeypatch):
+    """`compare` takes a fit.json and says which search did not come to its end, in words and in the figure."""
+    result, asked = made_result(), []
+
+    def compared(task, target, **options):
+        asked.append((task, target))
+        return made_comparison(target, success=success)
+
+    result.save(tmp_path / "fit.json")
+    monkeypatch.setattr(jm, "compare_noise", compared)
+    outcome = run("compare", tmp_path / "fit.json", "--out", tmp_path / "out")
+    ((task, target),) = asked
+    assert_equal(target, result.target)
+    assert type(task) is type(result.task)
+    unsettled = "the search did not come to its end for tremor, no harmonic. Do not use these rows"
+    assert (outcome.exit_code, unsettled in outcome.output) == ((0, False) if success else (1, True))
+    assert success or "Hold a parameter of theirs, for example --fix resonance_width=" in outcome.output
+    figure = made_comparison(target, success=success).plot()
+    marks = [text.get_text() for ax in figure.axes for text in ax.texts]
+    assert ("not settled" in marks) is not success
+    refused = run("compare", tmp_path / "fit.json", "--segments", "12", "--out", tmp_path / "out", "--force")
+    assert refused.exit_code == 2 and "--segments: the spectrum of a fit states this already" in refused.stderr
+
+
 def test_a_fit_is_replaced(tmp_path, monkeypatch):
     for seed, force in ((1, ()), (2, ("--force",))):
         monkeypatch.setattr(jm, "fit", lambda *_, seed=seed, **__: made_result(seed=seed))
@@ -774,11 +814,13 @@ def test_a_designed_motion(tmp_path):
         "--rate",
         "50",
     )
-    result = run("design", preset, *asked, "--out", tmp_path / "out", "--json")
+    result = run("design", preset, *asked, "--durations", "20,40", "--error", "10", "--out", tmp_path / "out", "--json")
     assert result.exit_code == 0
     found = jm.design_input(jm.Isometric(), ("K_w0", "C_w0"), rms=5e-4, peak=9e-4, band=(0.2, 4.0), seconds=20.0, rate=50.0)
     table = json.loads(result.stdout)
     assert table == json.loads((tmp_path / "out" / "design.json").read_text())
+    assert [row["seconds"] for row in table["by_seconds"]] == [20.0, 40.0] and table["needed"]["error"] == 0.1
+    assert table["by_seconds"][0]["stderr"]["K_w0"] == pytest.approx(found.stderr["K_w0"])
     assert table["gain"] == pytest.approx(found.gain) and table["quantity"] == ["K_w0", "C_w0"]
     signal = np.loadtxt(tmp_path / "out" / "motor.csv", delimiter=",", skiprows=3)
     np.testing.assert_allclose(signal[:, 1], 1e3 * found.displacement, rtol=1e-6, atol=1e-9)
@@ -787,6 +829,7 @@ def test_a_designed_motion(tmp_path):
         (("--out", tmp_path / "out"), "motor.csv: is there already; overwrite it with --force"),
         (("--band", "5", "--out", tmp_path / "new"), "--band 5: give lowest and highest frequency in Hz, as --band 0.1:5"),
         (("--quantity", "K", "--out", tmp_path / "new"), "quantity 'K' is unknown"),
+        (("--durations", "30;60", "--out", tmp_path / "new"), "--durations 30;60: give lengths of the record in s, as"),
     ):
         wrong = run("design", preset, *arguments)
         assert wrong.exit_code == 2 and message in wrong.stderr

@@ -45,8 +45,15 @@ def test_of_a_fit(tmp_path):
     assert "k_w" in second and "m_w" in second.split("What was fixed", 1)[1]
     assert text.count(HOSTILE) >= 4 and "jaxmuscle fit '<script>" in text  # in the shell, too, it is one word
     assert "dt | 0.0025" in text and "jaxmuscle 0.1, jax 0.8" in text
+    tried = text.split("Models tried", 1)[1]
+    assert "0 | base | 1.90 | 0.002 | -250.1 | 1 | with activation | 0.90 | 0.3 | -260.0 | the result" in tried
     assert sum(tag == "img" for tag, _ in seen.elements) == 1
     assert write_fit(result, tmp_path) == ["fit.json", "spectrum.csv"] and not (tmp_path / "report.html").exists()
+
+
+def test_one_model_alone_was_not_tried_against_others(tmp_path):
+    fit_report(made_result(ladder=()), plt.figure(), tmp_path)
+    assert "Models tried" not in told(tmp_path)[0]
 
 
 ADVICE = {

@@ -48,6 +48,21 @@ def test_absolute_spectra_are_averaged_with_their_segments():
     assert target.mean == pytest.approx([np.mean(r.filtered()) for r in both]) and target.unit == "N"
 
 
+def test_what_several_trials_say_is_said_once():
+    """The steady parts in one notice; else with the names of those that say it, unless all do."""
+    rng, rise = np.random.default_rng(7), LEVEL * np.linspace(0, 1, RATE)
+    rest = 0.05 * rng.normal(size=2 * RATE)
+    held = [np.concatenate([rest, rise, signal(rng, seconds=s), rise[::-1]]) for s in (10.0, 12.0, 14.0)]
+    said = [("taken as N", "cut off"), ("taken as N",), ("taken as N", "cut off")]
+    found = jm.Trials(
+        jm.Recording(x, RATE, name=f"t{i}", notices=own) for i, (x, own) in enumerate(zip(held, said, strict=True))
+    ).steady()
+    windows = ", ".join(f"{a:.2f} s to {b:.2f} s in {r.name}" for r in found for a, b in [r.window])
+    assert found.target().notices[:3] == ("taken as N", "t0, t2: cut off", f"steady part found by itself: {windows}")
+    alone = found[0].target().notices
+    assert alone[-1].startswith("steady part found by itself: ") and alone[-1].endswith(" s")
+
+
 def scatter(made):
     """How often the squared deviations of many averages' shapes are what the law says, of their log powers."""
     logs = np.log([target.proportional_power for target in made])

@@ -79,6 +79,17 @@ def test_log_density_and_its_slope(problem):
     np.testing.assert_allclose(slope, differences, rtol=1e-4, atol=1e-5)  # second-order differences of a smooth function
 
 
+def test_the_log_density_has_second_derivatives():
+    """Against differences of the slope, in a step so small that the ripple along the frequency does not show."""
+    problem = jm.problem(TASK, TARGET, free=("c_w", "noise_K_w", "harmonic_frequency"))
+    theta, step = problem.theta({"c_w": 90.0, "harmonic_frequency": 7.0}), 1e-6 * np.eye(3)
+    slope = jax.jit(jax.grad(problem.log_density))
+    found = np.asarray(jax.jit(jax.hessian(problem.log_density))(theta))
+    differences = np.stack([(np.asarray(slope(theta + e)) - np.asarray(slope(theta - e))) / 2e-6 for e in step])
+    np.testing.assert_allclose(found, differences, rtol=1e-4)  # a slope of 300 is rounded by 1e-12, divided by the step
+    np.testing.assert_allclose(found, found.T, rtol=1e-8)
+
+
 @pytest.mark.slow
 def test_far_away_the_density_is_zero_and_not_a_number_for_a_sampler_to_choke_on(problem):
     far = np.full(len(problem.names), 15.0)

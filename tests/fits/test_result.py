@@ -227,13 +227,15 @@ def test_text_shows_what_is_known_and_what_is_not():
         "c_w 6.667 ± 0.013",  # 16.667 N over a mean of 2.5 N
         "corner_frequency 0.333 ± 0.010 above 0.31 Hz",
         "products and ratios known roughly: k_w / c_w",
-        "not determined: do not interpret these values: k_w",
+        "not determined: do not interpret these values (per newton of mean force): k_w",
         "the data leave open: - stiffness and damping can all be multiplied by one number",
-        "stiffness and damping are stated per newton of mean force",
+        "stiffness and damping are stated per newton of mean force. In newtons, as in result['K_w0'], in to_dataframe() and "
+        "in fit.json, they are those of a model muscle that pulls with 2.5 N: divide by that",
         "note: a notice",
     ):
         assert part in words
     assert words.index("determined by the data") < words.index("not determined: do not")
+    assert made_result()["c_w"].value / made_result()["mean"].value == pytest.approx(6.667, abs=5e-4)
     assert str(failed_result()).startswith("Not fitted: no start has a finite spectrum")
 
 
@@ -247,7 +249,7 @@ def test_a_fit_that_misses_the_data_says_so_first():
     for part in (
         f"errors are widened by a factor of {np.sqrt(145 / 25):.2g}",
         "what to do: do not interpret",
-        "would be determined if the model held:",
+        "would be determined if the model held (per newton of mean force):",
     ):
         assert part in words
     unknown = made_result(adequacy=None, chi2_per_bin=None)

@@ -43,8 +43,14 @@ def expected(task: jm.Isometric) -> np.ndarray:
 
 
 @functools.cache
+def climbed_and_told() -> tuple[jm.fits.FitResult, list[tuple[str, float]]]:
+    told: list[tuple[str, float]] = []
+    result = jm.fit(TASK, drawn(expected(with_tremor()), 90, 1), progress=lambda *said: told.append(said), **QUICK)
+    return result, told
+
+
 def climbed() -> jm.fits.FitResult:
-    return jm.fit(TASK, drawn(expected(with_tremor()), 90, 1), **QUICK)
+    return climbed_and_told()[0]
 
 
 # --- the models
@@ -108,6 +114,17 @@ def test_a_tremor_is_climbed_to_and_found():
     assert found.stderr is not None and abs(found.value - 9.0) < 3 * found.stderr < 1.5
     text = str(result)
     assert "models tried" in text and "-> 2 with tremor instead of the harmonic" in text
+
+
+@pytest.mark.slow
+def test_the_progress_says_which_model_it_is_at_and_never_falls_back():
+    _, told = climbed_and_told()
+    shares = [share for _, share in told]
+    assert shares == sorted(shares) and shares[-1] == 1
+    models = [text.partition(":")[0] for text, _ in told if text.startswith("model ")]
+    assert list(dict.fromkeys(models)) == [f"model {k} of up to 4" for k in (1, 2, 3)]
+    assert "model 2 of up to 4: with activation" in dict(told)
+    assert max(share for text, share in told if text.startswith("model 3")) <= 3 / 4 * 0.6  # the descents' share of a fit
 
 
 @pytest.mark.slow

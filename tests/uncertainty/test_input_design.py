@@ -195,6 +195,31 @@ def test_an_even_design_is_the_flat_one():
     assert not made.moves and "nearly even" in str(made)
 
 
+def test_longer_records_tell_more_and_the_wanted_error_says_how_long():
+    """A record of twice the length, designed as such, has the errors told for it; at the length needed they are as wanted.
+
+    The other design has other lines and phases, and a little more than twice the Welch segments: equal to a tenth.
+    """
+    made = designed(durations=(SECONDS, 2 * SECONDS), error=0.04)
+    assert made.by_seconds[SECONDS] == pytest.approx(made.stderr, rel=1e-9)
+    twice = designed(seconds=2 * SECONDS)
+    for name in ("K_w0", "K_z0", "C_w0", "C_z0"):
+        assert made.by_seconds[2 * SECONDS][name] == pytest.approx(twice.stderr[name], rel=0.1)
+    assert made.needed is not None and made.needed[0] == 0.04
+    found = designed(durations=(made.needed[1],))
+    assert found.by_seconds[made.needed[1]]["K_w0"] / found.values["K_w0"] == pytest.approx(0.04, rel=1e-6)
+    assert f"to know K_w0 to 4 %, record {made.needed[1]:.3g} s" in str(made)
+    assert "by the length of the record" in str(made) and "by the length" not in str(designed())
+    assert "no length of the record" in str(designed(error=1e-9))
+    assert (
+        made.to_dict()["needed"]["seconds"] == made.needed[1] and designed(error=1e-9).to_dict()["needed"]["seconds"] is None
+    )
+    with pytest.raises(ValueError, match="durations"):
+        designed(durations=(0.0,))
+    with pytest.raises(ValueError, match="error"):
+        designed(error=-0.1)
+
+
 def test_the_same_key_the_same_motion():
     again = jm.design_input(fitted(), seconds=SECONDS, band=BAND, rate=50.0, key=jax.random.key(0))
     np.testing.assert_array_equal(again.displacement, designed().displacement)

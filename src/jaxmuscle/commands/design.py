@@ -27,6 +27,13 @@ def design(
     spread: Annotated[
         float, typer.Option(metavar="SHARE", help="Share of the motion, 0 to 1, that is spread evenly over the band.")
     ] = 0.1,
+    durations: Annotated[
+        str | None,
+        typer.Option(metavar="S,S", help="Lengths of the record in s, as 30,60,120, for which to tell the errors, too."),
+    ] = None,
+    error: Annotated[
+        float | None, typer.Option(metavar="PERCENT", help="Say how long to record until the quantities are known to this.")
+    ] = None,
     seed: Seed = 0,
     output: Output = Path("out"),
     formats: Formats = None,
@@ -38,9 +45,11 @@ def design(
     Lengths are in mm here (in Python in m). Writes the signal for your motor, DIR/motor.csv, and a figure, DIR/design.png.
     DIR/design.json has the errors that you can expect from one record, beside those of a motion that is even over the band.
 
-    Example:
+    Examples:
 
         jaxmuscle design out/fit.json --quantity K_w0 --rms 1 --band 0.1:5 --seconds 60 --out out/design
+
+        jaxmuscle design out/fit.json --quantity K_w0,K_z0 --durations 30,60,120 --error 10 --out out/design
     """
     with reporting(as_json):
         from jaxmuscle._common.environment import keep_compiled_programs
@@ -52,6 +61,7 @@ def design(
             _source(source), names_in(quantity, "--quantity") or (), rms=rms / 1e3, band=_band(band), seconds=seconds,
             rate=rate,
             peak=None if peak is None else peak / 1e3, speed=None if speed is None else speed / 1e3, spread=spread, key=seed,
+            durations=_lengths(durations), error=None if error is None else error / 100,
         )  # fmt: skip
         found.save(output / "motor.csv")
         found.save(output / "design.json")
@@ -66,6 +76,13 @@ def _source(name: str) -> Any:
         raise ValueError(f"{name}: is a spectrum; a motion is designed for the muscle that was fitted to it. Fit first: "
                          f"jaxmuscle fit {name} --out out/fit, then jaxmuscle design out/fit/fit.json")  # fmt: skip
     return jm.load_result(name) if Path(name).suffix == ".json" else jm.load_preset(name)
+
+
+def _lengths(text: str | None) -> list[float]:
+    try:
+        return [] if text is None else [float(length) for length in text.split(",")]
+    except ValueError:
+        raise ValueError(f"--durations {text}: give lengths of the record in s, as --durations 30,60,120") from None
 
 
 def _band(text: str) -> tuple[float, float]:

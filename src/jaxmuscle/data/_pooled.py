@@ -1,7 +1,6 @@
 """The target that recordings of one condition give together: absolute spectra averaged, means, variations, notices."""
 
 import math
-from collections import Counter
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
@@ -17,6 +16,7 @@ if TYPE_CHECKING:
     from ._recording import Recording
 
 DRIFT = 0.5  # share of the variance
+FOUND = "steady part found by itself: "
 
 
 def pooled_target(
@@ -61,10 +61,16 @@ def pooled_target(
 
 
 def _notices(recordings: "Sequence[Recording]", more: list[tuple[str, ...]]) -> tuple[str, ...]:
-    """Those of every trial, by its name unless all say the same."""
-    said = [(r.name, notice) for r, own in zip(recordings, more, strict=True) for notice in (*r.notices, *own)]
-    often = Counter(notice for _, notice in said)
-    return tuple(dict.fromkeys(n if often[n] == len(recordings) else f"{name}: {n}" for name, n in said))
+    """Those of every trial, each once, with the names of the trials unless all say so; the steady parts in one."""
+    said = [(notice, r.name) for r, own in zip(recordings, more, strict=True) for notice in (*r.notices, *own)]
+    windows = [f"{notice.removeprefix(FOUND)} in {name}" for notice, name in said if notice.startswith(FOUND)]
+    together = FOUND + ", ".join(windows)
+    whose: dict[str, list[str]] = {}
+    for notice, name in said:
+        joined = len(windows) > 1 and notice.startswith(FOUND)
+        whose.setdefault(together if joined else notice, []).append(name)
+    alone = {together} | {notice for notice, names in whose.items() if len(names) == len(recordings)}
+    return tuple(notice if notice in alone else f"{', '.join(names)}: {notice}" for notice, names in whose.items())
 
 
 def _drift(x: Float[np.ndarray, " times"]) -> tuple[str, ...]:

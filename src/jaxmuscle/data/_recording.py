@@ -18,7 +18,7 @@ from jaxmuscle.spectra._measures import peaks, regularity
 from jaxmuscle.spectra._settings import SpectrumSettings, require
 from jaxmuscle.spectra._welch import Spectrum, lowpass, spectrum_of
 
-from ._pooled import pooled_target
+from ._pooled import FOUND, pooled_target
 from ._recording_choice import Reading, recording_of
 from ._recording_quality import RecordingSummary, checked, clipping, plateau
 from ._recording_table import frame_table
@@ -209,12 +209,8 @@ class Recording(Shown, eqx.Module):
                 )
             window = (self.start + found[0] / even.rate, min(self.start + found[1] / even.rate, self.stop))
             whole = found == (0, even.whole.size)
-            words = (
-                "no ramp found, so all of the recording is used"
-                if whole
-                else f"{window[0]:.2f} s to {window[1]:.2f} s, found by itself"
-            )
-            notices = (*notices, f"steady part: {words}")
+            words = "steady part: no ramp found, so all of the recording is used"
+            notices = (*notices, words if whole else f"{FOUND}{window[0]:.2f} s to {window[1]:.2f} s")
         part = self._with(self.whole, self.rate, window, notices)
         held, needed = part.segments(), RECORDED.length + (SEGMENTS - 1) * RECORDED.step
         remedy = f"holds {held} of the {SEGMENTS} Welch segments needed; give at least {needed / RECORDED.rate:g} s"

@@ -27,6 +27,7 @@ from ._harmonic_evidence import SIGNIFICANT, p_value
 STARTS = 32
 ALIKE = 2.0
 TREMOR = 2  # the rung whose rhythm is no line
+DESCENDED = 0.6  # a fit's progress when its descents have ended
 HEAD = f"{'models tried (-> result), before simulation':<47}{'chi2/bin':>9}{'p':>9}{'AIC':>9}"
 
 
@@ -88,14 +89,18 @@ def climb(first: Plan, models: Models, descend: Descend, keep: Callable[[Climbed
     """
     tried: list[Climbed] = []
     best: Climbed | None = None
-    for number in range(models.lowest, models.top + 1):
+    numbers = range(models.lowest, models.top + 1)
+    for place, number in enumerate(numbers):
         described = best is not None and best.rung.p >= ADEQUATE
         if described and number < TREMOR:
             continue
         plan = models.plan_of(on_rung(models.base, number)) if number > models.lowest else first
-        plan.problem.tell(f"model {number}: {rung_name(number)}", 0.02)
+        points = starting_points(plan.problem, plan.starts) if best is None else _warm(plan, best)
         stages: list[Stage] = []
-        known = descend(plan, starting_points(plan.problem, plan.starts) if best is None else _warm(plan, best), stages)
+        begin, share = place * DESCENDED / len(numbers), DESCENDED / len(numbers)
+        telling = _telling(plan, f"model {place + 1} of up to {len(numbers)}", begin, begin + share)
+        telling.problem.tell(rung_name(number), 0.0)
+        known = descend(telling, points, stages)
         if known is None:
             continue
         ended = Endpoint.of(plan.problem, stages[-1])
@@ -107,6 +112,16 @@ def climb(first: Plan, models: Models, descend: Descend, keep: Callable[[Climbed
         if described or (best.rung.p >= ADEQUATE and not (number < TREMOR <= models.top and _has_line(best))):
             break
     return tuple(each.rung._replace(chosen=each is best) for each in tried)
+
+
+def _telling(plan: Plan, which: str, begin: float, end: float) -> Plan:
+    """The plan of one of several models: its progress says which one it is, and goes from `begin` to `end` of the whole."""
+    tell = plan.problem.tell
+
+    def own(text: str, share: float) -> None:
+        tell(f"{which}: {text}", begin + (end - begin) * share / DESCENDED)
+
+    return plan._replace(problem=dataclasses.replace(plan.problem, tell=own))
 
 
 def _has_line(found: Climbed) -> bool:
@@ -182,6 +197,7 @@ def line_or_resonance(
 def _aic_of(plan: Plan, descend: Descend) -> float | None:
     """What a model reaches; None if no start has a finite spectrum."""
     stages: list[Stage] = []
+    plan = _telling(plan, "a line instead of the resonance", 0.95, 1.0)
     if descend(plan, starting_points(plan.problem, min(plan.starts, STARTS)), stages) is None:
         return None
     return criterion(Endpoint.of(plan.problem, stages[-1]))[0]

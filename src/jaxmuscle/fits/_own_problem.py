@@ -21,6 +21,7 @@ from jaxmuscle.objective._arguments import FitOptions, at_mean, planned
 from jaxmuscle.objective._consequences import expand
 from jaxmuscle.objective._coordinates import task_at
 from jaxmuscle.objective._likelihood import Likelihood, require_spread
+from jaxmuscle.objective._moment_models import Linear
 from jaxmuscle.objective._problem import FitProblem
 from jaxmuscle.objective._residuals import Residuals
 from jaxmuscle.response._expected import Moments
@@ -36,8 +37,8 @@ class Problem(Shown):
     with two finite bounds is `v = low + (high - low) sigmoid(θ)` (in the log, if it is positive); another
     `ln v = ln v0 + sd θ`, or `v = v0 + sd θ` where it may be negative: v0 the task's value, sd the prior's.
 
-    All methods are functions of θ that JAX compiles and differentiates. Turn on double precision first
-    (`jax.config.update("jax_enable_x64", True)`): in single precision a search ends early.
+    All methods are functions of θ that JAX compiles and differentiates, also twice: `jax.hessian(problem.log_density)`.
+    Turn on double precision first (`jax.config.update("jax_enable_x64", True)`): in single precision a search ends early.
 
     `fit_problem`, `objective` and `likelihood` are what the functions are made of, for the package itself.
     """
@@ -143,7 +144,11 @@ class Problem(Shown):
         return self.objective.theta(jnp.asarray(theta))
 
     def _moments(self, scaled: Any) -> tuple[Moments, ...]:
-        return tuple(part.moments(scaled) for part in self.objective.parts)
+        found = []
+        for part in self.objective.parts:
+            assert isinstance(part.model, Linear)
+            found.append(part.model.compared(task_at(part.task, part.coordinates, scaled)))
+        return tuple(found)
 
     def _card(self) -> Card:
         values = self.fit_problem.coordinates.centre

@@ -60,7 +60,7 @@ def reopened(
         bounds=limits,
         priors=sds,
         dt=settings["dt"],
-        increments=settings["increments"],
+        increments=settings.get("increments", "gaussian"),  # fits of before could have no other
     )
     problem = _problem(result, target, options, centres)
     return problem.scattering_as([task.with_parts(settings=part.target.settings)

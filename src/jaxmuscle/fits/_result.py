@@ -85,6 +85,10 @@ class FitResult(Result, eqx.Module):
     def __getitem__(self, name: str) -> Estimate:
         """The parameter or derived quantity of that name, with its `value`, `stderr`, `interval` and `unit`.
 
+        Where no mean force in newtons was given, these are newtons of the model muscle, and print shows forces, masses,
+        stiffness and damping divided by its mean force, `result["mean"].value`, as the person's are unknown. `per_newton`
+        and `as_shown(result.found)` give what is shown.
+
         Raises `ValueError` for an unknown name.
         """
         known = self.parameters | self.derived
@@ -93,7 +97,7 @@ class FitResult(Result, eqx.Module):
         return known[name]
 
     def to_dataframe(self) -> "pandas.DataFrame":
-        """A row for each parameter and derived quantity.
+        """A row for each parameter and derived quantity, in the units of `result[name]`.
 
         Columns: `quantity`; `kind`, "parameter" or "derived"; `value`; `stderr`, NaN where the data do not determine it;
         `low` and `high`, ends of the 95 % interval, NaN where one is open or was not computed; `unit`; `free`, whether it

@@ -66,23 +66,32 @@ def text_of(result: "FitResult") -> str:
     in_bands = {name: p for name, p in shown.items() if base_of(name) in BANDS}
     rows = {name: p for name, p in shown.items() if name not in in_bands}
     title = "determined by the data" if result.adequate is not False else "would be determined if the model held"
-    lines += _table(title, rows, " 95 % interval    " * intervals)
+    lines += _table(title + _per_newton(result, rows), rows, " 95 % interval    " * intervals)
     lines += [f"  {sentence}" for sentence in _by_band(in_bands)]
     fixed = [name for name in result.products if name not in result.parameters]
     lines += [f"  products and ratios known roughly: {', '.join(map(spelt, fixed))}"] if fixed else []
     loose = {name: p for name, p in every.items() if name not in shown and p.free}
-    lines += _table("not determined: do not interpret these values", loose) if loose else []
+    title = f"not determined: do not interpret these values{_per_newton(result, loose)}"
+    lines += _table(title, loose) if loose else []
     if factor := result.settings.get("carried"):
         what = "P_w, masses, stiffness" if single and result.only.stiffness is None else "P_w, stiffness"
         lines += [f"  before the fit {what} and damping were multiplied by {factor:.3g}, so that the muscle has the "
                   "measured mean force (mean_force=False leaves the mean out)"]  # fmt: skip
     if result.per_newton:
         lines += ["  no mean force in newtons was given, so the scale of force is unknown: forces, masses, stiffness and "
-                  "damping are stated per newton of mean force"]  # fmt: skip
+                  "damping are stated per newton of mean force. In newtons, as in result['K_w0'], in to_dataframe() and in "
+                  f"fit.json, they are those of a model muscle that pulls with {result.derived['mean'].value:.3g} N: divide "
+                  "by that"]  # fmt: skip
     if result.undetermined:
         whose = "the data leave" if single else "all targets together leave"
         lines += [f"  {whose} open:", *(f"    - {sentence}" for sentence in result.undetermined)]
     return folded(lines)
+
+
+def _per_newton(result: "FitResult", shown: Mapping[str, Estimate]) -> str:
+    """What the heading of a table says if numbers in it are no newtons."""
+    there = result.per_newton and any(result[name].unit in RELATIVE for name in shown)
+    return " (per newton of mean force)" * bool(there)
 
 
 def per_newton(table: Mapping[str, Estimate], mean: float) -> dict[str, Estimate]:
@@ -101,7 +110,7 @@ def _over(p: Estimate, mean: float) -> Estimate:
 def _table(title: str, table: dict[str, Estimate], column: str = "") -> list[str]:
     """Rows of name, value ± error, interval and unit."""
     wide = max([26, *(2 + len(name) for name in table)])
-    lines = [f"  {title}:"] if not column else [f"  {title + ':':<{wide + 24}}{column.strip()}"]
+    lines = [f"  {title}:"] if not column else [f"  {title + ': ':<{wide + 24}}{column.strip()}"]
     for name, p in table.items():
         unit = "" if p.unit == "1" else p.unit
         interval = f"{p.interval_in_words():<19} " if column else ""

@@ -209,6 +209,7 @@ def _descended(plan: Plan, points: np.ndarray, stages: list[Stage]) -> Known | N
 def _polished(plan: Plan, known: Known, stages: list[Stage]) -> None:
     """The nonlinear correction, until it no longer changes."""
     (problem, shares), found, max_steps = known, stages[-1].minima, plan.max_steps
+    problem = dataclasses.replace(problem, tell=plan.problem.tell)  # no longer that of one of several models
     corrections: list[Moments] | None = None
     for turn in range(POLISHES if problem.seeds else 0):
         if not np.isfinite(found.cost[found.best]):

@@ -323,11 +323,11 @@ def _fitted(cells: list[Cell], options: dict[str, Any], tell: Tell) -> tuple[Coh
     tried: dict[int, CohortResult] = {}
     aic: dict[int, float] = {}
     for number in numbers:
-        first = len(tried)
+        first, which = len(tried), f"model {len(tried) + 1} of up to {len(numbers)}: " * (len(numbers) > 1)
         tried[number] = fit_cohort(
             [cell.target for cell in cells], groups=labels, noise=options["noise"], rung=number, starts=options["starts"],
-            key=options["key"], progress=lambda text, share, n=number, i=first: tell(f"model {n}: {text}",
-                                                                                   (i + share) / len(numbers)),
+            key=options["key"], progress=lambda text, share, which=which, i=first: tell(which + text,
+                                                                                      (i + share) / len(numbers)),
         )  # fmt: skip
         table = np.array([[_aic(cohort, cell) for cell in cells] for cohort in tried.values()])
         table = table[:, np.isfinite(table).any(axis=0)]

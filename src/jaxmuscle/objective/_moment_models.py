@@ -15,7 +15,7 @@ from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.response._equilibrium import slowest, slowest_rate
 from jaxmuscle.response._expected import Moments, expected_moments, response
 from jaxmuscle.response._input_response import parts_of_stiffness
-from jaxmuscle.response._linearised import LinearTask, settled
+from jaxmuscle.response._linearised import Linearisation, LinearTask, settled
 from jaxmuscle.response._transfer import half_power_frequency
 from jaxmuscle.simulation._batch import streams_of
 from jaxmuscle.simulation._grid import Grid
@@ -59,16 +59,27 @@ class Linear(eqx.Module):
     window: tuple[float, float] = eqx.field(static=True)
     points: Float[Array | np.ndarray, " points"] | None = None
 
+    def compared(self, task: AbstractTask) -> Moments:
+        """Expected moments of the task's output that are compared with data: without rate and half-power frequency.
+
+        Those two have no second derivative.
+        """
+        return self._compared(task)[0]
+
     def moments(self, task: AbstractTask) -> Moments:
         """Expected moments of the task's output."""
+        found, system = self._compared(task)
+        rate, half = slowest(system.A), half_power_frequency(task, system)
+        return found._replace(rate=rate * self.correction.rate, half=half * self.correction.half)
+
+    def _compared(self, task: AbstractTask) -> tuple[Moments, Linearisation]:
         # Compiled apart, so that it is traced once.
         found, system = expected_moments(task, task.settings, self.window, self.samples)
         power, line, resonant = jax.tree.map(lambda x: x[self.chosen], (found.power, found.line, found.resonant))
-        half = half_power_frequency(task, system)
-        found = found._replace(power=power, line=line, resonant=resonant, rate=slowest(system.A), half=half)
+        found = found._replace(power=power, line=line, resonant=resonant)
         if self.points is not None:
             found = found._replace(stiffness=parts_of_stiffness(task, system, self.points))
-        return jax.tree.map(jnp.multiply, found, self.correction)
+        return jax.tree.map(jnp.multiply, found, self.correction), system
 
 
 class MonteCarlo(eqx.Module):

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxmuscle import plot
+from jaxmuscle._common.arrays import with_nulls
 from jaxmuscle._common.cards import Printed, Result
 from jaxmuscle._common.files import replacing, write_json
 from jaxmuscle._common.text import folded
@@ -34,7 +35,8 @@ class DesignedInput(Printed, Result, eqx.Module):
     in the band and as large as the same limits allow; `displacement` [m] at `time` [s], one period at
     `rate` [Hz], positive where the muscle gets longer (the motor pulls away from it: x_z = -displacement); `values` and
     `units` of every free parameter and derived quantity, and their standard errors in these units: `now`, without the
-    record; `flat`, with the flat motion; `stderr`, with this one.
+    record; `flat`, with the flat motion; `stderr`, with this one; `by_seconds`, with records of it that have other lengths
+    [s]; `needed`, the relative error that was asked for and the length [s] of the record that reaches it, or None.
     """
 
     quantity: tuple[str, ...] = eqx.field(static=True)
@@ -47,6 +49,8 @@ class DesignedInput(Printed, Result, eqx.Module):
     now: dict[str, float]
     flat: dict[str, float]
     stderr: dict[str, float]
+    by_seconds: dict[float, dict[str, float]]
+    needed: tuple[float, float] | None
 
     @property
     def time(self) -> Float[np.ndarray, " samples"]:
@@ -110,6 +114,8 @@ class DesignedInput(Printed, Result, eqx.Module):
         return {
             "format": 1, "quantity": list(self.quantity), "gain": self.gain, "seconds": self.lengthening.seconds,
             "rate": self.rate, "rms": self.rms, "peak": self.peak, "speed": self.speed,
+            "by_seconds": [{"seconds": seconds, "stderr": errors} for seconds, errors in self.by_seconds.items()],
+            "needed": None if self.needed is None else {"error": self.needed[0], "seconds": with_nulls(self.needed[1])},
             "frequency_hz": self.frequency.tolist(), "density": self.density.tolist(), "quantities": known,
         }  # fmt: skip
 
@@ -150,5 +156,21 @@ class DesignedInput(Printed, Result, eqx.Module):
             "  expected standard errors, in percent of the value:",
             f"    {'':<22}{'now':>10}{'flat':>10}{'designed':>10}",
             *rows,
+            *self._by_duration(),
             *ASSUMED,
         ])  # fmt: skip
+
+    def _by_duration(self) -> list[str]:
+        """The errors by the length of the record, and how long it takes to reach the one that was asked for."""
+        lines = []
+        if self.by_seconds:
+            heads = "".join(f"{f'{seconds:g} s':>10}" for seconds in self.by_seconds)
+            lines += ["  the same by the length of the record, the motion being repeated:", f"    {'':<22}{heads}"]
+            lines += [f"    {n:<22}" + "".join(f"{self.percent(n, e):>10.2g}" for e in self.by_seconds.values())
+                      for n in self.told]  # fmt: skip
+        if self.needed is not None:
+            error, seconds = self.needed
+            goal = f"{' and '.join(self.quantity)} to {100 * error:.3g} %"
+            lines += [f"  to know {goal}, record {seconds:.3g} s" if np.isfinite(seconds) else
+                      f"  no length of the record tells {goal}: raise rms, or choose another band"]  # fmt: skip
+        return lines

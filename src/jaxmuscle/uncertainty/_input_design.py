@@ -33,6 +33,7 @@ TRIES = 4  # how often the density follows the crest factors of its motion
 CREST = (1.6, 2.0)  # of position and velocity, to begin with
 ENOUGH = 1e-6
 MOST = 10**8  # samples of a motion
+LONGEST = 1e4  # times the record
 NOTHING = 1e-4  # of the relative variance, by which a motion must lower it
 
 
@@ -49,6 +50,8 @@ def design_input(
     spread: float = 0.1,
     target: str | None = None,
     key: Key = 0,
+    durations: Iterable[float] = (),
+    error: float | None = None,
 ) -> DesignedInput:
     """The motion of the insertion, within limits, whose record makes a quantity best known.
 
@@ -68,7 +71,8 @@ def design_input(
     at most; where the motion would pass `peak` or `speed` it gets smaller or slower; `band` [Hz]; `seconds`, length of the
     record and period; `rate` [Hz] of the motion; `key` of its phases; `spread`, the share of the mean square that is even
     over the band (a motion of few lines could be foreseen, and would not test the model); `target`, which one of a fit with
-    several.
+    several; `durations` [s], lengths of the record for which the errors are told, too, the motion being repeated; `error`,
+    relative, 0.1 say: how long a record takes until every quantity is known to that.
 
     **Raises:** `ValueError` for an unknown quantity or one that is fixed, or of which no motion tells; for limits that are
     not positive, a band that holds no line or reaches beyond half the rate, seconds that are no whole number of samples;
@@ -77,6 +81,10 @@ def design_input(
     for name, value, unit in (("rms", rms, "m"), ("peak", peak, "m"), ("speed", speed, "m/s"), ("rate", rate, "Hz")):
         require_positive(name, np.float64(1.0) if value is None else value, unit)
     require(0 <= spread <= 1, f"spread = {spread} must be a share, from 0 to 1")
+    durations = [float(one) for one in durations]
+    for one in durations:
+        require_positive("durations", one, "s")
+    require(error is None or 0 < error < 1, f"error = {error} must be a share between 0 and 1, 0.1 for 10 %")
     check_key(key)
     require(seconds * rate <= MOST, f"seconds = {seconds} at rate = {rate} Hz are more than {MOST} samples: make it shorter")
     frequency, samples = lines_in(band, seconds), round(seconds * rate)
@@ -105,8 +113,10 @@ def design_input(
     own = even.of_motion(motion)
     known = experiment.here.values
     values, units = {n: value for n, (value, _) in known.items()}, {n: unit for n, (_, unit) in known.items()}
-    errors = [experiment.errors(p) for p in (None, even.power, own.power)]
-    return DesignedInput(quantities, own, even, motion, float(rate), values, units, *errors)
+    now, flat, best = (experiment.errors(p) for p in (None, even.power, own.power))
+    longer = {one: experiment.errors(own.power, one / seconds) for one in durations}
+    needed = None if error is None else (float(error), seconds * experiment.times_for(own.power, error))
+    return DesignedInput(quantities, own, even, motion, float(rate), values, units, now, flat, best, longer, needed)
 
 
 class Experiment(NamedTuple):
@@ -172,11 +182,24 @@ class Experiment(NamedTuple):
                                         constraints=within, options={"maxiter": 500, "ftol": 1e-12})  # fmt: skip
         return rms**2 * np.maximum(found.x, 0) @ steps
 
-    def errors(self, power: Float[np.ndarray, " lines"] | None) -> dict[str, float]:
-        """Standard errors of all quantities with a motion; without the record if there is none."""
-        known = self.start if power is None else self.apart + np.tensordot(power, self.lines, 1)
+    def errors(self, power: Float[np.ndarray, " lines"] | None, times: float = 1.0) -> dict[str, float]:
+        """Standard errors of all quantities with a motion, if the record is so many `times` as long; without it if None."""
+        record = 0.0 if power is None else self.apart - self.start + np.tensordot(power, self.lines, 1)
+        known = self.start + times * record
         after = np.linalg.pinv(known, hermitian=True)
         return {name: float(np.sqrt(g @ after @ g)) for name, g in self.here.gradients.items()}
+
+    def times_for(self, power: Float[np.ndarray, " lines"], error: float) -> float:
+        """How many times as long a record must be for a relative error of every quantity; infinite where none is."""
+
+        def above(log_times: float) -> float:
+            found = self.errors(power, np.exp(log_times))
+            return float(np.log(max(found[n] / abs(self.here.values[n][0] or 1.0) for n in self.quantity) / error))
+
+        shortest, longest = np.log(1 / LONGEST), np.log(LONGEST)
+        if above(longest) > 0:
+            return np.inf
+        return 0.0 if above(shortest) <= 0 else float(np.exp(scipy.optimize.brentq(above, shortest, longest)))
 
 
 def steps_of(frequency: Float[np.ndarray, " lines"]) -> Float[np.ndarray, "steps lines"]:
