@@ -124,8 +124,9 @@ def rivals(problem: FitProblem, stage: Stage, stated: Mapping[str, Estimate]) ->
     said: tuple[str, ...] = ()
     if told:
         verb = "is" if len(moved) == 1 else "are"
-        said = (f"{' and '.join(sorted(moved))} {verb} ambiguous: {' or '.join(told)} fits almost as well (log-likelihood "
-                f"lower by at most {AMBIGUOUS:g}). All other numbers are those of the frequency shown",)  # fmt: skip
+        others = " or ".join((", ".join(told[:-1]), told[-1])) + " fit" if told[1:] else f"{told[0]} fits"
+        said = (f"{' and '.join(sorted(moved))} {verb} ambiguous: {others} almost as well (log-likelihood lower by at most "
+                f"{AMBIGUOUS:g}). All other numbers are those of the frequency shown",)  # fmt: skip
     if not any(p.stderr for p in stated.values()) or not stage.objective.linear:
         return said, moved
     rows = order[np.minimum(np.arange(BATCH), len(order) - 1)]  # one size, so that one program serves all

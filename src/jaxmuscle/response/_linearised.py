@@ -93,7 +93,7 @@ def settled(task: AbstractTask, time: float = HOLD) -> AbstractTask:
     traced = not all(is_concrete(leaf) for leaf in jax.tree.leaves(task))
     point = equilibrium(task, time) if traced else np.asarray(linearised(task, time).system.point).tolist()
     levels = _inputs(as_arrays(task), np.array([time]))
-    held = {name: Constant((level if traced else np.asarray(level))[0]) for name, level in levels.items()}
+    held = {name: Constant(level[0] if traced else float(np.asarray(level)[0])) for name, level in levels.items()}
     found = task.with_parts(**held, initial=tuple(point))
     return found if traced else as_numbers(found)
 
