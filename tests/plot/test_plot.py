@@ -278,6 +278,7 @@ def result(**changes):
         "residual": residual,
         "deviation": np.full(f.size, 0.3),
         "undetermined": ("stiffness and damping can all be multiplied by one number",),
+        "per_newton": {},
         "stretch": (10 + np.arange(500) / 100, 5 + 0.01 * np.sin(np.arange(500))),
         "starts": ((), ()),
         "notices": (),
@@ -323,7 +324,7 @@ def test_the_parts_of_a_model_with_tremor_are_areas_that_add_up_to_the_fit():
     figure = plot.fit(found)
     linear, logarithmic, _, _ = panels(figure)
     labels = [label for label in key(figure) if label.endswith("% of power")]
-    assert [label.partition(",")[0] for label in labels] == ["floor", "relaxation", "tremor"]
+    assert [label.partition(",")[0] for label in labels] == ["floor", "relaxation", "tremor (whole)"]
     assert sum(int(label.split(", ")[1].split()[0]) for label in labels) == pytest.approx(100, abs=2)
     top = max(path.vertices[:, 1].max() for area in linear.collections[-3:] for path in area.get_paths())
     assert top == pytest.approx(found.fitted.max())
@@ -360,6 +361,10 @@ def test_fit_draws_the_simulated_stretch():
     ax = panels(plot.fit(found))[3]
     np.testing.assert_array_equal(ax.lines[0].get_xydata().T, found.stretch)
     assert (ax.get_xlabel(), ax.get_ylabel()) == ("Time (s)", r"Force $F_\mathrm{ext}$ (N)")
+    without_newtons = result(per_newton={"K_w0": 63.0})
+    ax = panels(plot.fit(without_newtons))[3]
+    np.testing.assert_allclose(ax.lines[0].get_ydata(), found.stretch[1] / np.mean(found.stretch[1]))
+    assert ax.get_ylabel() == "Force / mean"
 
 
 @pytest.mark.parametrize(
@@ -510,7 +515,7 @@ def test_components_add_up_to_the_fit(log):
     ax = plot.components(found, log=log)
     labels = [text.get_text() for text in ax.get_legend().get_texts()]
     parts = [label for label in labels if label.endswith(" % of power")]
-    assert [part.partition(",")[0] for part in parts] == ["floor", "relaxation", "tremor"]
+    assert [part.partition(",")[0] for part in parts] == ["floor", "relaxation", "tremor (whole)"]
     if log:
         total = np.sum([np.nan_to_num(named(ax, part).get_ydata()) for part in parts], axis=0)
     else:
@@ -518,7 +523,8 @@ def test_components_add_up_to_the_fit(log):
         total = np.array([last[np.isclose(last[:, 0], x), 1].max() for x in f])
     np.testing.assert_allclose(total, found.fitted, rtol=1e-12)
     np.testing.assert_array_equal(named(ax, "fit").get_ydata(), found.fitted)
-    shares = [100 * np.sum(found.fitted * found.components[part.partition(",")[0]]) for part in parts]
+    held = [found.components[part.partition(",")[0].removesuffix(" (whole)")] for part in parts]
+    shares = [100 * np.sum(found.fitted * share) for share in held]
     assert parts == [f"{part.partition(',')[0]}, {share:.0f} % of power" for part, share in zip(parts, shares, strict=True)]
 
 

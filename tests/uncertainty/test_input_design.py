@@ -208,7 +208,7 @@ def test_longer_records_tell_more_and_the_wanted_error_says_how_long():
     assert made.needed is not None and made.needed[0] == 0.04
     found = designed(durations=(made.needed[1],))
     assert found.by_seconds[made.needed[1]]["K_w0"] / found.values["K_w0"] == pytest.approx(0.04, rel=1e-6)
-    assert f"to know K_w0 to 4 %, record {made.needed[1]:.3g} s" in str(made)
+    assert f"to know K_w0 to 4 % (standard error), record {made.needed[1]:.3g} s" in str(made)
     assert "by the length of the record" in str(made) and "by the length" not in str(designed())
     assert "no length of the record" in str(designed(error=1e-9))
     assert (

@@ -19,7 +19,12 @@ def design(
         str, typer.Option(metavar="NAMES", help="Quantities that you want to know; put commas between names.")
     ] = "K_w0",
     rms: Annotated[float, typer.Option(metavar="MM", help="Largest root mean square of the displacement in mm.")] = 1.0,
-    band: Annotated[str, typer.Option(metavar="A:B", help="Lowest and highest frequency of the motion in Hz.")] = "0.1:5",
+    band: Annotated[
+        str,
+        typer.Option(
+            metavar="A:B", help="Lowest and highest frequency of the motion in Hz; begin at 0.5 if the force drifts."
+        ),
+    ] = "0.1:5",
     seconds: Annotated[float, typer.Option(metavar="S", help="Length of the record and period of the motion in s.")] = 60.0,
     rate: Annotated[float, typer.Option(metavar="HZ", help="Sampling rate of the motor's signal in Hz.")] = 1000.0,
     peak: Annotated[float | None, typer.Option(metavar="MM", help="Largest displacement to either side in mm.")] = None,
@@ -32,7 +37,8 @@ def design(
         typer.Option(metavar="S,S", help="Lengths of the record in s, as 30,60,120, for which to tell the errors, too."),
     ] = None,
     error: Annotated[
-        float | None, typer.Option(metavar="PERCENT", help="Say how long to record until the quantities are known to this.")
+        float | None,
+        typer.Option(metavar="PERCENT", help="Say how long to record for this standard error."),
     ] = None,
     seed: Seed = 0,
     output: Output = Path("out"),
@@ -47,9 +53,9 @@ def design(
 
     Examples:
 
-        jaxmuscle design out/fit.json --quantity K_w0 --rms 1 --band 0.1:5 --seconds 60 --out out/design
+        jaxmuscle design out/fit/fit.json --quantity K_w0 --rms 1 --band 0.1:5 --seconds 60 --out out/design
 
-        jaxmuscle design out/fit.json --quantity K_w0,K_z0 --durations 30,60,120 --error 10 --out out/design
+        jaxmuscle design out/fit/fit.json --quantity K_w0,K_z0 --durations 30,60,120 --error 10 --out out/design
     """
     with reporting(as_json):
         from jaxmuscle._common.environment import keep_compiled_programs

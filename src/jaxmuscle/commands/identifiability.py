@@ -48,3 +48,6 @@ def identifiability(
         record(output / "identifiability.json")
         out.print(plain(found), highlight=False, soft_wrap=True)
         out.print(f"Written: {output}/{', '.join(['identifiability.json', *figures, 'fit.json'])}", highlight=False)
+        out.print("How long to record with a moved insertion, for a standard error of 10 %: "
+                  f"jaxmuscle design {output}/fit.json --quantity K_w0 --error 10", highlight=False,
+                  soft_wrap=True)  # fmt: skip

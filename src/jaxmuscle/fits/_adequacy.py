@@ -28,7 +28,7 @@ Rows = Float[np.ndarray, "replicates residuals"]
 class Adequacy(NamedTuple):
     """`chi2` of all data residuals of a fit, what is `expected` of it under the fitted model, and its p-value `p`.
 
-    `misfit` says in words where the data lie furthest from the model.
+    `misfit` says in words where the data lie furthest from the model, if it does not describe them.
     """
 
     chi2: float
@@ -108,8 +108,11 @@ def adequacy(ended: Endpoint) -> Adequacy | None:
         chi2 = np.append(chi2, np.sum(rest[:, :count] ** 2, axis=1))
     here = float(np.sum(found.residuals**2))
     p = (1 + np.sum(chi2 >= here)) / (1 + REPLICATES)
-    inner = refit.left(refit.left(np.pad(scatter, (0, rows))).T)[:count, :count]
-    return Adequacy(here, float(np.mean(chi2)), float(p), _misfit(problem, objective, found.residuals, inner))
+    misfit = ""
+    if p < ADEQUATE:
+        inner = refit.left(refit.left(np.pad(scatter, (0, rows))).T)[:count, :count]
+        misfit = _misfit(problem, objective, found.residuals, inner)
+    return Adequacy(here, float(np.mean(chi2)), float(p), misfit)
 
 
 def elsewhere(ended: Endpoint) -> float:

@@ -46,7 +46,7 @@ class AdequacyTable(Table, kw_only=True):
     chi2: Annotated[float, _told("Chi² of the verdict: of the model as it was fitted, over all residuals")]
     expected: Annotated[float, _told("Chi² to expect if the model is right")]
     p: Annotated[Share, _told("p-value: share of the model's own data with a larger chi²")]
-    misfit: Annotated[str, _told("Where the data lie furthest from the model")]
+    misfit: Annotated[str, _told("Where the data lie furthest from the model, if it does not describe them; else empty")]
 
 
 class RungTable(Table, kw_only=True):

@@ -96,6 +96,7 @@ def climb(first: Plan, models: Models, descend: Descend, keep: Callable[[Climbed
             continue
         plan = models.plan_of(on_rung(models.base, number)) if number > models.lowest else first
         points = starting_points(plan.problem, plan.starts) if best is None else _warm(plan, best)
+        plan = plan._replace(settings=plan.settings | {"starts": len(points)})
         stages: list[Stage] = []
         begin, share = place * DESCENDED / len(numbers), DESCENDED / len(numbers)
         telling = _telling(plan, f"model {place + 1} of up to {len(numbers)}", begin, begin + share)

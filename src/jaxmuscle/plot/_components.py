@@ -11,7 +11,7 @@ from ._spectra import target as draw_target
 from ._style import BLUE, GREEN, ORANGE, PURPLE, SKY, axes_or_new, styled
 
 PARTS = {"floor": ("0.75", "floor"), "relaxation": (SKY, "relaxation"), "harmonic": (ORANGE, "harmonic"),
-         "tremor": (GREEN, "tremor"), "resonance_2": (PURPLE, "second resonance")}  # fmt: skip
+         "tremor": (GREEN, "tremor (whole)"), "resonance_2": (PURPLE, "second resonance (whole)")}  # fmt: skip
 LEAST = 1e-4  # share of the power below which a part is not drawn
 DECADE = 10.0  # by which a part may lie below the spectrum to be seen
 
@@ -38,7 +38,8 @@ def components(result: Any, ax: Axes | None = None, target: str | None = None, *
     """Draws what the parts of the model hold of the fitted power: they add up to the fit.
 
     The floor is from noise on the passive tissue, the relaxation from noise on the active one. Harmonic, tremor and second
-    resonance are drawn where the model has them.
+    resonance are drawn where the model has them. Those of the two resonances hold all of their power, also that far below
+    their peaks; a result's `tremor_share` counts from half the tremor's frequency on.
 
     **Arguments:** `result`, what `jaxmuscle.fit` returns; `ax`, or a new figure; `target`, which of several; `log`, both
     axes logarithmic with a line for each part, else areas upon each other. **Returns:** the axes.

@@ -83,7 +83,8 @@ def _panels(result: Any) -> list[tuple[float, tuple[Panel, ...]]]:
     part = result.only
     rows = [
         (1.75, (partial(_spectra, part=part, log=False), partial(_spectra, part=part, log=True))),
-        (1.4, (partial(_residuals, part=part, verdict=(result.closeness, result.adequacy_p)), partial(_stretch, part=part))),
+        (1.4, (partial(_residuals, part=part, verdict=(result.closeness, result.adequacy_p)),
+               partial(_stretch, part=part, relative=bool(result.per_newton)))),
     ] if part.fitted.size else []  # fmt: skip
     rows += _moved(part, "Dynamic stiffness")
     return rows if result.profile is None else [*rows, (1.2, (partial(_profile, result=result),))]
@@ -187,10 +188,13 @@ def _closeness(ax: Axes, part: Any, said: str, p: float | None) -> None:
     ax.set_title(words if np.isfinite(part.fitted).all() else "Residual", color=color)
 
 
-def _stretch(ax: Axes, part: Any) -> None:
+def _stretch(ax: Axes, part: Any, relative: bool) -> None:
+    """A simulated path; `relative` to its mean, where the data do not tell how many newtons that is."""
     task = part.task
     time, output = map(np.asarray, part.stretch or ((), ()))
-    ax.set(xlabel="Time (s)", ylabel=output_label(task.output_name, task.output_unit))
+    label = "Force / mean" if relative else output_label(task.output_name, task.output_unit)
+    output = output / np.mean(output) if relative and output.size else output
+    ax.set(xlabel="Time (s)", ylabel=label)
     ax.set_title("One simulated path")
     if not output.size and np.isfinite(part.fitted).all():
         _say(ax, "not simulated", color=GREY)

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure, SubFigure
 
 SHOWN = 2.0  # times the even density: where a design moves the most
+DOUBTFUL = 30.0  # percent
 ASSUMED = (
     "  assumed: the masses are known. A fit of the record also fits m_z, so its error of K_z0 is larger",
     "  assumed: no reflex. A reflex can change K_w0 by 10 to 45 %, and the fit does not notice: call it muscle plus reflex",
@@ -157,6 +158,7 @@ class DesignedInput(Printed, Result, eqx.Module):
             f"    {'':<22}{'now':>10}{'flat':>10}{'designed':>10}",
             *rows,
             *self._by_duration(),
+            *self._as_fitted(),
             *ASSUMED,
         ])  # fmt: skip
 
@@ -170,7 +172,23 @@ class DesignedInput(Printed, Result, eqx.Module):
                       for n in self.told]  # fmt: skip
         if self.needed is not None:
             error, seconds = self.needed
-            goal = f"{' and '.join(self.quantity)} to {100 * error:.3g} %"
-            lines += [f"  to know {goal}, record {seconds:.3g} s" if np.isfinite(seconds) else
-                      f"  no length of the record tells {goal}: raise rms, or choose another band"]  # fmt: skip
+            period, goal = self.lengthening.seconds, f"{' and '.join(self.quantity)} to {100 * error:.3g} % (standard error)"
+            if not np.isfinite(seconds):
+                return [*lines, f"  no length of the record tells {goal}: raise rms, or choose another band"]
+            whole = period * max(1, int(np.ceil(seconds / period - 1e-9)))
+            lines += [f"  to know {goal}, record {seconds:.3g} s. In whole periods of this motion: play it for "
+                      f"{whole + period / 2:.3g} s, and analyse the last {whole:.3g} s"]  # fmt: skip
+        return lines
+
+    def _as_fitted(self) -> list[str]:
+        """What the design takes from the fit, and what to do if that is doubtful."""
+        mean = [self.values[name] for name in self.values if name.partition("@")[0] == "mean"]
+        lines = ["  assumed: the muscle is the one given here" + f", with a mean force of {mean[0]:.3g} N" * bool(mean)]
+        if mean:
+            lines[0] += ". If you measured another one, fit with it first (mean and unit of the target)"
+        known = {name: self.percent(name, self.now) for name in self.quantity}
+        vague = [f"{name} to {percent:.2g} %" for name, percent in known.items() if percent > DOUBTFUL]
+        if vague:
+            lines.append(f"  so far only known: {', '.join(vague)}. So record a first minute with a flat motion "
+                         "(--spread 1, spread=1.0), fit it, and design again from that fit")  # fmt: skip
         return lines

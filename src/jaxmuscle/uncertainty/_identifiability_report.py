@@ -91,7 +91,7 @@ class Outlook(Printed, Result, eqx.Module):
             return f"{self.name} is impossible: {self.failed}"
         names = sorted(set(self.gained) & set(told(self.quantities)), key=lambda n: self.quantities[n].left)
         if not names:
-            return f"{self.name} would determine nothing more"
+            return f"{self.name} would determine no further quantity"
         parts = [f"{n} to {self.quantities[n].percent}" for n in names]
         listed = parts[0] if len(parts) == 1 else f"{', '.join(parts[:-1])} and {parts[-1]}"
         return f"{self.name} would determine {listed}"

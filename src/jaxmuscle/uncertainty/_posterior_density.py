@@ -291,7 +291,7 @@ def _weights(
 
 
 @kept
-def _tables(settings: SpectrumSettings, frequency: Array | np.ndarray, samples: np.ndarray) -> LineTable:
+def _tables(settings: SpectrumSettings, frequency: Array | np.ndarray, samples: Array | np.ndarray) -> LineTable:
     return jax.vmap(lambda f: line_table(settings, WINDOW, f, samples))(jnp.asarray(frequency))
 
 
