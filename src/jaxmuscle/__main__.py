@@ -3,6 +3,7 @@
 import gc
 import os
 import signal
+import sys
 
 if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
     signal.signal(signal.SIGINT, signal.SIG_DFL)  # Ctrl-C during the next imports ends in silence
@@ -14,6 +15,9 @@ def main() -> None:
     """Entry point of the console script: signals are heard before anything large is imported."""
     # A fit's matrices are small: OpenBLAS's other threads would spin between them, for half as long as the fit computes.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    # Chains take one tiny step after the other: XLA's threads would spin between them.
+    if sys.argv[1:2] == ["posterior"]:
+        os.environ.setdefault("PJRT_NPROC", "1")
     gc.set_threshold(50_000)  # what is imported and loaded stays: to look through it again and again is of no use
     with heard():
         from jaxmuscle.commands.main import main as command

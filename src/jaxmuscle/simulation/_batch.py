@@ -22,7 +22,7 @@ from jaxmuscle.spectra._welch import lowpass, welch
 
 from ._grid import Grid
 
-LANES = 512  # XLA splits the loops of wider arrays among all cores, which other seeds need
+LANES = 1024
 THREADED = ("cpu",)  # backends whose devices are cores
 
 
