@@ -39,8 +39,11 @@ def run(path: Path) -> None:
 
 
 if __name__ == "__main__":
-    for path in sorted(HERE.glob("*.ipynb")):
-        if not sys.argv[1:] or path.stem in sys.argv[1:]:
-            begun = time.monotonic()
-            run(path)
-            print(f"{path.name}: {time.monotonic() - begun:.1f} s", flush=True)
+    known = {path.stem: path for path in sorted(HERE.glob("*.ipynb"))}
+    asked = [Path(name).stem for name in sys.argv[1:]] or list(known)
+    if unknown := sorted(set(asked) - set(known)):
+        sys.exit(f"no notebook is called {', '.join(unknown)}: choose among {', '.join(known)}")
+    for name in asked:
+        begun = time.monotonic()
+        run(known[name])
+        print(f"{name}: {time.monotonic() - begun:.1f} s", flush=True)
