@@ -48,6 +48,8 @@ def identifiability(
         record(output / "identifiability.json")
         out.print(plain(found), highlight=False, soft_wrap=True)
         out.print(f"Written: {output}/{', '.join(['identifiability.json', *figures, 'fit.json'])}", highlight=False)
-        out.print("How long to record with a moved insertion, for a standard error of 10 %: "
-                  f"jaxmuscle design {output}/fit.json --quantity K_w0 --error 10", highlight=False,
-                  soft_wrap=True)  # fmt: skip
+        stiffness = found.present.quantities.get("K_w0")
+        if stiffness is not None and not stiffness.determined:
+            out.print("How long must a record with a moved insertion be? Ask for the standard error that you want: "
+                      f"jaxmuscle design {output}/fit.json --quantity K_w0 --error 10", highlight=False,
+                      soft_wrap=True)  # fmt: skip

@@ -53,15 +53,7 @@ def reopened(
         if name in centres and not low < centres[name] < high:
             raise ValueError(f"the prior of {name} is centred at {centres[name]:g}, outside its bounds ({low:g}, {high:g}): "
                              "give priors={name: (centre, sd)} inside them, or wider bounds")  # fmt: skip
-    options = FitOptions(
-        free=names,
-        residual=settings["residual"],
-        key=key,
-        bounds=limits,
-        priors=sds,
-        dt=settings["dt"],
-        increments=settings.get("increments", "gaussian"),  # fits of before could have no other
-    )
+    options = FitOptions(free=names, residual=settings["residual"], key=key, bounds=limits, priors=sds, dt=settings["dt"])
     problem = _problem(result, target, options, centres)
     return problem.scattering_as([task.with_parts(settings=part.target.settings)
                                   for task, part in zip(result.tasks.values(), problem.parts, strict=True)])  # fmt: skip

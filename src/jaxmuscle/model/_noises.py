@@ -1,6 +1,7 @@
 """A task with another noise."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -33,8 +34,10 @@ def with_noise(
 
 def with_active_noise(task: AbstractTask) -> AbstractTask:
     """The task with noise on the active tissue and the drive only."""
-    parts = []
-    for noise in task.noise.components:
-        kept = noise.amplitude * np.isin(noise.acts_on, ACTIVE).astype(jnp.result_type(noise.amplitude))
-        parts.append(eqx.tree_at(lambda n: n.amplitude, noise, kept))
-    return task.with_parts(noise=NoiseSum(tuple(parts)) if isinstance(task.noise, NoiseSum) else parts[0])
+    return with_noise_times(task, lambda n: np.isin(n.acts_on, ACTIVE).astype(jnp.result_type(n.amplitude)))
+
+
+def with_noise_times(task: AbstractTask, factor: Callable[[AbstractNoise], Any]) -> AbstractTask:
+    """The task with the amplitudes of each of its noises times a factor."""
+    amplitudes = [noise.amplitude * factor(noise) for noise in task.noise.components]
+    return eqx.tree_at(lambda t: [noise.amplitude for noise in t.noise.components], task, amplitudes)

@@ -160,9 +160,14 @@ class FitOptions:
             if getattr(self, name) is not None:
                 count(name, getattr(self, name), least, MOST)
         check_key(self.key)
-        Draws.of("hash", self.increments)
+        _ = self.draws  # its check
         positive("dt", self.dt)
         check_data(self.coefficient_of_variation, self.mean_force)
+
+    @property
+    def draws(self) -> Draws:
+        """Random numbers of what is simulated. **Raises:** `ValueError` for unknown increments."""
+        return Draws.of(Draws().generator, self.increments)
 
     @property
     def seed(self) -> int | None:
@@ -234,7 +239,7 @@ def planned(task: AbstractTask, target: Target, options: FitOptions) -> Plan:
     part = Part("", task, target, coordinates, tuple(range(len(names))), variation, mean)
     key, prior = key_of(options.key), np.array([0.0 if sds[n] is None else 1.0 for n in names])
     problem = FitProblem((part,), coordinates, prior, options.residual, options.method, options.dt, key, counts["seeds"],
-                         control, options.progress, options.optimiser, Draws.of("hash", options.increments))  # fmt: skip
+                         control, options.progress, options.optimiser, options.draws)  # fmt: skip
     settings = {
         **settings_of(problem, bounds), **counts, "max_steps": options.max_steps, "dt": options.dt,
         "increments": options.increments,

@@ -9,6 +9,7 @@ import numpy as np
 import scipy
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
+from jaxmuscle.model._noises import with_noise_times
 from jaxmuscle.model._resonant_noise import ResonantNoise
 from jaxmuscle.model._stream import Draws, Stream
 from jaxmuscle.model._tasks import AbstractTask
@@ -128,7 +129,7 @@ class MonteCarlo(eqx.Module):
 
         def outputs(loud, *tasks):
             def one(stream, loud):
-                own = tasks if loud is None else tuple(_with_noise_times(loud, each) for each in tasks)
+                own = tasks if loud is None else tuple(with_noise_times(each, lambda _: loud) for each in tasks)
                 return integrated(own, stream, self.grid, settings.sampling, states=False).outputs
 
             return jax.vmap(one)(self.streams, loud)
@@ -159,9 +160,3 @@ class MonteCarlo(eqx.Module):
         bins = settings.last_bin - settings.first_bin + 1
         parts = (outputs @ self.operator.T).reshape(len(outputs), -1, bins)
         return jnp.sum(parts**2, axis=1)[:, self.chosen]
-
-
-def _with_noise_times(factor: Array, task: AbstractTask) -> AbstractTask:
-    """The task with all noise amplitudes times a factor."""
-    return eqx.tree_at(lambda t: [part.amplitude for part in t.noise.components], task,
-                       [factor * part.amplitude for part in task.noise.components])  # fmt: skip
