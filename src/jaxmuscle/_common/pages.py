@@ -126,6 +126,7 @@ def picture(figure: Any, words: str, *, pixels: bool = False) -> Html:
     made = io.BytesIO()
     with matplotlib.rc_context(SETTINGS):
         figure.savefig(made, format=kind, dpi=200, metadata=UNDATED[kind])
+    figure.set_layout_engine("none")  # it stays as it is now: to lay it out again for its own file takes as long as drawing
     data = base64.b64encode(made.getvalue()).decode()
     said = escape(words)
     size = f"width='{round(96 * figure.get_figwidth() * 1.25)}'"  # letters of 8 points are read as those of the text

@@ -3,11 +3,11 @@
 from typing import ClassVar
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxmuscle._common.arrays import require
+from jaxmuscle._common.matrices import exponential
 from jaxmuscle._common.quadrature import NODES, WEIGHTS
 from jaxmuscle._common.types import Scalar
 
@@ -21,7 +21,7 @@ def exact_step(made: ShapingFilter, dt: Scalar) -> tuple[Float[Array, "states st
     By Gauss-Legendre quadrature, a sum of squares: of `P - Φ P Φᵀ` short steps leave no digits in single precision.
     """
     size = len(made.F)
-    steps = jax.vmap(jax.scipy.linalg.expm)(made.F * dt * jnp.append(jnp.asarray(NODES, made.F.dtype), 1.0)[:, None, None])
+    steps = exponential(made.F * dt * jnp.append(jnp.asarray(NODES, made.F.dtype), 1.0)[:, None, None])
     kicks = jnp.moveaxis(steps[:-1] @ made.G * jnp.sqrt(dt * jnp.asarray(WEIGHTS, made.F.dtype))[:, None, None], 0, 1)
     kicks = kicks.reshape(size, -1)
     # Rows of unit length, so that rounding is relative to each.

@@ -9,6 +9,7 @@ import numpy as np
 import scipy
 from jaxtyping import Array, Float, Int
 
+from jaxmuscle._common.matrices import exponential, product
 from jaxmuscle.model._activation import ACTIVE
 from jaxmuscle.model._noise import AbstractNoise, ShapingFilter
 from jaxmuscle.model._tasks import AbstractTask
@@ -131,11 +132,11 @@ class Autocovariance(NamedTuple):
         short = (lags.bit_length() + 1) // 2
         columns, rows = self.next[:, :, None], self.rows[:, None]
         for power in self.powers[:short]:
-            columns = jnp.concatenate([columns, power @ columns], axis=2)
+            columns = jnp.concatenate([columns, product(power, columns)], axis=2)
         for power in self.powers[short:]:
             if rows.shape[1] * columns.shape[2] >= lags - 1:
                 break
-            rows = jnp.concatenate([rows, rows @ power], axis=1)
+            rows = jnp.concatenate([rows, product(rows, power)], axis=1)
         return jnp.concatenate([self.head, jnp.sum(rows @ columns, axis=0).reshape(-1)])[:lags]
 
     def mean_variance(self, samples: Int[Array | np.ndarray, ""] | int) -> Float[Array, ""]:
@@ -150,7 +151,8 @@ class Autocovariance(NamedTuple):
             power, bit = block
             sum_all, rise_all, sum_here, rise_here = sums
             length = (2**bit).astype(n.dtype)
-            moved = jnp.stack([rise_all + length * sum_all, sum_all, rise_here + length * sum_here, sum_here]) @ power.T
+            moved = jnp.stack([rise_all + length * sum_all, sum_all, rise_here + length * sum_here, sum_here])
+            moved = product(moved, power.T)
             counts = (count >> bit) % 2 == 1  # this block, then what is there already
             both = jnp.stack([sum_here + moved[1], rise_here + moved[0]])
             return jnp.concatenate([jnp.where(counts, both, sums[:2]), sums[2:] + moved[:1:-1]]), None
@@ -199,14 +201,14 @@ def _autocovariance(system: Covariances, interval: float, lags: int, sampling: s
         n = len(matrix)
         zero, eye = jnp.zeros_like(matrix), jnp.eye(n, dtype=matrix.dtype)
         blocks = jnp.block([[matrix * interval, eye, zero], [zero, zero, eye], [zero, zero, zero]])
-        whole = jax.scipy.linalg.expm(blocks)
+        whole = exponential(blocks)
         step, mean, ramp = whole[:n, :n], whole[:n, n : 2 * n], whole[:n, 2 * n :]
         first, rows, following = 2 * jnp.sum(rows @ ramp * start)[None], rows @ mean, start @ mean.T
     else:
-        step = jax.scipy.linalg.expm(matrix * (interval / finer))
+        step = exponential(matrix * (interval / finer))
         first, following = jnp.sum(rows * start)[None], start @ step.T
     count = (lags - 1).bit_length() + finer.bit_length()
-    _, powers = jax.lax.scan(lambda power, _: (power @ power, power), step, length=count)
+    _, powers = jax.lax.scan(lambda power, _: (product(power, power), power), step, length=count)
     if sampling == "filtered":
         first, following = _decimated(powers, rows, start)
         powers = powers[finer.bit_length() - 1 :]

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float, Int
 
+from jaxmuscle._common.matrices import exponential
 from jaxmuscle._common.programs import kept
 from jaxmuscle.model._signals import Constant
 from jaxmuscle.model._tasks import AbstractTask
@@ -39,22 +40,22 @@ def _sampled(angle: Float[Array, ""], sampling: str) -> Complex[Array, ""]:
 
 
 class LineTable(NamedTuple):
-    """What a line `Im(r e^(iωt))` of one frequency gives.
+    """What a line `Im(r e^(iωt))`, r = x + iy, of one frequency gives.
 
-    Welch power `|r|² level - Re(r² turning)` in every bin, phase and leakage included; variance of a recording
+    Welch power `level · (x² + y², x² - y², 2xy)` in every bin, phase and leakage included; variance of a recording
     `½ |r|² passed - ½ Re(r² twice) - Im(r once)²`; both after the low-pass.
     """
 
-    level: Float[Array, "*frequencies bins"]
-    turning: Complex[Array, "*frequencies bins"]
+    level: Float[Array, "3 bins *frequencies"]
     passed: Float[Array, "*frequencies"]
     once: Complex[Array, "*frequencies"]
     twice: Complex[Array, "*frequencies"]
 
-    def power(self, reply: Complex[Array, "*frequencies"]) -> Float[Array, "*frequencies bins"]:
-        """Welch power of every bin."""
-        r = reply[..., None]
-        return jnp.maximum(jnp.abs(r) ** 2 * self.level - jnp.real(r**2 * self.turning), 0.0)
+    def power(self, reply: Complex[Array, "*frequencies"]) -> Float[Array, "bins *frequencies"]:
+        """Welch power of every bin, in the precision of `level`."""
+        x, y = jnp.real(reply), jnp.imag(reply)
+        steady, turning, turned = (part.astype(self.level.dtype) for part in (x**2 + y**2, x**2 - y**2, 2 * x * y))
+        return jnp.maximum(steady * self.level[0] + turning * self.level[1] + turned * self.level[2], 0.0)
 
     def variance(self, reply: Complex[Array, "*frequencies"]) -> Float[Array, "*frequencies"]:
         """Variance of the recording."""
@@ -72,7 +73,7 @@ def line_levels(
     def one(f):
         table = line_table(settings, WINDOW, f, 1)
         reply = transfer(system, 2 * jnp.pi * f)
-        return 2 * table.level / table.passed, jnp.abs(reply) ** 2 * table.passed
+        return 2 * table.level[0] / table.passed, jnp.abs(reply) ** 2 * table.passed
 
     return jax.vmap(one)(jnp.asarray(frequency))
 
@@ -106,8 +107,9 @@ def line_table(
     level = 0.25 * jnp.abs(through) ** 2 * jnp.sum(jnp.abs(ahead) ** 2 + jnp.abs(behind) ** 2, axis=1)
     both = jnp.sum(ahead * jnp.conj(behind), axis=1)
     turning = 0.5 * through**2 * jnp.mean(turn_of(2 * angle * begins.astype(angle.dtype))) * both
+    level = jnp.stack([level, -jnp.real(turning), jnp.imag(turning)])
     once, twice = (through**k * _turns(k * frequency / settings.rate, start, samples) for k in (1, 2))
-    return LineTable(level, turning, jnp.abs(through) ** 2, once, twice)
+    return LineTable(level, jnp.abs(through) ** 2, once, twice)
 
 
 def harmonic_line(
@@ -157,7 +159,7 @@ def _enveloped_line(
     turning = A.astype(whirl.dtype) - whirl * jnp.eye(n, dtype=whirl.dtype)
     blocks = jnp.zeros((n + 2, n + 2), whirl.dtype)
     blocks = blocks.at[:n, :n].set(turning * interval).at[:n, n].set(drive * interval).at[n, n + 1].set(1.0)
-    whole = jax.scipy.linalg.expm(blocks)
+    whole = exponential(blocks)
     step, held, ramp = whole[:n, :n], whole[:n, n], whole[:n, n + 1]
 
     def advance(Y, pair):

@@ -1,4 +1,4 @@
-"""NUTS chains of a whitened density: all chains in one program, step size and metric adapted on all of them together."""
+"""Hamiltonian chains of a whitened density, in one program; step size and metric adapted on all of them together."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -15,7 +15,9 @@ Density = Any  # has `size`, `centre`, `scale` that whiten, and `log_density` of
 BLOCK = 50
 ADAPTATIONS = (2, 3, 5)  # blocks of warm-up; the metric is learnt after each but the last
 TARGET_ACCEPTANCE = 0.95
-DOUBLINGS = 7
+LONGEST = 4.0  # of a trajectory, in standard deviations; its length is drawn anew for every draw, from 0 on
+ALIKE = 0.7  # autocorrelation of successive draws of the warm-up, from which on trajectories become twice as long
+MOST_STEPS = 128
 SPREAD = 1.5
 SHRINK = 20  # draws that the old metric counts for when a new one is learnt
 
@@ -42,14 +44,14 @@ class _State(NamedTuple):
 
 
 def _tools() -> tuple[Any, Any, Any, Any]:
-    """NUTS and the class of its states, dual averaging and the class of its states."""
+    """HMC and the class of its states, dual averaging and the class of its states."""
     try:
         import blackjax
         from blackjax.adaptation.step_size import DualAveragingAdaptationState, dual_averaging_adaptation
         from blackjax.mcmc.hmc import HMCState
     except ImportError as error:
         raise ImportError("posterior needs blackjax and arviz-stats: pip install 'jaxmuscle[posterior]'") from error
-    return blackjax.nuts, HMCState, dual_averaging_adaptation(TARGET_ACCEPTANCE), DualAveragingAdaptationState
+    return blackjax.hmc, HMCState, dual_averaging_adaptation(TARGET_ACCEPTANCE), DualAveragingAdaptationState
 
 
 def _strong(tree: Any) -> Any:
@@ -59,29 +61,34 @@ def _strong(tree: Any) -> Any:
 
 @kept
 def _first(density: Density, positions: Array) -> Any:
-    nuts, _, (start, _, _), _ = _tools()
-    chains = jax.vmap(lambda x: nuts.init(x, density.log_density))(positions)
+    hmc, _, (start, _, _), _ = _tools()
+    chains = jax.vmap(lambda x: hmc.init(x, density.log_density))(positions)
     return _strong(_State(tuple(chains), tuple(start(jnp.asarray(0.5)))))
 
 
 @kept
-def _block(density: Density, key: Array, state: Any, adapting: Array) -> tuple[Any, Any]:
-    """`BLOCK` draws of every chain; while `adapting` the step size follows the mean acceptance of all chains."""
-    nuts, chain_state, (_, update, final), step_state = _tools()
-    kernel = nuts.build_kernel()
+def _block(density: Density, key: Array, state: Any, adapting: Array, longest: Array) -> tuple[Any, Any]:
+    """`BLOCK` draws of every chain; while `adapting` the step size follows the mean acceptance of all chains.
+
+    All chains make the same number of steps: none waits for another.
+    """
+    hmc, chain_state, (_, update, final), step_state = _tools()
+    kernel = hmc.build_kernel()
     state = _State(chain_state(*state.chains), step_state(*state.adaptation))
     settled = final(state.adaptation)
 
     def one(state, key):
         size = jnp.where(adapting, jnp.exp(state.adaptation.log_step_size), settled)
-        keys = jax.random.split(key, len(state.chains.logdensity))
+        length, *keys = jax.random.split(key, 1 + len(state.chains.logdensity))
+        steps = jnp.clip(jnp.ceil(jax.random.uniform(length) * longest / size), 1, MOST_STEPS).astype(int)
         metric = jnp.ones(density.size)
-        chains, info = jax.vmap(
-            lambda key, chain: kernel(key, chain, density.log_density, size, metric, max_num_doublings=DOUBLINGS)
-        )(keys, state.chains)
+        chains, info = jax.vmap(lambda key, chain: kernel(key, chain, density.log_density, size, metric, steps))(
+            jnp.stack(keys), state.chains
+        )
         learnt = update(state.adaptation, jnp.mean(info.acceptance_rate))
         adaptation = jax.tree.map(lambda new, old: jnp.where(adapting, new, old), learnt, state.adaptation)
-        made = chains.position, chains.logdensity, info.acceptance_rate, info.num_integration_steps, info.is_divergent
+        made = (chains.position, chains.logdensity, info.acceptance_rate,
+                jnp.broadcast_to(steps, info.acceptance_rate.shape), info.is_divergent)  # fmt: skip
         return _State(chains, adaptation), (*made, size)
 
     state, made = jax.lax.scan(one, state, jax.random.split(key, BLOCK))
@@ -95,6 +102,12 @@ def _learnt(density: Density, white: np.ndarray) -> Density:
     scale = np.asarray(density.scale) @ np.linalg.cholesky(covariance)
     centre = np.asarray(density.centre) + np.asarray(density.scale) @ white.mean(axis=0)
     return eqx.tree_at(lambda m: (m.centre, m.scale), density, (centre, scale))
+
+
+def _alike(density: Density, white: np.ndarray) -> float:
+    """The largest autocorrelation of successive draws among the coordinates; axes draw, chain, coordinate."""
+    away = (white - white.mean(axis=(0, 1))) @ np.asarray(density.scale).T
+    return float(np.max(np.sum(away[1:] * away[:-1], axis=(0, 1)) / np.sum(away**2, axis=(0, 1))))
 
 
 def _moved(old: Density, new: Density, white: Array) -> np.ndarray:
@@ -122,18 +135,23 @@ def _sample(
     renewals = {max(1, round(blocks * share)) for share in shares[:-1]}
     total = blocks + -(-draws // BLOCK)
     state = _first(density, _dispersed(density, jax.random.fold_in(key, 0), chains))
+    longest = LONGEST
     recent: list[np.ndarray] = []
     kept: list[Any] = []
     for number in range(total):
         adapting = number < blocks
-        state, made = _block(density, jax.random.fold_in(key, number + 1), state, jnp.asarray(adapting))
+        its, told = jax.random.fold_in(key, number + 1), (jnp.asarray(adapting), jnp.asarray(longest))
+        state, made = _block(density, its, state, *told)
         white = np.asarray(made[0])
         if not adapting:
             both = np.asarray(density.centre) + white @ np.asarray(density.scale).T
             kept.append((both, *map(np.asarray, made[1:])))
         elif number + 1 in renewals:
             recent.append(white)
-            new = _learnt(density, np.concatenate(recent[-2:]).reshape(-1, white.shape[-1]))
+            seen = np.concatenate(recent[-2:])
+            if number + 1 == max(renewals) and _alike(density, seen) > ALIKE:
+                longest *= 2
+            new = _learnt(density, seen.reshape(-1, white.shape[-1]))
             state = _first(new, jnp.asarray(_moved(density, new, state.chains[0])))
             density, recent = new, []
         else:

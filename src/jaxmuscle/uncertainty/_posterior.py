@@ -1,4 +1,4 @@
-"""The posterior of a fit's parameters: NUTS chains, what they say, and whether they may be believed."""
+"""The posterior of a fit's parameters: Hamiltonian chains, what they say, and whether they may be believed."""
 
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
@@ -17,10 +17,11 @@ from jaxmuscle.data._target import Target
 from jaxmuscle.fits._reopened import reopened
 from jaxmuscle.fits._result import FitResult
 from jaxmuscle.objective._arguments import settings_of
-from jaxmuscle.objective._consequences import Tables, expand, quantities
+from jaxmuscle.objective._consequences import Tables, derived, frequency_of
+from jaxmuscle.objective._coordinates import task_at
 from jaxmuscle.objective._likelihood import Likelihood
 from jaxmuscle.objective._problem import FitProblem
-from jaxmuscle.objective._residuals import Residuals
+from jaxmuscle.objective._residuals import PartResiduals, Residuals
 
 from ._chains import Chains, sample
 from ._posterior_checks import diagnosed, modes_of, replicates, verdict
@@ -43,7 +44,7 @@ def posterior(
     bounds: Mapping[str, tuple[float, float]] | None = None,
     progress: bool | Callable[[str, float], None] = False,
 ) -> Posterior:
-    """Draw from the posterior of a fit's parameters in linear response, by NUTS from dispersed starts.
+    """Draw from the posterior of a fit's parameters in linear response, by Hamiltonian Monte Carlo from dispersed starts.
 
         print(jm.posterior(result, target, key=jax.random.key(2)).summary())
 
@@ -64,7 +65,8 @@ def posterior(
     **Raises:** `ValueError` for a target without spread information, a prior outside its bounds or improper, a fit that
     failed, a task without linear response; `ImportError` without blackjax (extra `posterior`).
 
-    **Source:** Hoffman & Gelman 2014 (NUTS); Vehtari et al. 2021, doi:10.1214/20-BA1221 (R-hat, effective sample size).
+    **Source:** Neal 2011, arXiv:1206.1901 (Hamiltonian Monte Carlo, trajectories of random length); Vehtari et al. 2021,
+    doi:10.1214/20-BA1221 (R-hat, effective sample size).
     """
     for name, count, least in (("chains", chains, 2), ("draws", draws, 100), ("warmup", warmup, 1)):
         if count < least:
@@ -158,8 +160,16 @@ def _filled(rows: np.ndarray) -> list[np.ndarray]:
 
 def _consequences(objective: Residuals, theta: np.ndarray) -> tuple[Tables, Any]:
     """Derived quantities and moments of every part at every θ."""
-    parts = []
-    for part in _filled(theta):
-        seen = expand(objective, part)
-        parts.append((quantities(objective, seen)[0], seen.moments))
-    return jax.tree.map(lambda *x: np.concatenate(x)[: len(theta)], *parts)
+    parts = list(enumerate(objective.parts))
+    rows = [tuple(_values(part, objective.own(some, i)) for i, part in parts) for some in _filled(theta)]
+    found = jax.tree.map(lambda *x: np.concatenate(x)[: len(theta)], *rows)
+    return tuple(values for values, _ in found), tuple(moments for _, moments in found)
+
+
+@kept
+def _values(part: PartResiduals, theta: Array | np.ndarray) -> tuple[dict[str, Array], Any]:
+    def one(theta):
+        moments = part.moments(theta)
+        return derived(task_at(part.task, part.coordinates, theta), moments, frequency_of(part)), moments
+
+    return jax.lax.map(one, jnp.asarray(theta), batch_size=16)
