@@ -194,8 +194,8 @@ def merge(
 ) -> None:
     """Make one ensemble of the parts that `jaxmuscle ensemble --part` has put into a store.
 
-    Checks that every piece of every part is there, computes the averages if --reduce was given, and marks the store complete.
-    If something is missing, the message names the parts to run again. You may repeat this command.
+    Checks that every piece of every part is there, computes the averages if --reduce was given, and marks the store as
+    complete. If something is missing, the message names the parts to run again. You may repeat this command.
 
     Example:
 

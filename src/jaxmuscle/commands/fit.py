@@ -81,11 +81,13 @@ def fit(
     fix: Fix = None,
     starts: Annotated[
         int | None,
-        typer.Option(min=1, help="How many starting points the search has: 100 by default, 8 for a task without formula."),
+        typer.Option(
+            min=1, help="How many starting points the search has: 100 by default, 8 if the spectrum has no formula."
+        ),
     ] = None,
     seeds: Annotated[
         int | None,
-        typer.Option(min=1, help="How many noise paths are simulated: 32 by default, 48 for a task without formula."),
+        typer.Option(min=1, help="How many noise paths are simulated: 32 by default, 48 if the spectrum has no formula."),
     ] = None,
     increments: Annotated[
         Increments | None,

@@ -110,8 +110,8 @@ _Name = Annotated[
     str | None,
     typer.Option(
         metavar="NAME",
-        help="Column, or motion-capture point, that holds the signal. Data:74 is column 74 of the table Data, counted from 0. "
-        "all: every column is a trial (not in a study).",
+        help="Column, or motion-capture point, that holds the signal. Data:74 is column 74 of the table Data, counted from "
+        "0. all: every column is a trial (not in a study).",
     ),
 ]
 _Rate = Annotated[float | None, typer.Option(metavar="HZ", help="Sampling rate in Hz, if the file does not state it.")]
