@@ -56,7 +56,7 @@ TAIL = """
 You can use a [muscle of your own](own-muscle.md). `python docs/hill_muscle.py` draws one, and its spectrum with two colours
 of noise.
 
-[![Force-length, force-velocity and tendon curves; isometric force spectrum](hill.png)](hill.png)
+[![Force-length, force-velocity and tendon curves; isometric force spectrum](hill.png){ .wide }](hill.png)
 """
 
 FIT = """
