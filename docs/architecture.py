@@ -23,7 +23,9 @@ HOLDS = {
     "model": "muscle, noises, tasks", "spectra": "Welch, its law, measures", "plot": "all figures",
     "_common": "errors, files, text, progress",
 }  # fmt: skip
-WIDTH, HEIGHT, GAP, ROW, MARGIN = 190, 54, 26, 98, 24  # pixels
+WIDTH, HEIGHT, GAP, ROW, MARGIN, ROUND = 190, 54, 26, 98, 24, 10  # pixels
+
+Place = tuple[float, float]
 
 
 def imports() -> set[tuple[str, str]]:
@@ -49,10 +51,47 @@ def nearest() -> list[tuple[str, str]]:
     return sorted(direct - between)
 
 
+def bent(*points: Place) -> str:
+    """A line through these points, with round corners."""
+    way = f"M{points[0][0]:.0f} {points[0][1]:.0f}"
+    for (x0, y0), (x, y), (x1, y1) in zip(points, points[1:], points[2:], strict=False):
+        before = x + ROUND * ((x0 > x) - (x0 < x)), y + ROUND * ((y0 > y) - (y0 < y))
+        after = x + ROUND * ((x1 > x) - (x1 < x)), y + ROUND * ((y1 > y) - (y1 < y))
+        way += f" L{before[0]:.0f} {before[1]:.0f} Q{x:.0f} {y:.0f} {after[0]:.0f} {after[1]:.0f}"
+    return f'<path d="{way} L{points[-1][0]:.0f} {points[-1][1]:.0f}"/>'
+
+
+def way(upper: Place, lower: Place, boxes: list[Place]) -> list[Place]:
+    """The points of a line that leads around the boxes between: straight to the next row, else down beside a column."""
+    (x1, y1), (x2, y2) = upper, lower
+    a, b, right = x1 + WIDTH / 2, x2 + WIDTH / 2, x2 > x1
+
+    def clear(x: float) -> bool:
+        return not any(y1 < y < y2 and left < x < left + WIDTH for left, y in boxes)
+
+    def alone(x: float, row: float, end: float) -> bool:
+        return not any(
+            y == row and min(x, end) < left + WIDTH / 2 < max(x, end) for left, y in boxes if left not in (x1, x2)
+        )
+
+    side1, side2 = y1 + HEIGHT / 2, y2 + HEIGHT / 2
+    if round((y2 - y1) / ROW) == 1:
+        return [(a, y1 + HEIGHT), (b, y2)]
+    if a == b:
+        gap = x1 + WIDTH + GAP / 2
+        return [(x1 + WIDTH, side1), (gap, side1), (gap, side2), (x1 + WIDTH, side2)]
+    if clear(b) and alone(a, y1, b):
+        return [(x1 + WIDTH * right, side1), (b, side1), (b, y2)]
+    if alone(a, y2, b):
+        return [(a, y1 + HEIGHT), (a, side2), (x2 + WIDTH * (not right), side2)]
+    end, turn = b + (-40 if right else 40), y2 - (ROW - HEIGHT) / 2
+    return [(a, y1 + HEIGHT), (a, turn), (end, turn), (end, y2)]
+
+
 def picture() -> str:
     """The SVG."""
     rows = layers()
-    wide = max(map(len, rows)) * (WIDTH + GAP) - GAP + 2 * MARGIN + 120
+    wide = max(map(len, rows)) * (WIDTH + GAP) - GAP + 2 * MARGIN
     place = {}
     for number, row in enumerate(rows):
         left = (wide - len(row) * (WIDTH + GAP) + GAP) / 2
@@ -60,14 +99,7 @@ def picture() -> str:
             place[wing] = left + i * (WIDTH + GAP), MARGIN + number * ROW
     lines, boxes = [], []
     for upper, lower in nearest():
-        (x1, y1), (x2, y2) = place[upper], place[lower]
-        a, b, middle = x1 + WIDTH / 2, x2 + WIDTH / 2, HEIGHT / 2
-        if round((y2 - y1) / ROW) > 2 and a != b:  # from side to side, around what stands between
-            edge, side = (wide - 12, WIDTH) if b > a else (12, 0)
-            way = f"M{x1 + side:.0f} {y1 + middle:.0f} C{edge} {y1 + middle:.0f} {edge} {y2 + middle:.0f}"
-            lines.append(f'<path d="{way} {x2 + side:.0f} {y2 + middle:.0f}"/>')
-        else:
-            lines.append(f'<path d="M{a:.0f} {y1 + HEIGHT:.0f} L{b:.0f} {y2:.0f}"/>')
+        lines.append(bent(*way(place[upper], place[lower], [*place.values()])))
     for wing, (x, y) in place.items():
         boxes.append(f'<rect x="{x:.0f}" y="{y:.0f}" width="{WIDTH}" height="{HEIGHT}" rx="6"/>'
                      f'<text x="{x + WIDTH / 2:.0f}" y="{y + 24:.0f}" class="name">{wing}</text>'

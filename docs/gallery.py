@@ -10,15 +10,15 @@ HERE = Path(__file__).parent
 PAGE = HERE / "gallery.md"
 DPI, COLOURS = 130, 256
 PAPER = {
-    "fig2": "Force tuned to reference 30",
-    "fig3": "Its spectrum",
-    "fig4a": "Proportional power",
+    "fig2": "Force, tuned to Slifkin & Newell (reference 30)",
+    "fig3": "Spectrum of this force",
+    "fig4a": "Its proportional power",
     "fig4b": "The same, logarithmic",
     "fig5": "Displacement at constant force",
-    "fig6a": "Force tuned to reference 12",
-    "fig6b": "Displacement spectrum",
-    "fig7": "FFT above Welch",
-    "fig8": "One person against another",
+    "fig6a": "Force, tuned to Hamilton et al. (reference 12)",
+    "fig6b": "Spectrum of the displacement",
+    "fig7": "Spectra of three people: by FFT (above) and by Welch's method",
+    "fig8": "Bins of one person against those of another",
 }
 
 
@@ -44,11 +44,11 @@ hide: [navigation]
 # Gallery
 
 Use this page to find a figure by its looks. It shows every figure that jaxmuscle draws, with the code below it. Each section
-begins with a block of code. Run the blocks one after another: the figures of a section use its names. Click on a figure to
-see it whole.
+begins with a block of code. Run the blocks one after another: the lines below the figures use what their block defines.
+Click on a figure to see it whole.
 
-Every figure is a function of [`jm.plot`](reference/figures.md), and can also be drawn into axes of yours. `docs/gallery.py`
-makes this page and its figures.
+Every figure is a function of [`jm.plot`](reference/figures.md), and can also be drawn into your own Matplotlib axes.
+`docs/gallery.py` makes this page and its figures.
 """
 TAIL = """
 ## A Hill-type muscle
@@ -56,7 +56,7 @@ TAIL = """
 You can use a [muscle of your own](own-muscle.md). `python docs/hill_muscle.py` draws one, and its spectrum with two colours
 of noise.
 
-[![Force-length, force-velocity and tendon curves; isometric force spectrum](hill.png)](hill.png)
+[![Force-length, force-velocity and tendon curves; isometric force spectrum](hill.png){ .wide }](hill.png)
 """
 
 FIT = """
@@ -132,7 +132,8 @@ SECTIONS = (
         Shown("gallery/schematic.png", "jm.plot.schematic(result)", "The model with its numbers", "model.md#muscle"),
         Shown("gallery/components.png", "jm.plot.components(result)", "What the power is made of", "fitting.md"),
         Shown("gallery/starts.png", "jm.plot.starts(result)", "Did all starts end at the same minimum?", "fitting.md"),
-        Shown("gallery/start_values.png", "jm.plot.start_values(result)", "In which parameters they agree", "fitting.md"),
+        Shown("gallery/start_values.png", "jm.plot.start_values(result)", "In which parameters the starts agree",
+              "fitting.md"),
         Shown("gallery/target.png", "target.plot(log=True)", "A target with the sampling error of its bins", "digitise.md"),
     )),
     Section("Simulations", SIMULATED, (
@@ -142,9 +143,9 @@ SECTIONS = (
         Shown("gallery/spectrum.png", "runs.spectrum().plot(log=True, proportional=False)",
               "The spectra of these 200 seeds", "model.md"),
         Shown("gallery/estimate.png", "runs.mean_spectrum().plot(log=True)",
-              "Their mean spectrum, with and without control variate",
+              "Mean spectrum of these seeds, with and without control variate",
               "model.md"),
-        Shown("gallery/moments.png", "summary.plot()", "Mean and band of 2000 seeds, of which none is kept", "ensembles.md"),
+        Shown("gallery/moments.png", "summary.plot()", "Mean and band of 2000 seeds that are not stored", "ensembles.md"),
         Shown("gallery/sweep.png", "ax", "A sweep: three dampings with the same noise", "ensembles.md"),
         Shown("gallery/sensitivity.png", "jm.sensitivity(result.task).plot()",
               "How much each parameter changes each bin", "model.md"),
@@ -157,7 +158,8 @@ SECTIONS = (
               "Several profiles", "uncertainty.md"),
         Shown("gallery/posterior.png", "found.plot()", "The posterior of what the data determine", "uncertainty.md"),
         Shown("gallery/chains.png", "found.plot_chains()", "The chains of the posterior", "uncertainty.md"),
-        Shown("gallery/predictive.png", "found.plot_predictive()", "The spectra that it predicts", "uncertainty.md"),
+        Shown("gallery/predictive.png", "found.plot_predictive()", "The spectra that the posterior predicts",
+              "uncertainty.md"),
         Shown("identifiability.png", "jm.identifiability(result).plot()", "What further measurements would determine",
               "identifiability.md"),
         Shown("gallery/designed_input.png", "jm.design_input(result).plot()", "A motion made to measure stiffness",
@@ -167,7 +169,7 @@ SECTIONS = (
         Shown("gallery/bootstrap.png", "refits.plot()",
               "Are the stated errors right? Refits of simulated data", "goodness.md"),
         Shown("gallery/coverage.png", "refits.plot_coverage()",
-              "Do intervals of every level hold as often as they say?", "uncertainty.md#the-coverage-curve"),
+              "Do intervals of every level hold the truth as often as they say?", "uncertainty.md#the-coverage-curve"),
         Shown("gallery/comparison.png", "jm.compare_noise(jm.Isometric(), target).plot()",
               "Which noise? Models compared", "noise-colour.md"),
     )),
@@ -178,7 +180,8 @@ SECTIONS = (
         Shown("gallery/steadiness.png", "jm.steadiness(trials).plot()", "How steady five trials are",
               "recordings.md#steadiness"),
         Shown("gallery/cohort.png", "cohort.plot()", "What six people's spectra determine", "fitting.md#many-targets"),
-        Shown("gallery/groups.png", "jm.plot.groups(cohort)", "Their spectra and numbers", "fitting.md#many-targets"),
+        Shown("gallery/groups.png", "jm.plot.groups(cohort)", "Spectra and numbers of these six people",
+              "fitting.md#many-targets"),
         Shown("gallery/levels.png", 'cohort.plot(by="level")',
               "The same six people by level of contraction", "fitting.md#many-targets"),
         Shown("gallery/joint.png", "jm.fit_joint({name: people[name] for name in pair}, tasks=pair).plot()",
@@ -188,7 +191,8 @@ SECTIONS = (
         Shown("gallery/perturbed.png", "perturbed.plot()", "Force and displacement, and the stiffness between them",
               "perturbed.md"),
         Shown("gallery/fitted_stiffness.png", "jm.fit(jm.PrescribedLength(), minute).plot()",
-              "A muscle fitted to such a minute: its stiffness and its fluctuations", "perturbed.md#fit-it"),
+              "A muscle fitted to a minute with a moved insertion: its stiffness and its fluctuations",
+              "perturbed.md#fit-it"),
         Shown("gallery/frequency_response.png", "perturbed.frequency_response().plot()",
               "The dynamic stiffness with its errors",
               "perturbed.md"),

@@ -30,11 +30,11 @@ A parameter has the name of this table wherever you write it:
 | read it | `task["k_w"]`, `task.k_w`, `result["k_w"]` |
 | change it | `task.replace(k_w=4e5)` |
 | say how it is fitted | `free=("k_w",)`, `fix={"k_w": 4e5}`, `priors={"k_w": 0.5}`, `bounds={"k_w": (1e5, 1e6)}` |
-| do so from a shell | `--free k_w`, `--fix k_w=4e5` |
+| do the same on the command line | `--free k_w`, `--fix k_w=4e5` |
 
 - The letter at the end says which tissue is meant: `_w` the active one, `_z` the passive one. A small letter is a factor
   (`k_w`, `c_w`), a capital the stiffness or damping itself (`K_w0`). `noise_K_w` is the noise on the stiffness K_w.
-- Three parameters have a second name, from the field. Both names work everywhere: `tremor_frequency` is
+- Three parameters have a second name, as motor control calls them. Both names work everywhere: `tremor_frequency` is
   `resonance_frequency`, `tremor_width` is `resonance_width`, `contraction_time` is `activation_time`.
 - `K_w0`, `K_z0`, `C_w0` and `C_z0`, stiffness and damping at rest, follow from parameters. You can read them
   (`task["K_w0"]`, `result["K_w0"]`), but not set or fit them.
@@ -54,7 +54,8 @@ FIT = """
 
 A fit has a prior for every free parameter. It is centred on the value that the parameter has in the task which you pass in.
 *prior sd* is its standard deviation. A positive parameter is fitted in *log space*: there *prior sd* is that of the
-logarithm. For the others it is in the parameter's own unit. *Reached by a fit* are the bounds of the search.
+logarithm. For the others it is in the parameter's own unit. *Reached by a fit* are the bounds of the search. *The paper*
+is the one that [the model](../model.md) is from.
 
 | name | log space | prior sd | reached by a fit | source of the default |
 |---|---|---|---|---|
@@ -80,19 +81,21 @@ a table of all its keys. *Since* is the first version of the format that has the
 reads earlier formats.
 
 Files are checked when they are read. A key that is unknown, missing, there twice, of a wrong type or out of range is
-an error that names the file and the key. No missing key is replaced by a default without a word. Numbers must be
-finite. `true` is not 1, and `1.0` is not a whole number. `docs/generate.py` writes this page from the code that
+an error that names the file and the key. A required key that is missing is never replaced by a default. Numbers must
+be finite. `true` is not 1, and `1.0` is not a whole number. `docs/generate.py` writes this page from the code that
 checks the files.
+
+In the column *type and range*, *table* is what Python calls a dict: an object in JSON, a `[table]` in TOML. A *table by
+name* has keys that are free, such as the names of parameters.
 """
 FIT_FILE = """JSON, format 4. `FitResult.save` writes it and `load_result` reads it. `load_preset` reads its
 `task_table` alone. A fit of one target has the keys of the first two tables side by side. In a fit of several targets
 the keys of the second table stand under `parts`, by the name of the target. Keys must agree: the value of a parameter
 with its `task_table`, the spectrum with its `target_table`. Format 3 does not say where
-starts ended (`values`). In format 2 keys may be missing that task and target do
-not have."""
+starts ended (`values`). Format 2 may also leave out keys of `task_table` and `target_table` that do not apply."""
 PRESET = """TOML, format 2. `save_preset` writes it and `load_preset` reads it. The `task_table` has every field of
 the task and of its parts. `type` is the class of a part. What a task does not have (`activation`, `initial`, a
-low-pass) is `"none"`. In format 1, which has no key `format`, these may be missing."""
+low-pass) is `"none"`. Format 1 has no key `format`, and may leave out what a task does not have."""
 TARGET = """TOML, format 1. `Target.save` writes it and `load_target` reads it. The `target_table` of a fit.json has
 the same keys without `format`, and `null` for what is not stated."""
 STUDY = """TOML. `run_study` reads it. The second table has the columns of a study.csv."""
@@ -153,12 +156,16 @@ def kind(given: typing.Any) -> str:
     if origin is typing.Literal:
         return ", ".join(f"`{each}`" for each in inside)
     if origin in (list, tuple):
-        return (
-            f"list of: {kind(inside[0])}" if origin is list or ... in inside else f"{len(inside)} times: {kind(inside[0])}"
-        )
+        each = bracketed(kind(inside[0]))
+        return f"list of: {each}" if origin is list or ... in inside else f"{len(inside)} times: {each}"
     if origin is dict:
-        return f"table by name: {kind(inside[1])}" if inside[1] is not typing.Any else "table"
+        return f"table by name: {bracketed(kind(inside[1]))}" if inside[1] is not typing.Any else "table"
     return NAMES.get(given, "table" if isinstance(given, type) and issubclass(given, msgspec.Struct) else "any")
+
+
+def bracketed(text: str) -> str:
+    """A type of several possibilities in brackets."""
+    return f"({text})" if " or " in text else text
 
 
 def files_page() -> str:

@@ -3,6 +3,7 @@
 import base64
 import json
 import re
+import struct
 import sys
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ sys.path.append(str(Path(__file__).parent))
 from formulas import typeset, typeset_prose
 
 NOTEBOOKS = Path(__file__).resolve().parents[1] / "notebooks"
+NARROW, WIDE = 1000, "{ .wide }"  # pixels of a picture that a phone can show whole; how site.css knows others
 
 
 def on_files(files: Files, config: Any) -> Files:
@@ -52,6 +54,7 @@ def page(notebook: dict[str, Any], stem: str) -> tuple[str, dict[str, bytes]]:
                 name = f"{stem}-{len(pictures) + 1}.png"
                 pictures[name] = base64.b64decode(data["image/png"])
                 text = f"![What the code above draws]({name})"
+                text = f"[{text}{WIDE}]({name})" if _width(pictures[name]) > NARROW else text
             elif "application/vnd.jupyter.widget-view+json" in data:
                 text = "*Here are sliders when the notebook runs.*"
             else:
@@ -64,6 +67,11 @@ def page(notebook: dict[str, Any], stem: str) -> tuple[str, dict[str, bytes]]:
     )
     title, *rest = parts[0].split("\n", 1)
     return "\n\n".join([title, where, *rest, *parts[1:]]) + "\n", pictures
+
+
+def _width(png: bytes) -> int:
+    """Of a picture [pixels], as its header says."""
+    return struct.unpack(">I", png[16:20])[0]
 
 
 def prose(text: str) -> str:

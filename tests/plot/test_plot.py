@@ -538,20 +538,20 @@ def test_components_that_are_not_known_are_refused():
         plot.components(several)
 
 
-def cohort_of(people=6, bins=30):
-    """A cohort of two groups, as far as its figures read it; `bins` of the last person."""
+def cohort_of(people=6, bins=30, name="p", groups="ab"):
+    """A cohort of groups, as far as its figures read it; `bins` of the last person."""
     rng = np.random.default_rng(4)
     results, rows = {}, []
     for i in range(people):
         count = 30 if i < people - 1 else bins
-        name, power = f"p{i}", np.exp(0.2 * rng.standard_normal(count))
-        results[name] = types.SimpleNamespace(target=Target(name, power, bins=range(1, count + 1), segments=[6]))
-        about = {"target": name, "group": "ab"[i % 2], "mvc_fraction": None}
+        target, power = f"{name}{i}", np.exp(0.2 * rng.standard_normal(count))
+        results[target] = types.SimpleNamespace(target=Target(target, power, bins=range(1, count + 1), segments=[6]))
+        about = {"target": target, "group": groups[i % len(groups)], "mvc_fraction": None}
         rows += [about | {"quantity": "corner_frequency", "value": 1.0 + i, "stderr": 0.1, "unit": "Hz"},
                  about | {"quantity": "band_0.5_1", "value": 0.1 * i, "stderr": 0.01, "unit": "1"},
                  about | {"quantity": "k_w", "value": 1.0, "stderr": None, "unit": "N/m^3"}]  # fmt: skip
-    groups = {name: "ab"[i % 2] for i, name in enumerate(results)}
-    return types.SimpleNamespace(results=results, groups=groups, table=lambda: rows)
+    named = {each: groups[i % len(groups)] for i, each in enumerate(results)}
+    return types.SimpleNamespace(results=results, groups=named, table=lambda: rows)
 
 
 def test_groups_have_a_mean_spectrum_and_their_numbers():
@@ -576,6 +576,34 @@ def test_groups_have_a_mean_spectrum_and_their_numbers():
     assert len(plot.groups(cohort_of(bins=20)).axes) == 2  # spectra of different bins have no mean
     with pytest.raises(ValueError, match="nothing to draw"):
         plot.groups(found, quantities=["k_w"])
+
+
+CELLS = ["young adults, rested", "older adults, rested", "young adults, fatigued", "older adults, fatigued"]
+
+
+def studied():
+    """A study of three conditions, as far as its figure reads it; one person was not measured in the first."""
+    conditions, people = ["low force", "high force", "low force, with the eyes closed"], cohort_of(12, groups=CELLS[:2])
+    cells = [types.SimpleNamespace(target=result.target, group=people.groups[name], condition=condition)
+             for name, result in people.results.items() for condition in conditions][1:]  # fmt: skip
+    return types.SimpleNamespace(cells=cells, groups=CELLS[:2], conditions=conditions)
+
+
+def test_a_study_has_one_key_that_lies_outside_all_spectra():
+    figure = plot.study(studied())
+    figure.canvas.draw()
+    (key,) = figure.legends
+    assert [t.get_text() for t in key.get_texts()] == [f"{CELLS[0]} (5 to 6 people)", f"{CELLS[1]} (6 people)"]
+    assert not any(key.get_window_extent().overlaps(ax.get_window_extent()) for ax in figure.axes)
+    assert [bool(ax.get_xlabel()) for ax in figure.axes] == [False, True, True]  # what stands lowest in its column
+
+
+def test_long_names_do_not_take_the_height_of_the_panels():
+    short, long = (plot.cohort(cohort_of(12, name=name)) for name in ("p", "participant-"))
+    for figure in (short, long):
+        figure.canvas.draw()
+    heights = [figure.axes[0].get_window_extent().height for figure in (short, long)]
+    assert heights[1] > 0.8 * heights[0]
 
 
 def words_of(figure):
@@ -660,7 +688,11 @@ def refitted(names=("corner_frequency", "high_frequency_floor", "coefficient_of_
         lambda: plot.fit(result()),
         lambda: plot.components(result()).figure,
         lambda: plot.groups(cohort_of()),
+        lambda: plot.groups(cohort_of(12, groups=CELLS)),
+        lambda: plot.groups(cohort_of(12, 20, groups=CELLS)),
         lambda: plot.cohort(cohort_of()),
+        lambda: plot.cohort(cohort_of(12, groups=CELLS), "group"),
+        lambda: plot.study(studied()),
         lambda: plot.steadiness(steady(5)),
         lambda: plot.designed_input(designed()),
         lambda: plot.identifiability(identified()),
@@ -669,8 +701,8 @@ def refitted(names=("corner_frequency", "high_frequency_floor", "coefficient_of_
         lambda: plot.static(static_characteristics(Isometric()))[0].figure,
         lambda: plot.coverage({"corner_frequency": np.arange(20), "k_w": np.arange(20)}, draws=19).figure,
     ],
-    ids=["simulation", "fit", "components", "groups", "cohort", "steadiness", "designed_input", "identifiability",
-         "goodness", "bootstrap", "static", "coverage"],
+    ids=["simulation", "fit", "components", "groups", "long groups", "unlike bins", "cohort", "cells", "study",
+         "steadiness", "designed_input", "identifiability", "goodness", "bootstrap", "static", "coverage"],
 )  # fmt: skip
 def test_words_are_legible_in_a_column_of_a_journal_and_do_not_touch(draw):
     assert small_words(draw()) == ([], [], [])

@@ -22,7 +22,7 @@ def analyse(
         SpectrumName,
         typer.Option(
             help="How the spectrum is estimated. standard: bins of 0.39 Hz. slow: bins of 0.1 Hz, to see below 1 Hz. "
-            "multitaper: the same for recordings shorter than 30 s. pwelch: as MATLAB does."
+            "multitaper: also below 1 Hz, for recordings shorter than 30 s. pwelch: as MATLAB's pwelch does."
         ),
     ] = SpectrumName.standard,
     mvc: Annotated[
@@ -42,8 +42,8 @@ def analyse(
 ) -> None:
     """Look at a recording, or at the trials of one person in one condition: level, variability, regularity, spectrum.
 
-    The steady part of each is found by itself, unless --window gives it. The spectra of several trials are averaged. Writes
-    DIR/analysis.json, DIR/spectrum.csv and DIR/analysis.png.
+    The steady part of each recording is found automatically, unless --window gives it. The spectra of several trials are
+    averaged. Writes DIR/analysis.json, DIR/spectrum.csv and DIR/analysis.png.
 
     If a motor moved the insertion, name both columns with --force-column and --displacement. Then you get the dynamic
     stiffness instead, in DIR/analysis.json, DIR/response.csv and DIR/analysis.png.

@@ -55,8 +55,8 @@ def compare(
     """Which noise? Fit one spectrum with each colour of noise and with richer models, and say which can be told apart.
 
     Each colour is fitted with and without a harmonic (a regular rhythm). The richer models have activation or tremor. Writes
-    DIR/compare.csv, DIR/compare.json and DIR/compare.png, and prints the table. A model that the task cannot carry is left
-    out, and you are told why.
+    DIR/compare.csv, DIR/compare.json and DIR/compare.png, and prints the table. A model that is impossible in this task is
+    left out, and you are told why.
 
     Examples:
 

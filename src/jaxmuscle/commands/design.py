@@ -34,11 +34,11 @@ def design(
     ] = 0.1,
     durations: Annotated[
         str | None,
-        typer.Option(metavar="S,S", help="Lengths of the record in s, as 30,60,120, for which to tell the errors, too."),
+        typer.Option(metavar="S,S", help="Also tell the errors for records of these lengths in s, as 30,60,120."),
     ] = None,
     error: Annotated[
         float | None,
-        typer.Option(metavar="PERCENT", help="Say how long to record for this standard error."),
+        typer.Option(metavar="PERCENT", help="Say how long to record for a standard error of so many percent."),
     ] = None,
     seed: Seed = 0,
     output: Output = Path("out"),

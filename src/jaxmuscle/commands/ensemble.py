@@ -45,7 +45,9 @@ def ensemble(
     seed: Seed = 0,
     vary: Annotated[
         list[str] | None,
-        typer.Option(metavar="NAME=VALUES", help="Simulate several values, as k_w=4e5,5e5; give it again for a grid."),
+        typer.Option(
+            metavar="NAME=VALUES", help="Simulate several values of a parameter, as k_w=4e5,5e5; give it again for a grid."
+        ),
     ] = None,
     duration: Annotated[float, typer.Option(help="Simulated time of each noise path in s.")] = 15.0,
     dt: Annotated[float, typer.Option(help="Time step of the noise in s.")] = 1e-3,
@@ -60,13 +62,15 @@ def ensemble(
     ] = None,
     precision: Annotated[Precision, typer.Option(help="Precision of the simulation.")] = Precision.single,
     increments: Annotated[
-        Increments, typer.Option(help="Random numbers of a step; weak ones are faster, and only for --reduce.")
+        Increments,
+        typer.Option(help="Kind of random numbers; weak ones are faster, with the same means, and need --reduce."),
     ] = Increments.gaussian,
     generator: Annotated[
         Generator, typer.Option(help="Generator of the random numbers; threefry is that of JAX, and slower.")
     ] = Generator.hash,
     chunk: Annotated[
-        int | None, typer.Option(min=1, max=2**32, help="How many noise paths are simulated at once; chosen by itself.")
+        int | None,
+        typer.Option(min=1, max=2**32, help="How many noise paths are simulated at once; chosen for you by default."),
     ] = None,
     threads: Threads = None,
     coordinator: Annotated[
@@ -77,13 +81,14 @@ def ensemble(
     force: Force = False,
     as_json: Json = False,
 ) -> None:
-    """Simulate any number of noise paths (seeds) into a zarr store, on all cores; what was interrupted can go on.
+    """Simulate any number of noise paths (seeds) on all cores, into a zarr store; an interrupted run can be continued.
 
     The store is a folder that xarray reads. It has the dimensions seed, time and frequency (and point with --vary). Its
     attribute `complete` is set last.
 
-    On a cluster use --part: each process adds its part to the store, in any order, and needs no other. After a kill give the
-    same command again. Under SLURM or Open MPI, or with --coordinator, several processes share one run.
+    On a cluster use --part: each process adds its part to the store, in any order. The parts need not run at the same time.
+    If a part is killed, give the same command again. At the end, `jaxmuscle merge` puts the parts together. Under SLURM or
+    Open MPI, or with --coordinator, several processes can share one run instead.
 
     Examples:
 
@@ -189,8 +194,8 @@ def merge(
 ) -> None:
     """Make one ensemble of the parts that `jaxmuscle ensemble --part` has put into a store.
 
-    Checks that every chunk is there, computes the averages if --reduce was given, and marks the store complete. If
-    something is missing, the message names the parts to run again. You may repeat this command.
+    Checks that every piece of every part is there, computes the averages if --reduce was given, and marks the store as
+    complete. If something is missing, the message names the parts to run again. You may repeat this command.
 
     Example:
 

@@ -62,7 +62,7 @@ def fit(
     task: TargetTask = None,
     method: Annotated[
         MethodName,
-        typer.Option(help="linear: the spectrum is computed in closed form, then corrected. montecarlo: it is simulated."),
+        typer.Option(help="linear: the spectrum follows from a formula and is then corrected. montecarlo: it is simulated."),
     ] = MethodName.linear,
     noise: Noise = None,
     rungs: Annotated[
@@ -70,8 +70,8 @@ def fit(
         typer.Option(
             min=0,
             max=3,
-            help="Richest model that may be tried: 0 base, 1 with activation, 2 with tremor, 3 with a second resonance; "
-            "several spectra all get this model.",
+            help="Richest model that may be tried: 0 base, 1 with activation, 2 with tremor, 3 with a second resonance. "
+            "If you give several spectra, all get exactly this model.",
         ),
     ] = None,
     residual: Annotated[
@@ -81,15 +81,19 @@ def fit(
     fix: Fix = None,
     starts: Annotated[
         int | None,
-        typer.Option(min=1, help="How many points the search starts from: 100 by default, 8 if the fit must simulate."),
+        typer.Option(
+            min=1, help="How many starting points the search has: 100 by default, 8 if the spectrum has no formula."
+        ),
     ] = None,
     seeds: Annotated[
         int | None,
-        typer.Option(min=1, help="How many noise paths are simulated: 32 by default, 48 if the fit must simulate."),
+        typer.Option(min=1, help="How many noise paths are simulated: 32 by default, 48 if the spectrum has no formula."),
     ] = None,
     increments: Annotated[
         Increments | None,
-        typer.Option(help="Random numbers of what is simulated; weak ones are faster.", show_default="gaussian"),
+        typer.Option(
+            help="Kind of random numbers in simulations; weak ones are faster, with the same means.", show_default="gaussian"
+        ),
     ] = None,
     seed: Seed = 0,
     segments: Segments = None,
@@ -100,8 +104,8 @@ def fit(
     axis: Annotated[
         str | None,
         typer.Option(
-            help="log-log if the points of a digitised figure are log10 of Hz and of power; for a point x, y, z "
-            "or principal."
+            help="Of a digitised figure: log-log if its points are log10 of Hz and of power. Of a motion-capture point: "
+            "x, y, z or principal."
         ),
     ] = None,
     groups: Annotated[
@@ -129,13 +133,13 @@ def fit(
     Or give the frequency response: a CSV with the columns frequency, gain, phase, and coherence or stderr. Then
     DIR/stiffness.csv holds the dynamic stiffness, measured and fitted.
 
-    Several spectra are taken as those of several people. They are fitted in one go, from the closed form of the spectrum
-    alone, without the checks by simulation.
+    Several spectra are taken as those of several people. They are fitted together, by the formula of the spectrum alone,
+    without simulation.
 
-    Of one spectrum or person: prints a table as soon as the search has ended, then what the checks add. Writes DIR/fit.json,
-    DIR/fit.png, DIR/spectrum.csv and DIR/report.html.
+    For one spectrum or person it prints a table as soon as the search has ended, then what the checks add. It writes
+    DIR/fit.json, DIR/fit.png, DIR/spectrum.csv and DIR/report.html.
 
-    Of several spectra: writes a folder DIR/TARGET for each, DIR/cohort.csv, DIR/cohort.png and DIR/report.html; with
+    For several spectra it writes a folder DIR/TARGET for each, DIR/cohort.csv, DIR/cohort.png and DIR/report.html; with
     --groups also DIR/differences.csv.
 
     Examples:

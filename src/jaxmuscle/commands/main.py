@@ -62,7 +62,7 @@ def common(
     ] = False,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Show no progress.")] = False,
     verbose: Annotated[
-        bool, typer.Option("--verbose", "-v", help="Also say which compiled programs are kept and loaded.")
+        bool, typer.Option("--verbose", "-v", help="Also say which compiled programs are stored on disk and loaded again.")
     ] = False,
 ) -> None:
     """Fit a muscle model to measured force, analyse recordings, and simulate the fluctuations of force.

@@ -71,7 +71,7 @@ Preset = Annotated[
 ]
 OtherTask = Annotated[TaskName | None, typer.Option(help="Put the same muscle into this task.")]
 Observe = Annotated[
-    Observed | None, typer.Option(help="In the task prescribed-force: which quantity of the motion is the output.")
+    Observed | None, typer.Option(help="In the task prescribed-force: whether the output is displacement or acceleration.")
 ]
 TargetTask = Annotated[
     TaskName | None, typer.Option(help="What is held in the experiment; by default it follows from what was measured.")
@@ -90,7 +90,9 @@ Fix = Annotated[
 ]
 Segments = Annotated[
     int | None,
-    typer.Option(min=1, max=10**9, help="How many Welch segments were averaged; the errors of the spectrum follow from it."),
+    typer.Option(
+        min=1, max=10**9, help="How many Welch segments were averaged. From it follows how well the spectrum is known."
+    ),
 ]
 Quantity = Annotated[str | None, typer.Option(help="What was measured: force, torque, displacement or acceleration.")]
 Window = Annotated[
@@ -108,8 +110,8 @@ _Name = Annotated[
     str | None,
     typer.Option(
         metavar="NAME",
-        help="Column or point that holds the signal; Data:74 is column 74 of Data, counted from 0; all: every column is a "
-        "trial (not in a study).",
+        help="Column, or motion-capture point, that holds the signal. Data:74 is column 74 of the table Data, counted from "
+        "0. all: every column is a trial (not in a study).",
     ),
 ]
 _Rate = Annotated[float | None, typer.Option(metavar="HZ", help="Sampling rate in Hz, if the file does not state it.")]
@@ -123,7 +125,10 @@ READING: dict[str, tuple[Any, Any]] = {  # how a recording is read: annotation a
     "rate": (_Rate, None),
     "units": (_Units, None),
     "axis": (
-        Annotated[str | None, typer.Option(help="Direction of a point: x, y, z, or principal for its largest motion.")],
+        Annotated[
+            str | None,
+            typer.Option(help="Direction of a motion-capture point: x, y, z, or principal for its largest motion."),
+        ],
         None,
     ),
     "reference": (_Reference, None),
@@ -133,7 +138,9 @@ READING: dict[str, tuple[Any, Any]] = {  # how a recording is read: annotation a
         0,
     ),
     "max_gap": (
-        Annotated[float, typer.Option(metavar="S", help="Longest gap in s that is closed by a straight line.")],
+        Annotated[
+            float, typer.Option(metavar="S", help="Longest gap in the recording, in s, that is filled by a straight line.")
+        ],
         0.2,
     ),
 }
@@ -161,7 +168,8 @@ PERTURBED: dict[str, tuple[Any, Any]] = {  # the same for a file of force and di
     "positive": (_Positive, None),
     "delay": (
         Annotated[
-            float, typer.Option(metavar="S", help="Time in s by which the channel of the force is late; it is undone.")
+            float,
+            typer.Option(metavar="S", help="Delay in s of the force channel behind the displacement. It is corrected."),
         ],
         0.0,
     ),

@@ -58,9 +58,10 @@ def posterior(
 ) -> None:
     """How sure is a fit? Draw from the posterior of the muscle's parameters.
 
-    Fits first (unless given a fit.json), then runs Hamiltonian Monte Carlo chains with the likelihood of the Welch
-    bins. Writes DIR/fit.json, DIR/posterior.nc (for ArviZ), DIR/posterior.json, corner.png, predictive.png, chains.png
-    and report.html. Exit code 1 if the fit failed or the chains did not mix: then there is no summary.
+    The posterior is the probability of all parameters together, given your data. Fits first (unless given a fit.json), then
+    draws from the posterior with several random chains (Hamiltonian Monte Carlo). Writes DIR/fit.json, DIR/posterior.nc
+    (for ArviZ), DIR/posterior.json, corner.png, predictive.png, chains.png and report.html. The exit code is 1 if the fit
+    failed or the chains do not agree with each other. Then there is no summary.
 
     Examples:
 

@@ -25,7 +25,8 @@ def reproduce(
 ) -> None:
     """Draw the figures of the paper and check what its text states.
 
-    Writes DIR/index.html (open it in a browser), DIR/fig2 ... fig8 as .png and .pdf, and DIR/claims.json.
+    The paper is that of Zagrodny, Wojnicz, Ludwicki and Barański, from which the model is. Writes DIR/index.html (open it in
+    a browser), DIR/fig2 ... fig8 as .png and .pdf, and DIR/claims.json.
 
     Examples:
 

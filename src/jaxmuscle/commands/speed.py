@@ -25,7 +25,8 @@ def speed(
 ) -> None:
     """How fast is this machine? Measure compile time, steps per second, real-time factor and memory.
 
-    It simulates as `jaxmuscle ensemble --reduce` does, without control variate. The numbers are medians of three calls.
+    It simulates as `jaxmuscle ensemble --reduce` does, but without the linear model beside it (control variate). The
+    real-time factor is simulated time over elapsed time. The numbers are medians of three calls.
 
     Example:
 

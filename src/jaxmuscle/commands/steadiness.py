@@ -23,7 +23,7 @@ def steadiness(
 ) -> None:
     """How steady is a force? Variability, power by band, regularity of one or several trials, without a model.
 
-    Give the trials of one person in one condition. With three or more the errors follow from the scatter between them.
+    Give the trials of one person in one condition. From three trials on, the errors follow from how much the trials differ.
     Writes DIR/steadiness.json, DIR/steadiness.csv (a row per trial and quantity) and DIR/steadiness.png.
 
     Example:

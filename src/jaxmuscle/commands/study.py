@@ -17,7 +17,11 @@ def study(
     table: Annotated[Path, typer.Argument(help="Table of the recordings (.csv), or a .toml with the table and options.")],
     *,
     rung: Annotated[
-        str | None, typer.Option(help="Model that all people get: 0 to 3 (2 by default), or auto for the lowest AIC.")
+        str | None,
+        typer.Option(
+            help="Model for all people: 0 base, 1 with activation, 2 with tremor (default), 3 with a second resonance; or "
+            "auto: the one with the lowest AIC."
+        ),
     ] = None,
     noise: Annotated[
         NoiseName | None, typer.Option(help="Colour of the noise on stiffness, band-limited by default.")
@@ -45,9 +49,9 @@ def study(
     """Compare groups and conditions: fit all recordings of a study with one model, write tables, figures and methods.
 
     The table has a line for each recording. It needs the columns file and person, and may have group, condition and trial.
-    The trials of a person in a condition are averaged. Options such as --column say how files are read, unless the table
-    says it. Writes DIR/people.csv, differences.csv, study.json, spectra.png, quantities.png, methods.txt
-    and report.html, all at the end.
+    The trials of a person in a condition are averaged. Options such as --column say how files are read. A column of the
+    same name in the table has priority. Writes DIR/people.csv, differences.csv, study.json, spectra.png, quantities.png,
+    methods.txt and report.html, all at the end.
 
     Examples:
 

@@ -71,7 +71,7 @@ class StartTable(Table, kw_only=True):
 
 
 class CorrelationTable(Table, kw_only=True):
-    """Of the free parameters; empty where the fit failed."""
+    """Correlations of the free parameters: `correlation`; empty where the fit failed."""
 
     parameters: Annotated[list[str], _told("Names of the parameters")] = msgspec.field(default_factory=list)
     matrix: Annotated[list[list[float]], _told("Correlations, a row for each parameter")] = msgspec.field(
@@ -87,7 +87,7 @@ class ProfileTable(Table, kw_only=True):
 
 
 class SettingsTable(Table, kw_only=True):
-    """How it was fitted: `settings`. Posterior, profile and bootstrap take the fit up with it."""
+    """How it was fitted: `settings`. Posterior, profile and bootstrap need it to go on from the fit."""
 
     free: Annotated[list[str], _told("Names of the fitted parameters")]
     residual: Annotated[Literal[RESIDUALS], _told("How powers were compared")]  # pyright: ignore[reportInvalidTypeForm]
@@ -104,7 +104,7 @@ class SettingsTable(Table, kw_only=True):
     mean_force: Annotated[
         tuple[float, float] | dict[str, tuple[float, float] | None] | None, _told("Mean and its error [N] as data, or null")
     ]
-    carried: Annotated[float | None, _told("Factor by which the task was carried to the mean force")]
+    carried: Annotated[float | None, _told("Factor by which the task was scaled to the mean force")]
     spectrum: Annotated[dict[str, Any], _told("Spectrum settings; of several targets by name")]
     steps_per_sample: Annotated[Count, _told("Steps of dt between samples")]
     optimiser: Annotated[str | None, _told("Solver, where another than Levenberg-Marquardt was asked for")] = None
@@ -117,7 +117,9 @@ class SpectrumTable(Table, kw_only=True):
 
     frequency_hz: Annotated[list[float], _told("Frequencies [Hz]")]
     target: Annotated[list[float], _told("Proportional power of the target")]
-    fitted: Annotated[Numbers, _told("Proportional power of the fit: mean of new simulations, if there are some")]
+    fitted: Annotated[
+        Numbers, _told("Proportional power of the fit: the mean of new simulations, or from the formula if there are none")
+    ]
     harmonic_share: Annotated[Numbers, _told("Share of the harmonic in each bin")]
     residual: Annotated[Numbers, _told("Target against fit, in standard deviations")]
     deviation: Annotated[Numbers | None, _told("Standard deviation of the log power, null where it is unknown")]
@@ -132,7 +134,7 @@ class StretchTable(Table, kw_only=True):
 
 
 class PartTable(Table, kw_only=True):
-    """What belongs to one target: beside the other keys, of several targets under `parts` by name."""
+    """What belongs to one target: beside the keys above, or for several targets under `parts`, by name."""
 
     target: Annotated[str, _told("Name of the target")]
     provenance: Annotated[str, _told("Where its numbers are from")]

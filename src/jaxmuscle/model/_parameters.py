@@ -13,15 +13,15 @@ import numpy as np
 from jaxmuscle._common.arrays import _is_scalar, checked, is_concrete, require
 from jaxmuscle._common.text import choices
 
-_HAND = "mass of a hand, about 0.6 % of body mass (Winter 2009, Biomechanics, table 4.1); design 2: keeps fits non-stiff"
-_STIFF = "K_0 = k x_ref^2 = 200 N/m, the postural stiffness of a hand (order of Mussa-Ivaldi et al. 1985)"
+_HAND = "about the mass of a hand, 0.6 % of body mass (Winter 2009, Biomechanics, table 4.1); allows large time steps"
+_STIFF = "K_0 = k x_ref^2 = 200 N/m, about the postural stiffness of a hand (Mussa-Ivaldi et al. 1985)"
 _DAMP = (
     "no measured damping: C_0 = c v_ref^2 of both tissues was chosen so that the slow eigenvalue of isometric force, -10/s "
     "(1.5 Hz), is near the corner of force spectra (fits of the measured ones: 0.4 and 0.9 Hz)"
 )
 _REF = "sets the range over which the muscle is linear: displacements here are about 0.01 m"
 _HUMAN = "coefficient of variation of isometric force near 1 %, as people show"
-_PAPER_K = f"{_HUMAN}; the paper: 0.16 % of the initial stiffness coefficient"
+_PAPER_K = f"{_HUMAN}; the paper has 0.16 % of the initial stiffness coefficient"
 _PAPER_C = "the paper: 0.01 % of the initial damping coefficient"
 _TWITCH = "twitch contraction times of human muscles, 50 to 110 ms (Buchthal & Schmalbruch 1970, Acta Physiol Scand 79:435)"
 _TREMOR = "physiological tremor of hand and wrist, 8 to 12 Hz (Elble & Koller 1990, Tremor)"

@@ -1,6 +1,7 @@
 """The figure of a cohort: what its data determine, by person, group or level."""
 
 import textwrap
+from collections import Counter
 from collections.abc import Collection
 from typing import Any
 
@@ -9,13 +10,15 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure, SubFigure
 
 from ._numbers import in_words
-from ._study import group_spectra
-from ._style import BLUE, COLUMN, GREY, PALETTE, canvas, fitted_to, frequency_axis, key, named, styled
+from ._study import columns, counted, group_spectra
+from ._style import BLUE, COLUMN, GREY, LINE, PALETTE, canvas, fitted_to, frequency_axis, key, named, styled
 
 WAYS = ("person", "group", "level")
 HEIGHT, ACROSS, SPECTRA = 1.6, 2, 2.3  # inches, panels, inches
 LABELLED = 12  # people who get a name on the axis
 LONGEST = 20  # letters of it
+LETTER, FREE = 0.055, 6  # inches that a letter needs downwards, letters for which there is room anyway
+ROOM = 16  # letters of all groups' names below a panel; else they stand in a key
 SHARE = 0.5  # of the targets that must determine a quantity for it to be drawn
 
 
@@ -34,11 +37,11 @@ def cohort(
     names = _drawn(cohort, quantities)
     if by == "level" and all(result.target.mvc_fraction is None for result in cohort.results.values()):
         raise ValueError("by = 'level': no target states its mvc_fraction")
-    height = HEIGHT * -(-len(names) // ACROSS)
+    height = (HEIGHT + (_below(cohort) if by == "person" else 0.0)) * -(-len(names) // ACROSS)
     fig = canvas(ax, (COLUMN, height))
     _panels(fig, cohort, names, by)
-    if len(_groups(cohort)) > 1 and by != "group":
-        fitted_to(fig, height, key(fig, ACROSS))
+    if len(_groups(cohort)) > 1 and not (by == "group" and _short(_groups(cohort))):
+        fitted_to(fig, height, key(fig, columns(_groups(cohort))))
     return fig
 
 
@@ -55,23 +58,40 @@ def groups(cohort: Any, ax: Axes | None = None, *, quantities: Collection[str] |
     names = _drawn(cohort, quantities)
     targets = {name: result.target for name, result in cohort.results.items()}
     alike = len({tuple(target.frequency) for target in targets.values()}) == 1
+    numbers = Counter(cohort.groups.get(name, "") for name in targets)
+    labels = {group: counted(group, numbers[group]) for group in _groups(cohort)}
+    across = columns([*labels.values()])
+    spelled = alike or not _short(_groups(cohort))  # a key, below the spectra or else below all
     heights = [SPECTRA] * alike + [HEIGHT * -(-len(names) // ACROSS)]
+    heights[0] += (0.2 + LINE * -(-len(labels) // across)) * spelled
     fig = canvas(ax, (COLUMN, sum(heights)))
     places = fig.subfigures(len(heights), 1, height_ratios=heights, squeeze=False)[:, 0]
     if alike:
         panel = places[0].add_subplot()
         for number, group in enumerate(_groups(cohort)):
             here = [target for name, target in targets.items() if cohort.groups.get(name, "") == group]
-            group_spectra(panel, here, PALETTE[number % len(PALETTE)], group, True)
+            group_spectra(panel, here, PALETTE[number % len(PALETTE)], labels[group], True)
         frequency_axis(panel, log=True)
         panel.set_ylabel("Power (fraction per bin)")
-        panel.legend(loc="lower left")
     _panels(places[-1], cohort, names, "group")
+    if spelled:
+        key(places[0], across)
     return fig
 
 
 def _groups(cohort: Any) -> list[str]:
     return list(dict.fromkeys(cohort.groups.get(name, "") for name in cohort.results))
+
+
+def _short(groups: list[str]) -> bool:
+    """Whether their names have room below a panel."""
+    return len(groups) * max(len(group or "all") for group in groups) <= ROOM
+
+
+def _below(cohort: Any) -> float:
+    """How much higher [inches] long names make a panel."""
+    longest = max(len(named(name, LONGEST)) for name in cohort.results)
+    return max(0.0, LETTER * (longest - FREE)) if len(cohort.results) <= LABELLED else 0.0
 
 
 def _drawn(cohort: Any, quantities: Collection[str] | None) -> dict[str, list[dict[str, Any]]]:
@@ -109,10 +129,13 @@ def _panel(ax: Axes, rows: list[dict[str, Any]], people: list[str], groups: list
             place = number + np.linspace(-0.25, 0.25, len(here)) if len(here) > 1 else np.array([float(number)] * len(here))
             if len(here):
                 ax.hlines(value.mean(), number - 0.35, number + 0.35, color=GREY, linewidth=1)
-        ax.errorbar(place, value, error, fmt="o", markersize=3.5, capsize=2, linewidth=1, color=colour, label=group or None)
+        label = named(group, 2 * LONGEST) or None
+        ax.errorbar(place, value, error, fmt="o", markersize=3.5, capsize=2, linewidth=1, color=colour, label=label)
     ax.set_ylabel(textwrap.fill(in_words(rows[0]["quantity"], rows[0]["unit"]), 18))
     if by == "group":
-        ax.set_xticks(range(len(groups)), [named(group, LONGEST) or "all" for group in groups])
+        ax.set_xticks(range(len(groups)) if _short(groups) else [])
+        if _short(groups):
+            ax.set_xticklabels([named(group, LONGEST) or "all" for group in groups])
         ax.set_xlim(-0.6, len(groups) - 0.4)
     elif by == "level":
         ax.set_xlabel("Level (% MVC)")

@@ -14,6 +14,7 @@ NAMES, CELL = 1.3, 0.28  # inches: the names of quantities, the narrowest column
 LEAST, EDGE = 1e-2, 5e-3
 WRAP, WIDEST = 60, 20  # letters
 PAIRS = 3
+PALE = -0.6  # share of the prior's error at which the colours would begin: black is read on all that are left
 
 
 @styled
@@ -77,15 +78,14 @@ def _singular_values(ax: Axes, shown: list[Any], labels: list[str], threshold: f
 def _matrix(ax: Axes, shown: list[Any], marks: list[str], names: list[str]) -> None:
     """Colour: share of the prior's standard deviation that is left. Number: standard error; bold: determined."""
     left = np.array([[o.quantities[name].left for o in shown] for name in names])
-    mesh = ax.imshow(np.minimum(left, 1.0), cmap="Blues_r", vmin=-0.35, vmax=1.0, aspect="auto")
+    mesh = ax.imshow(np.minimum(left, 1.0), cmap="Blues_r", vmin=PALE, vmax=1.0, aspect="auto")
     labels = []
     for i, name in enumerate(names):
         unit = ""
         for j, outlook in enumerate(shown):
             known = outlook.quantities[name]
             number, _, unit = known.percent.partition(" ")
-            weight, colour = ("bold", "white" if left[i, j] < 0.4 else "black") if known.determined else ("normal", "0.35")
-            ax.text(j, i, number, ha="center", va="center", color=colour, weight=weight)
+            ax.text(j, i, number, ha="center", va="center", color="black", weight="bold" if known.determined else "normal")
         labels.append(_wrapped(name) + (f" ({unit})" if unit != "%" else ""))
     ax.set_yticks(range(len(names)), labels, linespacing=0.9)
     ax.set_xticks(range(len(shown)), [mark.replace(" + ", "\n+") for mark in marks], weight="bold", linespacing=0.95)

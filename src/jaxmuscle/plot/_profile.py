@@ -7,6 +7,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure, SubFigure
 
+from ._numbers import unit_in_print
 from ._style import (
     BLUE,
     COLUMN,
@@ -49,7 +50,7 @@ def profile(found: Any, ax: Axes | None = None) -> Axes:
     ax.set(ylim=(0, top), xlim=(seen[0], seen[-1]), ylabel="Rise of -2 ln L")
     if wide:
         log_axis(ax)
-    ax.set_xlabel(found.name + ("" if found.unit == "1" else f" ({found.unit})"))
+    ax.set_xlabel(found.name + ("" if found.unit == "1" else f" ({unit_in_print(found.unit)})"))
     ax.set_title(f"{found.target}: profile likelihood", pad=32, parse_math=False)
     if found.low is None or found.high is None:
         side = "on both sides" if found.low is found.high else "downwards" if found.low is None else "upwards"

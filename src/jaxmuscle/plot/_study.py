@@ -7,9 +7,10 @@ from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure, SubFigure
 
-from ._style import COLUMN, PALETTE, canvas, density_unit, frequency_axis, styled
+from ._style import COLUMN, PALETTE, canvas, density_unit, fitted_to, frequency_axis, key, named, styled
 
 HEIGHT, ACROSS = 2.2, 2  # inches, panels beside each other
+HALF, LONGEST, TITLE = 26, 40, 24  # letters: half a line of the key, a group's name, a condition's
 
 
 @styled
@@ -28,24 +29,42 @@ def study(study: Any, ax: Axes | None = None, *, proportional: bool = True) -> F
     down, across = -(-len(study.conditions) // ACROSS), min(len(study.conditions), ACROSS)
     fig = canvas(ax, (COLUMN, HEIGHT * down))
     axes = fig.subplots(down, across, squeeze=False, sharex=True, sharey=True)
-    for panel, condition in zip(axes.flat, study.conditions, strict=False):
+    here = {(group, condition): [cell.target for cell in cells if (cell.group, cell.condition) == (group, condition)]
+            for group in study.groups for condition in study.conditions}  # fmt: skip
+    labels = [counted(group, *(len(here[group, condition]) for condition in study.conditions)) for group in study.groups]
+    for place, (panel, condition) in enumerate(zip(axes.flat, study.conditions, strict=False)):
         for number, group in enumerate(study.groups):
-            here = [cell.target for cell in cells if (cell.group, cell.condition) == (group, condition)]
-            if here:
-                group_spectra(panel, here, PALETTE[number % len(PALETTE)], group, proportional)
-        panel.set_title(condition, parse_math=False)
+            if here[group, condition]:
+                colour = PALETTE[number % len(PALETTE)]
+                group_spectra(panel, here[group, condition], colour, labels[number], proportional)
+        panel.set_title(named(condition, TITLE), parse_math=False)
         frequency_axis(panel, log=True)
-        panel.legend(loc="lower left")
         panel.label_outer()
+        if place + across >= len(study.conditions):  # nothing stands below
+            panel.set_xlabel("Frequency (Hz)")
+            panel.tick_params(axis="x", which="both", labelbottom=True)
     for panel in axes.flat[len(study.conditions) :]:
         panel.remove()
     unit = next(iter(units)) or "?"
     for row in axes:
         row[0].set_ylabel("Power (fraction per bin)" if proportional else f"Power ({density_unit(unit)})")
+    fitted_to(fig, HEIGHT * down, key(fig, columns(labels)))
     return fig
 
 
-def group_spectra(ax: Axes, targets: list[Any], colour: str, group: str, proportional: bool) -> None:
+def counted(group: str, *numbers: int) -> str:
+    """A group and how many people it has, of conditions with different numbers the range."""
+    low, high = min(filter(None, numbers), default=0), max(numbers)
+    people = "1 person" if high == 1 else f"{high} people" if low == high else f"{low} to {high} people"
+    return f"{named(group, LONGEST)} ({people})" if group else people
+
+
+def columns(labels: list[str]) -> int:
+    """How many of these have room beside each other in a key."""
+    return ACROSS if max(map(len, labels), default=0) <= HALF else 1
+
+
+def group_spectra(ax: Axes, targets: list[Any], colour: str, label: str, proportional: bool) -> None:
     """Spectra of the people of a group (thin), their geometric mean and its standard error (thick)."""
     rows = [target.proportional_power if proportional else _power(target) for target in targets]
     for target, row in zip(targets, rows, strict=True):
@@ -57,8 +76,6 @@ def group_spectra(ax: Axes, targets: list[Any], colour: str, group: str, proport
         error = log.std(axis=0, ddof=1) / np.sqrt(count)
         band = np.exp(mean - error), np.exp(mean + error)
         ax.fill_between(targets[0].frequency, *band, color=colour, alpha=0.25, lw=0, zorder=3)
-    people = f"{count} people" if count > 1 else "1 person"
-    label = f"{group} ({people})" if group else people
     ax.plot(targets[0].frequency, np.exp(mean), color=colour, lw=1.8, label=label, zorder=4)
 
 
