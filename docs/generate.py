@@ -86,7 +86,7 @@ be finite. `true` is not 1, and `1.0` is not a whole number. `docs/generate.py` 
 checks the files.
 
 In the column *type and range*, *table* is what Python calls a dict: an object in JSON, a `[table]` in TOML. A *table by
-name* has keys that are free, such as the names of parameters.
+name* has keys that are free, such as the names of parameters. *2 times* is a list of two.
 """
 FIT_FILE = """JSON, format 4. `FitResult.save` writes it and `load_result` reads it. `load_preset` reads its
 `task_table` alone. A fit of one target has the keys of the first two tables side by side. In a fit of several targets
@@ -108,6 +108,12 @@ SECTIONS = (
     ("Study", STUDY, 1, (StudyFile, RecordingTable)),
 )  # fmt: skip
 NAMES = {float: "number", int: "whole number", str: "text", bool: "true or false", dict: "table", type(None): "null"}
+LATER = {
+    ("StartTable", "values"): 4,
+    ("SettingsTable", "increments"): 4,
+    ("SettingsTable", "optimiser"): 3,
+    ("PresetFile", "format"): 2,
+}
 POWERS = str.maketrans("23", "²³")
 
 
@@ -182,7 +188,8 @@ def files_page() -> str:
                 given = typing.Annotated[given, *limits] if limits else given  # an Annotated within one is flattened
                 told = about.extra["type"] if about.extra else kind(given)
                 needed = "yes" if field.required else "no"
-                text += f"| `{field.name}` | {told} | {needed} | {since} | {about.description} |\n"
+                first = LATER.get((table.__name__, field.name), since)
+                text += f"| `{field.name}` | {told} | {needed} | {first} | {about.description} |\n"
     return text
 
 
