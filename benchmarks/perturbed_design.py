@@ -57,7 +57,8 @@ def main():
             sd = [repeats(result.task, made, lines.power, asked.repeats, 1)[:, i].std(ddof=1)
                   for lines in (made.even, made.lengthening)]  # fmt: skip
             ratio = (sd[0] / sd[1]) ** 2
-            print(f"{quantity:8} {1e3 * made.rms:7.3g}  0.1-5 {sd[0]:12.4f} {sd[1]:12.4f} "
+            band = f"{made.frequency[0]:g}-{made.frequency[-1]:g}"
+            print(f"{quantity:8} {1e3 * made.rms:7.3g}  {band} {sd[0]:12.4f} {sd[1]:12.4f} "
                   f"{ratio:12.2f} ± {ratio * 2 / np.sqrt(asked.repeats - 1):.2f} {made.gain:16.2f}")  # fmt: skip
 
 

@@ -827,7 +827,7 @@ def test_a_designed_motion(tmp_path):
     assert (tmp_path / "out" / "design.png").stat().st_size > 10_000
     for arguments, message in (
         (("--out", tmp_path / "out"), "motor.csv: is there already; overwrite it with --force"),
-        (("--band", "5", "--out", tmp_path / "new"), "--band 5: give lowest and highest frequency in Hz, as --band 0.1:5"),
+        (("--band", "5", "--out", tmp_path / "new"), "--band 5: give lowest and highest frequency in Hz, as --band 0.5:5"),
         (("--quantity", "K", "--out", tmp_path / "new"), "quantity 'K' is unknown"),
         (("--durations", "30;60", "--out", tmp_path / "new"), "--durations 30;60: give lengths of the record in s, as"),
     ):

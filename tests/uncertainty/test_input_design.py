@@ -1,7 +1,9 @@
 """Designed motions: their information against closed forms and repeats, the optimum against its theorem, limits, files."""
 
 import functools
+import inspect
 import json
+import re
 
 import jax
 import matplotlib.pyplot as plt
@@ -13,6 +15,7 @@ import scipy.stats
 from test_identify import MOVED, SEGMENTS, STEP, TRUTH, fitted
 
 import jaxmuscle as jm
+from jaxmuscle.commands.design import design
 from jaxmuscle.data import FrequencyResponse
 from jaxmuscle.objective._coordinates import Coordinates
 from jaxmuscle.uncertainty import Lengthening
@@ -230,10 +233,10 @@ def test_the_same_key_the_same_motion():
 @pytest.mark.slow
 def test_a_task_instead_of_a_fit():
     """Its usual parameters are free, and there are no data: the start is the prior."""
-    made = jm.design_input(TRUTH, rate=50.0)
+    made = jm.design_input(TRUTH, band=BAND, rate=50.0)
     assert made.now["K_w0"] == pytest.approx(made.values["K_w0"])
     assert made.stderr["K_w0"] >= designed().stderr["K_w0"] * (1 - 1e-6)
-    loose = jm.design_input(TRUTH.as_task(jm.PrescribedForce, P_w=TRUTH.P_w), rate=50.0)
+    loose = jm.design_input(TRUTH.as_task(jm.PrescribedForce, P_w=TRUTH.P_w), band=BAND, rate=50.0)
     assert loose.stderr == pytest.approx(made.stderr)
 
 
@@ -287,11 +290,19 @@ def test_the_file_for_the_motor(tmp_path):
     assert kept["quantities"]["K_w0"]["stderr"] == made.stderr["K_w0"] and kept["gain"] == made.gain
 
 
+def test_the_default_band_begins_where_the_page_advises():
+    """In Python and in the shell."""
+    advised = re.search(r"^\| band \| ([\d.]+) to", (pages.ROOT / "docs" / "perturbed.md").read_text(), re.MULTILINE)
+    here, shell = (inspect.signature(made).parameters["band"].default for made in (jm.design_input, design))
+    assert advised is not None and float(advised[1]) == here[0]
+    assert shell == f"{here[0]:g}:{here[1]:g}"
+
+
 def test_the_page(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     made = pages.run("docs/perturbed-design.md", {"result": fitted(), "jm": jm})["made"]
     plt.close("all")
-    assert made.gain == pytest.approx(designed().gain) and (tmp_path / "motor.csv").exists()
+    assert made.gain == pytest.approx(designed(band=(0.5, 5.0)).gain) and (tmp_path / "motor.csv").exists()
 
 
 def test_in_words():

@@ -22,9 +22,9 @@ def design(
     band: Annotated[
         str,
         typer.Option(
-            metavar="A:B", help="Lowest and highest frequency of the motion in Hz; begin at 0.5 if the force drifts."
+            metavar="A:B", help="Lowest and highest frequency of the motion in Hz; slower motions meet drift of the force."
         ),
-    ] = "0.1:5",
+    ] = "0.5:5",
     seconds: Annotated[float, typer.Option(metavar="S", help="Length of the record and period of the motion in s.")] = 60.0,
     rate: Annotated[float, typer.Option(metavar="HZ", help="Sampling rate of the motor's signal in Hz.")] = 1000.0,
     peak: Annotated[float | None, typer.Option(metavar="MM", help="Largest displacement to either side in mm.")] = None,
@@ -53,7 +53,7 @@ def design(
 
     Examples:
 
-        jaxmuscle design out/fit/fit.json --quantity K_w0 --rms 1 --band 0.1:5 --seconds 60 --out out/design
+        jaxmuscle design out/fit/fit.json --quantity K_w0 --rms 1 --band 0.5:5 --seconds 60 --out out/design
 
         jaxmuscle design out/fit/fit.json --quantity K_w0,K_z0 --durations 30,60,120 --error 10 --out out/design
     """
@@ -96,4 +96,4 @@ def _band(text: str) -> tuple[float, float]:
     try:
         return float(low), float(high)
     except ValueError:
-        raise ValueError(f"--band {text}: give lowest and highest frequency in Hz, as --band 0.1:5") from None
+        raise ValueError(f"--band {text}: give lowest and highest frequency in Hz, as --band 0.5:5") from None
