@@ -270,3 +270,16 @@ def test_quantities_that_are_observed_are_those_of_the_fit():
         if p.interval is not None:
             low, high = p.interval
             assert (low is None or low < p.value) and (high is None or high > p.value)
+
+
+@pytest.mark.slow
+def test_the_power_in_bands_has_intervals():
+    """The highest third of the bins is both a band and, by bin, the floor."""
+    result = jm.fit(TASK, drawn(12, 2), **QUICK)
+    bands = [p for name, p in result.derived.items() if name.startswith("band_")]
+    assert len(bands) == 6 and sum(p.stderr is not None for p in bands) >= 3
+    assert all((p.interval is None) == (p.stderr is None) for p in bands)
+    band, floor = (result.derived[name].interval for name in ("band_8_12", "high_frequency_floor"))
+    assert band == pytest.approx(10 * np.array(floor), rel=1e-6)
+    columns = result.to_dataframe().set_index("quantity")[["low", "high"]]
+    assert tuple(columns.loc["band_8_12"]) == band

@@ -142,6 +142,10 @@ def test_tables_hold_every_quantity_of_every_target():
         here = data.sel(target=row["target"], quantity=row["quantity"])
         assert float(here["value"]) == row["value"] and str(here["unit"].item()) == row["unit"]
         assert np.isnan(here["stderr"]) if row["stderr"] is None else float(here["stderr"]) == row["stderr"]
+        for end in ("low", "high"):
+            assert np.isnan(here[end]) if row[end] is None else float(here[end]) == row[end]
+    corner = next(row for row in rows if row["quantity"] == "corner_frequency")
+    assert (corner["low"], corner["high"]) == made_result().derived["corner_frequency"].interval
     table = found.to_dataframe()
     assert list(table["value"]) == [row["value"] for row in rows] and list(table.columns) == list(rows[0])
 
@@ -216,7 +220,7 @@ def test_the_command_writes_a_folder_for_each_and_the_table(tmp_path):
         assert jm.load_result(out / name / "fit.json").success
         assert (out / name / "fit.png").stat().st_size > 0
     rows = (out / "cohort.csv").read_text().splitlines()
-    assert rows[0].startswith("target,group,quantity,value,stderr,unit,determined")
+    assert rows[0].startswith("target,group,quantity,value,stderr,low,high,unit,determined")
     assert (out / "differences.csv").read_text().startswith("quantity,a,b,difference,low,high,unit,basis")
     assert (out / "cohort.png").stat().st_size > 0
 

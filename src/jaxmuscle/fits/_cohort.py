@@ -25,6 +25,7 @@ from jaxmuscle.spectra._bin_law import trial_samples
 
 from ._differences import Difference, difference
 from ._ladder import options_for
+from ._part import Estimate
 from ._perturbed import aimed
 from ._result import FitResult
 from ._search import search_together
@@ -36,8 +37,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure, SubFigure
 
 
-COLUMNS = ("target", "group", "quantity", "value", "stderr", "unit", "determined", "mvc_fraction", "chi2_per_bin",
-           "adequate", "adequacy_p", "success")  # fmt: skip
+COLUMNS = ("target", "group", "quantity", "value", "stderr", "low", "high", "unit", "determined", "mvc_fraction",
+           "chi2_per_bin", "adequate", "adequacy_p", "success")  # fmt: skip
 
 
 class CohortResult(Result, eqx.Module):
@@ -68,11 +69,14 @@ class CohortResult(Result, eqx.Module):
         return Card("\n".join([folded([heading]), *in_columns(columns, rows)]), heading, columns, tuple(rows))
 
     def table(self) -> list[dict[str, Any]]:
-        """Tidy rows, one per target and quantity (free parameters, then derived ones), with the keys of `COLUMNS`."""
+        """Tidy rows, one per target and quantity (free parameters, then derived ones), with the keys of `COLUMNS`.
+
+        `low` and `high` are the ends of the 95 % interval.
+        """
         return [
-            dict(zip(COLUMNS, (name, self.groups.get(name, ""), quantity, e.value, e.stderr, e.unit, e.identifiable,
-                               result.target.mvc_fraction, result.chi2_per_bin, result.adequate, result.adequacy_p,
-                               result.success), strict=True))
+            dict(zip(COLUMNS, (name, self.groups.get(name, ""), quantity, e.value, e.stderr, *_ends(e), e.unit,
+                               e.identifiable, result.target.mvc_fraction, result.chi2_per_bin, result.adequate,
+                               result.adequacy_p, result.success), strict=True))
             for name, result in self.results.items()
             for quantity, e in _quantities(result).items()
         ]  # fmt: skip
@@ -82,7 +86,10 @@ class CohortResult(Result, eqx.Module):
         return frame(self.table())
 
     def to_xarray(self) -> "xarray.Dataset":
-        """`value`, `stderr` (NaN where not determined) and `determined` over (target, quantity); units as coordinate."""
+        """`value`, `stderr`, `low`, `high` (NaN where there is none) and `determined` over (target, quantity).
+
+        `low` and `high` are the ends of the 95 % interval; units are a coordinate.
+        """
         import xarray
 
         names = list(dict.fromkeys(q for result in self.results.values() for q in _quantities(result)))
@@ -97,7 +104,9 @@ class CohortResult(Result, eqx.Module):
         return xarray.Dataset(
             {
                 "value": (dims, grid(lambda e: e.value, np.nan)),
-                "stderr": (dims, grid(lambda e: np.nan if e.stderr is None else e.stderr, np.nan)),
+                "stderr": (dims, grid(lambda e: _or_nan(e.stderr), np.nan)),
+                "low": (dims, grid(lambda e: _or_nan(_ends(e)[0]), np.nan)),
+                "high": (dims, grid(lambda e: _or_nan(_ends(e)[1]), np.nan)),
                 "determined": (dims, grid(lambda e: e.identifiable, False)),
                 "chi2_per_bin": ("target", [_or_nan(result.chi2_per_bin) for result in results]),
                 "adequacy_p": ("target", [_or_nan(result.adequacy_p) for result in results]),
@@ -138,6 +147,11 @@ class CohortResult(Result, eqx.Module):
 
 def _or_nan(value: float | None) -> float:
     return np.nan if value is None else float(value)
+
+
+def _ends(estimate: Estimate) -> tuple[float | None, float | None]:
+    """Of the 95 % interval."""
+    return (None, None) if estimate.interval is None else estimate.interval
 
 
 def _quantities(result: FitResult) -> dict[str, Any]:

@@ -14,7 +14,7 @@ from jaxmuscle.ensembles._ensemble import runs_for_means
 from jaxmuscle.model._noises import with_active_noise
 from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.objective._arguments import Plan, base_of
-from jaxmuscle.objective._consequences import BANDS, jackknife, observed
+from jaxmuscle.objective._consequences import jackknife, observed
 from jaxmuscle.objective._covariance import Identifiability, common_scales, known_products
 from jaxmuscle.objective._moment_models import Linear
 from jaxmuscle.objective._problem import FitProblem, Part
@@ -129,8 +129,7 @@ def report_fit(
     factor = 1.0 if judgement is None else judgement.widening
     moved |= too_curved(problem, derived, known)
     parameters, derived = (widened(without_errors(moved, table), factor) for table in (parameters, derived))
-    stated = [n for n, p in (parameters | derived).items()
-              if p.stderr and (n in derived or n in c.names) and base_of(n) not in BANDS]  # fmt: skip
+    stated = [n for n, p in (parameters | derived).items() if p.stderr and (n in derived or n in c.names)]
     ends = intervals(problem, objective, seen, factor**2 * covariance, stated)
     parameters, derived = (with_intervals(table, ends) for table in (parameters, derived))
     polish = polish_check(problem, stages, derived)
