@@ -17,6 +17,7 @@ from typer.testing import CliRunner
 import jaxmuscle as jm
 from jaxmuscle.commands import cohort as _cli_cohort
 from jaxmuscle.commands.main import app
+from jaxmuscle.fits import Estimate
 
 PEOPLE, SEEDS = 6, 20
 
@@ -148,6 +149,19 @@ def test_tables_hold_every_quantity_of_every_target():
     assert (corner["low"], corner["high"]) == made_result().derived["corner_frequency"].interval
     table = found.to_dataframe()
     assert list(table["value"]) == [row["value"] for row in rows] and list(table.columns) == list(rows[0])
+
+
+@pytest.mark.parametrize("whose", ["", "@a"])
+def test_a_tremor_is_listed_once_by_the_name_that_people_use(whose):
+    frequency, width = Estimate(9.0, "Hz", 0.3), Estimate(2.0, "Hz", None, True, False)
+    result = made_result(
+        parameters={f"resonance_frequency{whose}": frequency, f"resonance_width{whose}": width, "c_w": Estimate(60.0, "N")},
+        derived={f"tremor_frequency{whose}": frequency, f"tremor_width{whose}": width, "mean": Estimate(2.5, "N")},
+    )
+    names = [f"{name}{whose}" for name in ("tremor_frequency", "tremor_width")]
+    assert list(result.found) == ["c_w", *names, "mean"]
+    rows = jm.fits.CohortResult({"a": result}, {}, {}).table()
+    assert [row["quantity"] for row in rows if row["quantity"] != "mean"] == ["c_w", *names]
 
 
 def test_single_members_are_compared_by_their_standard_errors():

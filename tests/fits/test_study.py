@@ -17,6 +17,7 @@ import jaxmuscle as jm
 from jaxmuscle.data._study_table import Cell
 from jaxmuscle.fits import Estimate, StudyResult
 from jaxmuscle.fits._differences import corrected
+from jaxmuscle.fits._study import USUAL, _checked
 
 PEOPLE, CONDITIONS = 5, ("rest", "tired")
 OPTIONS = {"rung": "auto", "noise": None, "quantities": ["corner_frequency"], "alpha": 0.05, "correction": "holm",
@@ -134,6 +135,11 @@ def test_tables():
     np.testing.assert_array_equal(frame["value"], column("old", 1))
     assert {row["quantity"] for row in made_study(quantities=["corner_frequency"]).table()} == {"corner_frequency"}
     assert study.rung == 1 and study.people["old0"] == "old" and study.success
+
+
+def test_a_quantity_is_asked_for_by_either_name():
+    asked = ["resonance_frequency", "tremor_frequency", "corner_frequency"]
+    assert _checked(USUAL | {"quantities": asked})["quantities"] == ["tremor_frequency", "corner_frequency"]
 
 
 def test_the_folder(tmp_path):

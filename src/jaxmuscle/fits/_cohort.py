@@ -155,8 +155,8 @@ def _ends(estimate: Estimate) -> tuple[float | None, float | None]:
 
 
 def _quantities(result: FitResult) -> dict[str, Any]:
-    """Free parameters and derived quantities, as they are shown; what is both (the harmonic's frequency) once."""
-    return result.as_shown({name: p for name, p in result.parameters.items() if p.free} | result.derived)
+    """Free parameters and derived quantities, as they are shown; what is both (the tremor's frequency) once."""
+    return result.as_shown(result.found)
 
 
 def _determined(result: FitResult) -> dict[str, Any]:

@@ -218,7 +218,7 @@ class FitResult(Result, eqx.Module):
     @property
     def found(self) -> dict[str, Estimate]:
         """Fitted parameters and derived quantities; what is both, once, by the name that people use."""
-        fitted = {name: p for name, p in self.parameters.items() if p.free and ALIASES.get(name) not in self.derived}
+        fitted = {name: p for name, p in self.parameters.items() if p.free and _in_use(name) not in self.derived}
         return fitted | self.derived
 
     @property
@@ -245,6 +245,12 @@ class FitResult(Result, eqx.Module):
 
     def _card(self) -> Card:
         return card_of(self)
+
+
+def _in_use(name: str) -> str | None:
+    """The name that people use for a parameter, of one target or "name@target"; None where that is its own."""
+    base, at, target = name.partition("@")
+    return ALIASES[base] + at + target if base in ALIASES else None
 
 
 def to_table(result: FitResult) -> dict[str, Any]:

@@ -32,6 +32,7 @@ from jaxmuscle.objective._consequences import DERIVED
 from ._cohort import CohortResult, fit_cohort
 from ._differences import CORRECTIONS, Difference, change, corrected, difference, paired
 from ._part import Estimate, estimates_to_table
+from ._result import ALIASES
 from ._study_words import methods_paragraph, report_lines
 
 if TYPE_CHECKING:
@@ -310,7 +311,7 @@ def _checked(options: dict[str, Any]) -> dict[str, Any]:
     for name in names or ():
         if name not in DERIVED and name not in PARAMETERS:
             raise ValueError(f"quantities: unknown {name!r}; {choices(str(name), DERIVED)}")
-    return options | {"quantities": names}
+    return options | {"quantities": None if names is None else list(dict.fromkeys(ALIASES.get(n, n) for n in names))}
 
 
 def _fitted(cells: list[Cell], options: dict[str, Any], tell: Tell) -> tuple[CohortResult, dict[int, float]]:

@@ -13,6 +13,7 @@ from jaxmuscle._common.cards import Printed, Result
 from jaxmuscle._common.files import write_json
 from jaxmuscle._common.tables import frame
 from jaxmuscle._common.text import WIDTH
+from jaxmuscle.fits._result import ALIASES
 from jaxmuscle.fits._result_text import RELATIVE
 from jaxmuscle.objective._covariance import DETERMINED, spelt
 
@@ -171,8 +172,11 @@ class IdentifiabilityReport(Printed, Result, eqx.Module):
 
 
 def told(quantities: dict[str, Known]) -> list[str]:
-    """The quantities to be told of: K_j0 and C_j0 stand for the k_j and c_j to which they are proportional."""
-    twins = {k: base for k, base in BASE.items() if k in quantities and base in quantities}
+    """The quantities to be told of: K_j0 and C_j0 stand for the k_j and c_j to which they are proportional.
+
+    What has two names, as the tremor's frequency, is told by the one that people use.
+    """
+    twins = {k: base for k, base in (BASE | ALIASES).items() if k in quantities and base in quantities}
     doubled = {k for k, base in twins.items() if abs(quantities[k].left - quantities[base].left) < SAME}
     return [name for name in quantities if name not in doubled]
 
