@@ -72,7 +72,7 @@ def fit(
     correction); `key`, a `jax.random` key or a seed number; `bounds` {name: (low, high)}; `priors` {name: sd in log, or None
     for a flat one}; `coefficient_of_variation`, whether the target's, if it states one, is one more residual (it fixes the
     scale of the noise); `mean_force` (value, sd) [N] as a further residual, by default the target's if it states its mean in
-    newtons: the task is then carried to it (`at_force`) and P_w is free (False: not used); `max_steps` for each descent;
+    newtons: the task is then scaled to it (`at_force`) and P_w is free (False: not used); `max_steps` for each descent;
     `check_seeds` (64, or 200 then; 0: not simulated); `dt` [s], noise grid of a Monte Carlo fit; `progress`, True or a
     function of (text, share); `rungs`, how many richer models may be tried where the base model does not describe the data
     (`on_rung`; 3, or 0 where `noise` or `free` is given); `optimiser`, what makes the steps instead of

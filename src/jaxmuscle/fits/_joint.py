@@ -77,7 +77,7 @@ def fit_joint(
     nonlinear correction (0: none); `check_seeds`, fresh seeds of the nonlinear model for each reported spectrum (0: linear
     response times the correction); `bounds`, `priors`, `key`, `residual`, `coefficient_of_variation`, `max_steps`,
     `increments`, `progress` as in `fit`; `mean_force` {target: (value, sd)}, by default what the
-    targets state in newtons, if no `tasks` are given: all tasks are then carried by one number to the first, with a free
+    targets state in newtons, if no `tasks` are given: all tasks are then scaled by one number to the first, with a free
     P_w each.
 
     **Returns:** a `FitResult` with a part for each target; a fit that fails is one, too, and says why.
@@ -195,7 +195,7 @@ def _local_free(
 
 
 def _at_means(tasks: Tasks, targets: dict[str, Target]) -> tuple[Tasks, dict[str, tuple[float, float]], float | None]:
-    """All tasks carried by one number to the first mean force that a target states, each P_w to its own; means, number."""
+    """All tasks scaled by one number to the first mean force that a target states, each P_w to its own; means, number."""
     stated = {
         name: t.mean_force for name, t in targets.items() if t.mean_force is not None and tasks[name].output_unit == "N"
     }

@@ -176,7 +176,7 @@ class FitOptions:
 
 
 def at_mean(task: AbstractTask, target: Target, options: FitOptions) -> tuple[AbstractTask, FitOptions]:
-    """The task carried to the target's mean force, where it states one in newtons, which then is data; P_w follows from it.
+    """The task scaled to the target's mean force, where it states one in newtons, which then is data; P_w follows from it.
 
     Not where the fit is given a `mean_force` (or False), where P_w is fixed, nor for a muscle that is not the paper's.
     """

@@ -72,7 +72,7 @@ def _off_grid(stated: float) -> Claim:
     )  # fmt: skip
 
 
-FIT, SCALE = "isometric task, fitted to a curve reconstructed from the text of [30]", "carried to ten levels, 5 to 95 % MVC"
+FIT, SCALE = "isometric task, fitted to a curve reconstructed from the text of [30]", "scaled to ten levels, 5 to 95 % MVC"
 TASK1, SEEDS32 = "preset zagrodny-slifkin, Task 1, expected spectrum", "32 seeds"
 LAW, FIG = "the law of at_level with its steadiest level at 30 % (docs/scaling.md)", "the paper, Fig."
 PEOPLE = "Figures 7, 8: simulated people, 10 % apart, Ornstein-Uhlenbeck noise (or your own recordings)"
@@ -107,7 +107,7 @@ CLAIMS: tuple[Claim, ...] = (
           f"{FIT} at 35 %; the curve was made with it", lambda bin_, _: near(LOCAL_30, HALF_BIN)(bin_),
           "7 Hz is not a bin; the nearest is 7.031 Hz"),
     Claim("max-7-only", TESTED, "[30]", "the 7 Hz maximum is named for 35 % MVC alone",
-          lambda r: _local(r.levels.at_35_moved, LOCAL_30), "carried from 35 to 95 % MVC it is still at {0:.3f} Hz",
+          lambda r: _local(r.levels.at_35_moved, LOCAL_30), "scaled from 35 to 95 % MVC it is still at {0:.3f} Hz",
           f"{FIT} at 35 %, at_level to 95 %", holds(lambda bin_, _: not abs(bin_ - LOCAL_30) < HALF_BIN), "because at_level "
           "changes all amplitudes by one factor: a rhythm that comes and goes with the level has to be fitted at each"),
     Claim("largest", GIVEN, "[30]", "variability is largest at 95 % MVC",

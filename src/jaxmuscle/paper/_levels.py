@@ -27,7 +27,7 @@ ENTROPY_SEEDS = 16
 
 
 class Levels(eqx.Module):
-    """Fits to the reconstructed spectra of [30], carried to other levels of contraction by `at_level`.
+    """Fits to the reconstructed spectra of [30], scaled to other levels of contraction by `at_level`.
 
     **Fields:** `fractions` (levels,) of the MVC; of the fit at 95 %: `line`, the frequency of its harmonic [Hz], `within`,
     the share of its power in the compared bins, `power` (levels, bins), `variation` (levels,) with 1.7 % at 30 % MVC,

@@ -1,4 +1,4 @@
-"""Preset files: saved tasks, carried to the mean force that the file states."""
+"""Preset files: saved tasks, scaled to the mean force that the file states."""
 
 import math
 import os
@@ -34,7 +34,7 @@ def load_preset(name_or_path: str | Path) -> AbstractTask:
         mean = 40.5
         unit = "N"          # or "mN", "kN"
 
-    Then the task is carried to that force by `at_force`: P_w and F_ext, masses, stiffness and damping are multiplied by one
+    Then the task is scaled to that force by `at_force`: P_w and F_ext, masses, stiffness and damping are multiplied by one
     number. The spectrum and the coefficient of variation stay. A fit that starts from the task has its priors in ratio to
     the new values. A file of `save_preset` and a `fit.json` hold the final numbers and state no mean.
 

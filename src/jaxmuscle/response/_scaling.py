@@ -92,7 +92,7 @@ def at_level(
 
 
 def at_force(task: AbstractTask, mean: Scalar) -> AbstractTask:
-    """The task carried to another mean force: forces, masses, stiffness and damping multiplied by one number.
+    """The task scaled to another mean force: forces, masses, stiffness and damping multiplied by one number.
 
         task = jm.at_force(jm.Isometric(), 40.5)
 
