@@ -208,6 +208,9 @@ def test_the_printed_table_fits_80_columns_and_shortens_no_number(monkeypatch):
     printed = console.file.getvalue()
     assert printed.count("0.000199±6e-05") == 2 * len(_cli_cohort.SHOWN) and "…" not in printed
     assert max(map(len, printed.splitlines())) <= 80
+    assert [line.split()[-1] for line in printed.splitlines()[2:5]] == ["chi²", "per", "bin"]
+    words = printed.partition("chi² per")[1:]
+    assert "chi² per bin: squared distance of spectrum and fit" in " ".join("".join(words).split())
 
 
 def test_a_figure_needs_a_known_way_and_levels():

@@ -28,6 +28,7 @@ SHOWN = {
     "harmonic_share": "share",
     "high_frequency_floor": "floor",
 }
+CHI2 = "chi² per bin: squared distance of spectrum and fit in standard deviations, mean over the bins"
 
 
 def fit_together(
@@ -131,7 +132,7 @@ def _show(cohort: "CohortResult", folder: Path, places: dict[str, Path]) -> None
     table = Table(title=title, title_justify="left", box=SIMPLE_HEAD, padding=0)
     table.add_column("target", overflow="fold")
     grouped = bool(cohort.groups)
-    for column in [*["group"] * grouped, *SHOWN.values(), "chi²"]:
+    for column in [*["group"] * grouped, *SHOWN.values(), "chi²\nper\nbin"]:
         table.add_column(column, justify="left" if column == "group" else "right", no_wrap=column != "group")
     for name, result in cohort.results.items():
         cells = [plain(cohort.groups.get(name, ""))] * grouped + [_cell(result.derived.get(q)) for q in SHOWN]
@@ -139,6 +140,7 @@ def _show(cohort: "CohortResult", folder: Path, places: dict[str, Path]) -> None
         chi2 = f"[bold red]{chi2}*[/]" if result.adequate is False else chi2
         table.add_row(plain(name), *cells, chi2 if result.success else "[bold red]failed[/]")
     out.print(table)
+    out.print(f"{CHI2}. * the model does not describe the data", highlight=False)
     out.print(plain(cohort.verdict), highlight=False)
     for d in cohort.differences():
         unit = "" if d.unit == "1" else f" {d.unit}"
