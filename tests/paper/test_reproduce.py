@@ -117,6 +117,15 @@ def test_the_numbers_and_the_verdict_of_a_row(rows, key):
     assert bool(row.why) == (verdict != AGREES), "whatever does not simply agree says why"
 
 
+def test_the_envelope_is_told_as_the_preset_has_it():
+    (claim,) = (claim for claim in CLAIMS if claim.key == "changing")
+    told = re.search(r"envelope falls from ([\d.]+) at ([\d.]+) s to ([\d.]+) at ([\d.]+) s", claim.how)
+    assert told is not None
+    first, begin, last, end = map(float, told.groups())
+    envelope = jm.load_preset("zagrodny-hamilton").harmonic.envelope
+    assert float(envelope(begin)) == first and round(float(envelope(end)), 2) == last
+
+
 @pytest.mark.parametrize("claim", CLAIMS, ids=lambda claim: claim.key)
 def test_a_rule_can_say_no(claim):
     """Numbers that cannot be right are not called right."""

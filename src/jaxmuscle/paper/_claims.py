@@ -184,7 +184,7 @@ CLAIMS: tuple[Claim, ...] = (
           "chosen for it", holds(lambda own, other: own < other / 2)),
     Claim("changing", GIVEN, f"{FIG} 6a", "tuned to [12]: amplitude changing in time", lambda r: r.hamilton.swing,
           "harmonic in the force {0:.3%} of the mean in the first quarter of the window, {1:.3%} in the last",
-          f"preset zagrodny-hamilton, mean of {SEEDS32}; its envelope falls from 1 to 0.35, our choice",
+          f"preset zagrodny-hamilton, mean of {SEEDS32}; its envelope falls from 1 at 5 s to 0.35 at 15 s, our choice",
           holds(lambda first, last: abs(first / last - 1) > 0.2)),
     Claim("dominated", FITTED, f"{FIG} 6b", "displacement dominated by 0.391 Hz",
           lambda r: (peaks(r.hamilton.moved).maximum.frequency, peaks(r.hamilton.moved).maximum.power),
