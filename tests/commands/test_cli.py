@@ -1,6 +1,8 @@
 """The command: what it writes, its exit codes, and one line instead of a traceback for a user's mistake."""
 
 import csv
+import gc
+import importlib
 import inspect
 import json
 import os
@@ -8,9 +10,11 @@ import re
 import signal
 import subprocess
 import sys
+import types
 from pathlib import Path
 
 import jax
+import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 import typer
@@ -377,6 +381,50 @@ def test_what_to_measure_next_is_told_of_a_fit(fitted, tmp_path):
     assert strict(run("identifiability", tmp_path / "fit.json", "--out", tmp_path, "--force", "--json").stdout) == kept
     wrong = run("identifiability", folder / "fit.json", "--segments", 12, "--out", tmp_path / "new")
     assert wrong.exit_code == 2 and "is a fit; its task, parameters and target stay" in wrong.stderr
+
+
+@pytest.mark.parametrize(("quantities", "told"), [
+    ({"K_w0": types.SimpleNamespace(determined=False)}, True),
+    ({"K_w0": types.SimpleNamespace(determined=True)}, False),
+    ({}, False),
+])  # fmt: skip
+def test_where_the_stiffness_is_open_it_is_told_how_long_to_record(quantities, told, tmp_path, monkeypatch):
+    """What to ask for next, only where it would help."""
+    made = types.SimpleNamespace(present=types.SimpleNamespace(quantities=quantities), plot=plt.figure,
+                                 save=lambda path: path.write_text("{}"))  # fmt: skip
+    module = importlib.import_module("jaxmuscle.commands.identifiability")
+    monkeypatch.setattr(module, "fit_into", lambda *_: None)
+    monkeypatch.setattr(jm, "identifiability", lambda _: made)
+    outcome = run("identifiability", "some.toml", "--out", tmp_path)
+    assert outcome.exit_code == 0
+    assert (f"jaxmuscle design {tmp_path}/fit.json --quantity K_w0 --error 10" in outcome.stdout) == told
+    assert ("How long must a record with a moved insertion be?" in outcome.stdout) == told
+
+
+THREADS = ("OPENBLAS_NUM_THREADS", "PJRT_NPROC")
+
+
+@pytest.mark.parametrize(("command", "given", "expected"), [
+    ("fit", {}, ("1", None)),
+    ("posterior", {}, ("1", "1")),
+    ("posterior", dict.fromkeys(THREADS, "3"), ("3", "3")),
+])  # fmt: skip
+def test_commands_set_the_numbers_of_threads_that_the_user_has_not(command, given, expected, monkeypatch):
+    """Before anything large is imported, and only as long as this test."""
+    for name in THREADS:
+        monkeypatch.setenv(name, "")
+        monkeypatch.delenv(name)
+    for name, value in given.items():
+        monkeypatch.setenv(name, value)
+    seen, thresholds, handler = [], gc.get_threshold(), signal.getsignal(signal.SIGINT)
+    monkeypatch.setattr("jaxmuscle.commands.main.main", lambda: seen.append(tuple(map(os.environ.get, THREADS))))
+    monkeypatch.setattr(sys, "argv", ["jaxmuscle", command, "target"])
+    try:
+        importlib.import_module("jaxmuscle.__main__").main()
+    finally:
+        gc.set_threshold(*thresholds)
+        signal.signal(signal.SIGINT, handler)
+    assert seen == [expected]
 
 
 @pytest.mark.slow
