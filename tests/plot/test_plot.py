@@ -598,6 +598,25 @@ def test_a_study_has_one_key_that_lies_outside_all_spectra():
     assert [bool(ax.get_xlabel()) for ax in figure.axes] == [False, True, True]  # what stands lowest in its column
 
 
+def test_a_dollar_in_a_name_is_no_mathematics():
+    groups = ["$x_1$ at rest", "b"]
+    people = cohort_of(groups=groups, name="$p$")
+    cells = [types.SimpleNamespace(target=result.target, group=people.groups[name], condition="all")
+             for name, result in people.results.items()]  # fmt: skip
+    study = types.SimpleNamespace(cells=cells, groups=groups, conditions=["all"])
+    short = cohort_of(groups=["$a$", "b"])
+    for figure in (
+        plot.cohort(people),
+        plot.groups(people),
+        plot.groups(short),
+        plot.cohort(short, "group"),
+        plot.study(study),
+    ):
+        figure.canvas.draw()
+        named = [text for text in words_of(figure) if "$" in text.get_text()]
+        assert named and not any(text.get_parse_math() for text in named)
+
+
 def test_long_names_do_not_take_the_height_of_the_panels():
     short, long = (plot.cohort(cohort_of(12, name=name)) for name in ("p", "participant-"))
     for figure in (short, long):

@@ -41,7 +41,7 @@ def cohort(
     fig = canvas(ax, (COLUMN, height))
     _panels(fig, cohort, names, by)
     if len(_groups(cohort)) > 1 and not (by == "group" and _short(_groups(cohort))):
-        fitted_to(fig, height, key(fig, columns(_groups(cohort))))
+        fitted_to(fig, height, key(fig, columns(_groups(cohort)), plain=True))
     return fig
 
 
@@ -75,7 +75,7 @@ def groups(cohort: Any, ax: Axes | None = None, *, quantities: Collection[str] |
         panel.set_ylabel("Power (fraction per bin)")
     _panels(places[-1], cohort, names, "group")
     if spelled:
-        key(places[0], across)
+        key(places[0], across, plain=True)
     return fig
 
 
@@ -135,7 +135,7 @@ def _panel(ax: Axes, rows: list[dict[str, Any]], people: list[str], groups: list
     if by == "group":
         ax.set_xticks(range(len(groups)) if _short(groups) else [])
         if _short(groups):
-            ax.set_xticklabels([named(group, LONGEST) or "all" for group in groups])
+            ax.set_xticklabels([named(group, LONGEST) or "all" for group in groups], parse_math=False)
         ax.set_xlim(-0.6, len(groups) - 0.4)
     elif by == "level":
         ax.set_xlabel("Level (% MVC)")
@@ -144,6 +144,6 @@ def _panel(ax: Axes, rows: list[dict[str, Any]], people: list[str], groups: list
         if len(people) <= LABELLED:
             turned = 35 if len(people) <= 6 else 60
             labels = [named(name, LONGEST) for name in people]
-            ax.set_xticks(range(len(people)), labels, rotation=turned, ha="right", rotation_mode="anchor")
+            ax.set_xticks(range(len(people)), labels, rotation=turned, ha="right", rotation_mode="anchor", parse_math=False)
         else:
             ax.set_xlabel("Target number")

@@ -48,7 +48,7 @@ def study(study: Any, ax: Axes | None = None, *, proportional: bool = True) -> F
     unit = next(iter(units)) or "?"
     for row in axes:
         row[0].set_ylabel("Power (fraction per bin)" if proportional else f"Power ({density_unit(unit)})")
-    fitted_to(fig, HEIGHT * down, key(fig, columns(labels)))
+    fitted_to(fig, HEIGHT * down, key(fig, columns(labels), plain=True))
     return fig
 
 

@@ -123,12 +123,17 @@ def heading(fig: Figure | SubFigure, words: str, *, bad: str = "") -> int:
     return 1 + bool(bad)
 
 
-def key(fig: Figure | SubFigure, columns: int = 2) -> int:
-    """One legend below all panels that have none, in which each name stands once; how many lines."""
+def key(fig: Figure | SubFigure, columns: int = 2, *, plain: bool = False) -> int:
+    """One legend below all panels that have none, in which each name stands once; how many lines.
+
+    `plain`, of names that somebody else gave, in which $ is no sign of mathematics.
+    """
     named = {label: handle for ax in fig.axes if ax.get_legend() is None
              for handle, label in zip(*ax.get_legend_handles_labels(), strict=True)}  # fmt: skip
     if named:
-        fig.legend(named.values(), named, loc="outside lower center", ncols=columns, frameon=False, columnspacing=1.2)
+        made = fig.legend(named.values(), named, loc="outside lower center", ncols=columns, frameon=False, columnspacing=1.2)
+        for text in made.get_texts() if plain else ():
+            text.set_parse_math(False)
     return -(-len(named) // columns)
 
 
