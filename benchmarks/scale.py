@@ -24,6 +24,7 @@ from measure import Row, Unequal, seconds
 
 import jaxmuscle as jm
 from jaxmuscle._common.arrays import as_arrays
+from jaxmuscle._common.environment import UNDIVIDED_LOOPS
 from jaxmuscle.model._stream import Draws, Stream
 from jaxmuscle.simulation._grid import Grid
 from jaxmuscle.simulation._integrator import integrated
@@ -130,8 +131,10 @@ for line in sys.stdin:
 
 
 def _worker(cores: list[int], threads: int, seeds: int) -> subprocess.Popen:
+    """An ensemble in a process, with XLA_FLAGS as the command `jaxmuscle ensemble` sets them."""
     program = [sys.executable, "-c", WORKER, json.dumps([cores, threads, seeds])]
-    worker = subprocess.Popen(program, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    flags = {"XLA_FLAGS": UNDIVIDED_LOOPS} | os.environ
+    worker = subprocess.Popen(program, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=flags)
     assert worker.stdout is not None and worker.stdout.readline().strip() == "ready"
     return worker
 

@@ -18,6 +18,10 @@ def main() -> None:
     # Chains take one tiny step after the other: XLA's threads would spin between them.
     if sys.argv[1:2] == ["posterior"]:
         os.environ.setdefault("PJRT_NPROC", "1")
+    if sys.argv[1:2] == ["ensemble"]:
+        from jaxmuscle._common.environment import UNDIVIDED_LOOPS
+
+        os.environ.setdefault("XLA_FLAGS", UNDIVIDED_LOOPS)
     gc.set_threshold(50_000)  # what is imported and loaded stays: to look through it again and again is of no use
     with heard():
         from jaxmuscle.commands.main import main as command

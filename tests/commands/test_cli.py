@@ -24,7 +24,7 @@ from typer.testing import CliRunner
 import jaxmuscle as jm
 from jaxmuscle import paper
 from jaxmuscle._common.arrays import as_arrays
-from jaxmuscle._common.environment import keep_compiled_programs
+from jaxmuscle._common.environment import UNDIVIDED_LOOPS, keep_compiled_programs
 from jaxmuscle.commands.main import app
 from jaxmuscle.paper._claims import claims_json
 from jaxmuscle.paper._verdicts import Row
@@ -401,15 +401,17 @@ def test_where_the_stiffness_is_open_it_is_told_how_long_to_record(quantities, t
     assert ("How long must a record with a moved insertion be?" in outcome.stdout) == told
 
 
-THREADS = ("OPENBLAS_NUM_THREADS", "PJRT_NPROC")
+THREADS = ("OPENBLAS_NUM_THREADS", "PJRT_NPROC", "XLA_FLAGS")
 
 
 @pytest.mark.parametrize(("command", "given", "expected"), [
-    ("fit", {}, ("1", None)),
-    ("posterior", {}, ("1", "1")),
-    ("posterior", dict.fromkeys(THREADS, "3"), ("3", "3")),
+    ("fit", {}, ("1", None, None)),
+    ("posterior", {}, ("1", "1", None)),
+    ("ensemble", {}, ("1", None, UNDIVIDED_LOOPS)),
+    ("posterior", dict.fromkeys(THREADS, "3"), ("3", "3", "3")),
+    ("ensemble", dict.fromkeys(THREADS, "3"), ("3", "3", "3")),
 ])  # fmt: skip
-def test_commands_set_the_numbers_of_threads_that_the_user_has_not(command, given, expected, monkeypatch):
+def test_commands_set_of_the_environment_what_the_user_has_not(command, given, expected, monkeypatch):
     """Before anything large is imported, and only as long as this test."""
     for name in THREADS:
         monkeypatch.setenv(name, "")

@@ -7,6 +7,10 @@ from pathlib import Path
 
 import platformdirs
 
+# For the environment variable XLA_FLAGS: a loop of less than a megabyte becomes one piece of machine code. Else XLA splits
+# what is inside it among all cores, although these are busy with other seeds.
+UNDIVIDED_LOOPS = "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=1000000"
+
 
 def keep_compiled_programs() -> Path | None:
     """Switch JAX's persistent compilation cache on; returns its folder.
