@@ -69,6 +69,7 @@ clean:
 	@$(PYTHON) -m venv .venv
 	@$(PIP) --upgrade pip
 	@$(PIP) --editable '.[all]'
+	@$(BIN)/python -m compileall -q src
 	@touch $@
 
 .venv/.stamp-notebooks: .venv/.stamp-run

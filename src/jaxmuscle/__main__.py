@@ -15,10 +15,11 @@ def main() -> None:
     """Entry point of the console script: signals are heard before anything large is imported."""
     # A fit's matrices are small: OpenBLAS's other threads would spin between them, for half as long as the fit computes.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    # Chains take one tiny step after the other: XLA's threads would spin between them.
-    if sys.argv[1:2] == ["posterior"]:
+    command = next((word for word in sys.argv[1:] if not word.startswith("-")), "")
+    # Searches and chains take one tiny step after the other: XLA's threads would spin between them. Many seeds need them.
+    if command in ("fit", "compare", "posterior") and not any(word.startswith("--seeds") for word in sys.argv):
         os.environ.setdefault("PJRT_NPROC", "1")
-    if sys.argv[1:2] == ["ensemble"]:
+    if command == "ensemble":
         from jaxmuscle._common.environment import UNDIVIDED_LOOPS
 
         os.environ.setdefault("XLA_FLAGS", UNDIVIDED_LOOPS)

@@ -54,6 +54,20 @@ def test_a_second_process_traces_nothing(x64, folder):
     assert second.traces == 1
 
 
+@pytest.mark.parametrize("known", ["xla_cpu_use_fusion_emitters", "xla_cpu_that_is_gone"])
+def test_an_option_that_xla_does_not_know_is_done_without(x64, folder, monkeypatch, known):
+    monkeypatch.setattr(programs, "OPTIONS", {known: False})
+    assert_right(Kept(solved)(TASK, MATRIX))
+    monkeypatch.setattr(programs, "program_folder", lambda: None)
+    assert_right(Kept(solved)(TASK, MATRIX))
+
+
+def test_a_fault_in_compiling_is_not_hidden(x64, folder, monkeypatch):
+    monkeypatch.setattr(programs, "OPTIONS", {"xla_cpu_use_fusion_emitters": "perhaps"})
+    with pytest.raises(jax.errors.JaxRuntimeError, match="perhaps"):
+        Kept(solved)(TASK, MATRIX)
+
+
 def test_precision_makes_another_program(folder):
     program = Kept(solved)
     with jax.enable_x64(True):

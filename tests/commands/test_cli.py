@@ -405,8 +405,12 @@ THREADS = ("OPENBLAS_NUM_THREADS", "PJRT_NPROC", "XLA_FLAGS")
 
 
 @pytest.mark.parametrize(("command", "given", "expected"), [
-    ("fit", {}, ("1", None, None)),
+    ("fit", {}, ("1", "1", None)),
+    ("--quiet fit", {}, ("1", "1", None)),
+    ("fit --seeds 4096", {}, ("1", None, None)),
+    ("fit --seeds=4096", {}, ("1", None, None)),
     ("posterior", {}, ("1", "1", None)),
+    ("check", {}, ("1", None, None)),
     ("ensemble", {}, ("1", None, UNDIVIDED_LOOPS)),
     ("posterior", dict.fromkeys(THREADS, "3"), ("3", "3", "3")),
     ("ensemble", dict.fromkeys(THREADS, "3"), ("3", "3", "3")),
@@ -420,7 +424,7 @@ def test_commands_set_of_the_environment_what_the_user_has_not(command, given, e
         monkeypatch.setenv(name, value)
     seen, thresholds, handler = [], gc.get_threshold(), signal.getsignal(signal.SIGINT)
     monkeypatch.setattr("jaxmuscle.commands.main.main", lambda: seen.append(tuple(map(os.environ.get, THREADS))))
-    monkeypatch.setattr(sys, "argv", ["jaxmuscle", command, "target"])
+    monkeypatch.setattr(sys, "argv", ["jaxmuscle", *command.split(), "target"])
     try:
         importlib.import_module("jaxmuscle.__main__").main()
     finally:

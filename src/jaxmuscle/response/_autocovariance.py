@@ -132,11 +132,11 @@ class Autocovariance(NamedTuple):
         short = (lags.bit_length() + 1) // 2
         columns, rows = self.next[:, :, None], self.rows[:, None]
         for power in self.powers[:short]:
-            columns = jnp.concatenate([columns, product(power, columns)], axis=2)
+            columns = jnp.concatenate([columns, power @ columns], axis=2)
         for power in self.powers[short:]:
             if rows.shape[1] * columns.shape[2] >= lags - 1:
                 break
-            rows = jnp.concatenate([rows, product(rows, power)], axis=1)
+            rows = jnp.concatenate([rows, rows @ power], axis=1)
         return jnp.concatenate([self.head, jnp.sum(rows @ columns, axis=0).reshape(-1)])[:lags]
 
     def mean_variance(self, samples: Int[Array | np.ndarray, ""] | int) -> Float[Array, ""]:
