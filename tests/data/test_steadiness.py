@@ -170,7 +170,7 @@ def test_no_peak_is_no_number():
     none = jm.steadiness(jm.Recording(forces(30, 15.0, tremor=0, seed=3)[without[0]], RATE))
     assert math.isnan(none["peak_frequency"].value) and none["peak_frequency"].stderr is None
     assert none.to_dict()["measures"]["peak_frequency"]["value"] is None
-    assert "peak between 6 and 12 Hz    none" in str(none)
+    assert "peak between 6 and 12 Hz    no sharp one" in str(none)
 
 
 def test_rates_may_differ():

@@ -82,7 +82,9 @@ def fit(
     starts: Annotated[
         int | None,
         typer.Option(
-            min=1, help="How many starting points the search has: 100 by default, 8 if the spectrum has no formula."
+            min=1,
+            help="How many starting points the search has: 100 by default, 32 for each richer model, "
+            "8 if the spectrum has no formula.",
         ),
     ] = None,
     seeds: Annotated[
@@ -249,8 +251,11 @@ def _fit_one(target: Any, model: Any, folder: Path, options: dict[str, Any], for
     if not printed:
         table(result)
     told_before = {*printed[0].remarks, *printed[0].notices}
-    for sentence in (*result.remarks, *(f"note: {notice}" for notice in result.notices)):
-        if sentence.removeprefix("note: ") not in told_before:
-            out.print(plain(sentence), highlight=False)
+    new = [sentence for sentence in (*result.remarks, *(f"note: {notice}" for notice in result.notices))
+           if sentence.removeprefix("note: ") not in told_before]  # fmt: skip
+    for sentence in new:
+        out.print(plain(sentence), highlight=False)
+    if new and printed[0].derived != result.derived:
+        out.print("New simulations move the last digits a little: the files have the final numbers.", highlight=False)
     out.print(f"Written: {folder}/{', '.join(files)}", highlight=False, soft_wrap=True)
     return result.success

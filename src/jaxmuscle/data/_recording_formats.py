@@ -118,7 +118,7 @@ def read_c3d(path: str, most: int) -> list[Channel]:
     try:
         import ezc3d  # pyright: ignore
     except ImportError:
-        raise ImportError("reading C3D needs ezc3d: pip install jaxmuscle[c3d]") from None
+        raise ImportError("reading C3D needs ezc3d: pip install ezc3d") from None
     content: Any = ezc3d.c3d(path)
     found: list[Channel] = []
     point, analog = content["parameters"]["POINT"], content["parameters"]["ANALOG"]

@@ -13,7 +13,7 @@ def _library(name: str) -> Any:
         return importlib.import_module(name)
     except ImportError:
         what = name.partition(".")[0]
-        raise ImportError(f"reading this file needs {what}: pip install jaxmuscle[labs]") from None
+        raise ImportError(f"reading this file needs {what}: pip install {what}") from None
 
 
 def read_xlsx(path: str, most: int) -> bytes:

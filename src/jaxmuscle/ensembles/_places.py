@@ -317,7 +317,7 @@ def place_of(path: str | Path) -> AbstractPlace:
     try:
         from fsspec.core import url_to_fs
     except ImportError as error:
-        raise StoreError(f"{text}: a URL needs fsspec: pip install 'jaxmuscle[url]'") from error
+        raise StoreError(f"{text}: a URL needs fsspec: pip install fsspec") from error
     try:
         # fsspec's own local files, with which tests play an object store, make no folders unless they are told to.
         files, inside = url_to_fs(text, **({"auto_mkdir": True} if text.startswith("local://") else {}))

@@ -1,5 +1,6 @@
 """What a fit found of one target, and numbers with their errors: as objects and as tables."""
 
+import math
 from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
@@ -57,10 +58,17 @@ class Estimate(eqx.Module):
         """The 95 % interval, empty where there is none."""
         if self.interval is None:
             return ""
-        low, high = ("" if end is None else f"{end:.3g}" for end in self.interval)
+        low, high = ("" if end is None else f"{end:.{self._digits(end)}g}" for end in self.interval)
         if low and high:
             return f"{low} to {high}"
         return f"above {low}" if low else f"below {high}" if high else "open"
+
+    def _digits(self, end: float) -> int:
+        """Three significant digits of an end of the interval, or more where both ends would else look the same."""
+        low, high = self.interval or (None, None)
+        if low is None or high is None or end == 0 or not 0 < high - low < math.inf:
+            return 3
+        return max(3, math.floor(math.log10(abs(end))) - math.floor(math.log10(high - low)) + 1)
 
 
 class Start(eqx.Module):

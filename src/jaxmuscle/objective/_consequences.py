@@ -63,7 +63,9 @@ OF_SPECTRUM = {"harmonic_share", "harmonic_frequency", "high_frequency_floor", "
 def derived_names(task: Any, spectrum: bool = True) -> tuple[str, ...]:
     """The derived quantities that a task has; without a spectrum among the data those of the muscle alone."""
     frequency, resonances = task.settings.frequency, sum(isinstance(n, ResonantNoise) for n in task.noise.components)
-    bands = {name for name, (low, high) in BANDS.items() if np.any((frequency >= low) & (frequency < high))}
+    covered = np.sum(in_bands(frequency, task.settings.resolution), axis=1) * task.settings.resolution
+    least = 0.5 * np.diff([*BANDS.values()])[:, 0]
+    bands = {name for name, enough in zip(BANDS, covered >= least, strict=True) if enough}
     missing = set(BANDS) - bands | (set() if spectrum else OF_SPECTRUM)
     missing |= set() if task.activation is not None else {"contraction_time"}
     missing |= {"tremor_frequency", "tremor_width", "tremor_share"} if resonances < 1 else set()
@@ -71,6 +73,14 @@ def derived_names(task: Any, spectrum: bool = True) -> tuple[str, ...]:
     # About a mean of zero, and where the response begins with f².
     missing |= {"coefficient_of_variation", "mean", "half_power_frequency"} if task.quantity == "acceleration" else set()
     return tuple(name for name in DERIVED if name not in missing)
+
+
+def in_bands(frequency: Any, resolution: float) -> Any:
+    """How much of each bin lies in each band, from 0 to 1: a bin holds what is up to half the resolution away from it."""
+    low, high = np.array([*BANDS.values()], frequency.dtype).T[:, :, None]
+    half = 0.5 * resolution
+    kind = np if isinstance(frequency, np.ndarray) else jnp
+    return kind.clip((kind.minimum(frequency + half, high) - kind.maximum(frequency - half, low)) / resolution, 0.0, 1.0)
 
 
 def derived(task: Any, moments: Moments, frequency: Float[Array | np.ndarray, " bins"] | None = None) -> dict[str, Any]:
@@ -83,7 +93,8 @@ def derived(task: Any, moments: Moments, frequency: Float[Array | np.ndarray, " 
     `harmonic_share` of the compared power; `harmonic_frequency`; `high_frequency_floor`, mean proportional power per bin
     over the highest third of the bins; the base coefficients; `coefficient_of_variation` and `mean` of the output (not of
     an acceleration, whose mean is zero, and which has no `half_power_frequency`);
-    `band_4_8` and so on, the proportional power of the bins from 4 Hz to below 8 Hz.
+    `band_4_8` and so on, the proportional power from 4 to 8 Hz, of bins at the edges the part that lies inside, where the
+    bins cover half of the band.
     """
     base, seen = task.muscle.base(), observed(moments)
     at: Any = task.settings.frequency if frequency is None else frequency  # of the bins, if not all are compared
@@ -101,8 +112,9 @@ def derived(task: Any, moments: Moments, frequency: Float[Array | np.ndarray, " 
         peak = at >= 0.5 * jax.lax.stop_gradient(noise.frequency)
         found[f"{name}_share"] = jnp.sum(jnp.where(peak, own, 0.0)) / whole
     proportional = moments.power / whole
-    for name, (low, high) in BANDS.items():
-        found[name] = jnp.sum(jnp.where((at >= low) & (at < high), proportional, 0.0))
+    found |= dict(
+        zip(BANDS, in_bands(jnp.asarray(at, proportional.dtype), task.settings.resolution) @ proportional, strict=True)
+    )
     found |= {
         "harmonic_share": seen["harmonic_share"],
         "harmonic_frequency": task.harmonic.frequency * jnp.ones(()),

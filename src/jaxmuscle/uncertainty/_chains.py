@@ -50,7 +50,7 @@ def _tools() -> tuple[Any, Any, Any, Any]:
         from blackjax.adaptation.step_size import DualAveragingAdaptationState, dual_averaging_adaptation
         from blackjax.mcmc.hmc import HMCState
     except ImportError as error:
-        raise ImportError("posterior needs blackjax and arviz-stats: pip install 'jaxmuscle[posterior]'") from error
+        raise ImportError("posterior needs blackjax and arviz-stats: pip install blackjax arviz-stats") from error
     return blackjax.hmc, HMCState, dual_averaging_adaptation(TARGET_ACCEPTANCE), DualAveragingAdaptationState
 
 

@@ -39,7 +39,7 @@ class Design(eqx.Module):
 
     **Arguments:**
 
-    - `name`: a noun phrase, "a second force level at 10 N": reports make sentences of it.
+    - `name`: a noun phrase, "a second force level, 2 times as high": reports make sentences of it.
     - `task`: what is measured, at the values expected; the fitted task itself by default.
     - `segments`: Welch segments of its spectrum, of one trial or of several; as many as the target's by default; 0 for
       no new recording, only the numbers that follow.
@@ -190,9 +190,8 @@ def _designs_for(part: Part, moments: Moments, factors: tuple[float, ...], separ
         designs.append(Design("the force with the insertion held", fixed, coefficient_of_variation=True))
     forces = {n: float(task[n]) for n in FORCES if n in task.parameter_names and float(task[n]) != 0}
     if forces:
-        first, level = next(iter(forces.items()))
         for factor in factors:
-            name = f"a second force level at {first} = {factor * level:.3g} N"
+            name = f"a second force level, {factor:g} times as high"
             moved = task.replace(**{n: factor * v for n, v in forces.items()})
             designs.append(Design(name, moved, coefficient_of_variation=varying, separate=separate))
     more = tuple((LONGER - 1) * k for k in segments_of(part.target))
