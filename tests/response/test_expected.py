@@ -614,6 +614,27 @@ SIMULATED = {
 
 
 @pytest.mark.slow
+def test_the_expected_coefficient_of_variation_is_that_of_simulations(x64):
+    """Its square, whose mean over seeds has a known standard error; and its slope by differences."""
+    task, (start, stop) = jm.settled(jm.Isometric(noise="white")), (5.0, 15.0)
+    runs = jm.ensemble(task, KEY, seeds=1000, duration=stop, dt=1.25e-3, control=False)
+    rate = task.settings.rate
+    passed = np.asarray(jm.spectra.lowpass(np.asarray(runs.output), task.settings))[
+        :, round(start * rate) : round(stop * rate)
+    ]
+    squares = passed.var(axis=1) / passed.mean(axis=1) ** 2
+    expected = jm.response.expected_variation(task, window=(start, stop))
+    assert abs(squares.mean() - expected**2) < 4 * squares.std() / np.sqrt(len(squares))
+
+    def one(k):
+        return jm.response.expected_variation(task.replace(k_w=k))
+
+    k, step = float(task["k_w"]), 1e-4
+    difference = (one(k * (1 + step)) - one(k * (1 - step))) / (2 * k * step)
+    np.testing.assert_allclose(jax.jit(jax.grad(one))(k), difference, rtol=1e-6)
+
+
+@pytest.mark.slow
 def test_the_mean_of_simulations_is_as_expected(x64):
     z, window = [], (1.0, 6.12)  # a settled task forgets that it starts without fluctuations, by 1 s to e^-7
     options = {"seeds": 1000, "duration": window[1], "dt": 1.25e-3, "control": False}

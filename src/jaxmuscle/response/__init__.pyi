@@ -4,6 +4,7 @@ from ._characteristics import StaticCharacteristics as StaticCharacteristics
 from ._characteristics import static_characteristics as static_characteristics
 from ._equilibrium import equilibrium as equilibrium
 from ._expected_spectrum import expected_spectrum as expected_spectrum
+from ._expected_spectrum import expected_variation as expected_variation
 from ._input_response import dynamic_stiffness as dynamic_stiffness
 from ._input_response import noise_density as noise_density
 from ._linearised import settled as settled

@@ -2,13 +2,14 @@
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
 from jaxmuscle._common.arrays import all_concrete, is_concrete
 from jaxmuscle.model._task import AbstractTask, require_task
 from jaxmuscle.spectra._settings import WINDOW, SpectrumSettings
 from jaxmuscle.spectra._welch import Spectrum
 
-from ._expected import check_line, check_power, expected_moments
+from ._expected import Moments, check_line, check_power, expected_moments
 from ._linearised import check_equilibrium, check_inputs
 from ._second_order import warn_beyond
 
@@ -37,7 +38,37 @@ def expected_spectrum(
     harmonic. Warns (`FirstOrderWarning`) where the second order adds more than 10 % to a bin, and of coefficients that
     turn negative. Under a transformation, where values cannot be looked at, the result is not finite instead.
     """
-    require_task(task, "expected_spectrum(task)")
+    moments, settings = _moments(task, "expected_spectrum(task)", settings, window)
+    frequency = jnp.asarray(settings.frequency, moments.power.dtype)
+    return Spectrum(frequency, moments.power, settings, task.output_unit)
+
+
+def expected_variation(
+    task: AbstractTask, settings: SpectrumSettings | None = None, window: tuple[float, float] = WINDOW
+) -> Float[Array, ""]:
+    """The expected coefficient of variation of a task's output, to first order in its perturbations: no Monte Carlo.
+
+        jm.response.expected_variation(jm.Isometric(k_w=4e5))
+
+        CV = √E[s²] / |μ|,    E[s²] = r(0) - Var(mean) + ½ |line|²
+
+    r is the autocovariance of the output behind the low-pass of the settings, s² the variance within the window, and μ the
+    output at rest. Slow fluctuations count less in a short window, which hardly holds one of their periods.
+
+    **Arguments:** as of `expected_spectrum`; the `window` [s] also says how long the recording is (10 s by default).
+
+    **Returns:** a fraction, not a percentage; differentiable, also under `jit` and `vmap`. **Raises** and warns as
+    `expected_spectrum`.
+    """
+    moments, _ = _moments(task, "expected_variation(task)", settings, window)
+    return jnp.sqrt(moments.variance) / jnp.abs(moments.mean)
+
+
+def _moments(
+    task: AbstractTask, call: str, settings: SpectrumSettings | None, window: tuple[float, float]
+) -> tuple[Moments, SpectrumSettings]:
+    """The expected moments, after what has to be refused or said."""
+    require_task(task, call)
     settings = task.settings if settings is None else settings
     if not isinstance(settings, SpectrumSettings):
         raise ValueError(f"settings: this is a {type(settings).__name__}; give a jaxmuscle.SpectrumSettings")
@@ -51,5 +82,4 @@ def expected_spectrum(
         check_power(task, moments)
     if concrete:
         warn_beyond(task, settings)
-    frequency = jnp.asarray(settings.frequency, moments.power.dtype)
-    return Spectrum(frequency, moments.power, settings, task.output_unit)
+    return moments, settings
