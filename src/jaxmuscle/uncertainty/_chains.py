@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxmuscle._common.programs import kept
+from jaxmuscle._common.programs import kept, kept_to_run_long
 
 Density = Any  # has `size`, `centre`, `scale` that whiten, and `log_density` of whitened coordinates
 BLOCK = 50
@@ -66,7 +66,7 @@ def _first(density: Density, positions: Array) -> Any:
     return _strong(_State(tuple(chains), tuple(start(jnp.asarray(0.5)))))
 
 
-@kept
+@kept_to_run_long
 def _block(density: Density, key: Array, state: Any, adapting: Array, longest: Array) -> tuple[Any, Any]:
     """`BLOCK` draws of every chain; while `adapting` the step size follows the mean acceptance of all chains.
 
