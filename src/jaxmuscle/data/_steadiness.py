@@ -135,7 +135,7 @@ def _range(low: float, high: float) -> str:
 
 def _said(name: str, m: Measure) -> str:
     if math.isnan(m.value):
-        return "no sharp one"
+        return "no sharp one" if name == "peak_frequency" else "none"
     percent = name.startswith((VARIATION, "share"))
     scale, unit = (100.0, " %") if percent else (1.0, f" {m.unit.replace('^2', '²')}" * (m.unit != "1"))
     if m.stderr is None:
