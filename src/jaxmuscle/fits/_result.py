@@ -28,7 +28,7 @@ from ._adequacy import Adequacy
 from ._fit_file import FORMAT, FORMATS, FitTable, PartTable, disagreement
 from ._ladder import Rung
 from ._part import Estimate, FittedPart, Start, estimates_to_table, part_to_table, read_estimates, read_part
-from ._result_text import card_of, per_newton
+from ._result_text import card_of, in_use, per_newton
 
 if TYPE_CHECKING:
     import pandas
@@ -36,11 +36,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure, SubFigure
 
 
-ALIASES = {
-    "resonance_frequency": "tremor_frequency",
-    "resonance_width": "tremor_width",
-    "activation_time": "contraction_time",
-}
 PROFILE = ("frequency_hz", "chi2_rise")
 
 
@@ -218,7 +213,7 @@ class FitResult(Result, eqx.Module):
     @property
     def found(self) -> dict[str, Estimate]:
         """Fitted parameters and derived quantities; what is both, once, by the name that people use."""
-        fitted = {name: p for name, p in self.parameters.items() if p.free and _in_use(name) not in self.derived}
+        fitted = {name: p for name, p in self.parameters.items() if p.free and in_use(name) not in self.derived}
         return fitted | self.derived
 
     @property
@@ -245,12 +240,6 @@ class FitResult(Result, eqx.Module):
 
     def _card(self) -> Card:
         return card_of(self)
-
-
-def _in_use(name: str) -> str | None:
-    """The name that people use for a parameter, of one target or "name@target"; None where that is its own."""
-    base, at, target = name.partition("@")
-    return ALIASES[base] + at + target if base in ALIASES else None
 
 
 def to_table(result: FitResult) -> dict[str, Any]:

@@ -19,8 +19,11 @@ if TYPE_CHECKING:
     from ._result import FitResult
 
 RELATIVE = {"N": "1", "N/m": "1/m", "N s/m": "s/m", "N/m^3": "1/m^3", "N s^3/m^3": "s^3/m^3", "kg": "kg/N"}
-
-
+ALIASES = {
+    "resonance_frequency": "tremor_frequency",
+    "resonance_width": "tremor_width",
+    "activation_time": "contraction_time",
+}
 COLUMNS = ("name", "value", "95 % interval", "unit", "in the fit", "what it is")
 
 
@@ -152,3 +155,9 @@ def _stiffness(part: FittedPart) -> list[str]:
     return [
         f"dynamic stiffness: {len(f)} points from {f[0]:.2g} to {f[-1]:.2g} Hz, chi2 per point {part.chi2_per_point:.2f}"
     ]
+
+
+def in_use(name: str) -> str | None:
+    """The name that people use for a parameter, of one target or "name@target"; None where that is its own."""
+    base, at, target = name.partition("@")
+    return ALIASES[base] + at + target if base in ALIASES else None

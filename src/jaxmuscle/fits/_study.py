@@ -32,7 +32,7 @@ from jaxmuscle.objective._consequences import DERIVED
 from ._cohort import CohortResult, fit_cohort
 from ._differences import CORRECTIONS, Difference, change, corrected, difference, paired
 from ._part import Estimate, estimates_to_table
-from ._result import ALIASES
+from ._result_text import ALIASES
 from ._study_words import methods_paragraph, report_lines
 
 if TYPE_CHECKING:

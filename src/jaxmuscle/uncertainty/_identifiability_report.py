@@ -13,8 +13,7 @@ from jaxmuscle._common.cards import Printed, Result
 from jaxmuscle._common.files import write_json
 from jaxmuscle._common.tables import frame
 from jaxmuscle._common.text import WIDTH
-from jaxmuscle.fits._result import ALIASES
-from jaxmuscle.fits._result_text import RELATIVE
+from jaxmuscle.fits._result_text import ALIASES, RELATIVE
 from jaxmuscle.objective._covariance import DETERMINED, spelt
 
 if TYPE_CHECKING:

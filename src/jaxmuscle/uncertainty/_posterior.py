@@ -24,8 +24,9 @@ from jaxmuscle.objective._problem import FitProblem
 from jaxmuscle.objective._residuals import PartResiduals, Residuals
 
 from ._chains import Chains, sample
+from ._frequency_grid import edges_of
 from ._posterior_checks import diagnosed, modes_of, replicates, verdict
-from ._posterior_density import PosteriorDensity, density_about, edges_of
+from ._posterior_density import PosteriorDensity, density_about
 from ._posterior_result import Posterior, PosteriorPart
 
 ROWS = 256
