@@ -619,3 +619,16 @@ def test_an_unknown_preset_names_the_nearest(monkeypatch):
     monkeypatch.setattr(_preset, "list_presets", lambda: ("zagrodny-hamilton", "zagrodny-slifkin"))
     with pytest.raises(PresetError, match=r"'zagrodny-slifki': did you mean 'zagrodny-slifkin'.*or give a path"):
         jm.load_preset("zagrodny-slifki")
+
+
+@pytest.mark.parametrize(("ends", "words"), [
+    ((11.968, 12.0628), "11.97 to 12.06"),  # three digits of each would say 12 to 12.1
+    ((0.6381, 1.2812), "0.638 to 1.28"),
+    ((-0.0004, 0.0), "-0.0004 to 0"),
+    ((1e5, 1e5), "1e+05 to 1e+05"),
+    ((0.3112, None), "above 0.311"),
+    ((None, 12.0628), "below 12.1"),
+    ((None, None), "open"),
+])  # fmt: skip
+def test_the_ends_of_an_interval_can_be_told_apart(ends, words):
+    assert Estimate(1.0, "N", 0.1, interval=ends).interval_in_words() == words

@@ -14,7 +14,7 @@ from jaxmuscle.fits._adequacy import Endpoint
 from jaxmuscle.fits._ladder import criterion, told_apart
 from jaxmuscle.model._rungs import RUNGS
 from jaxmuscle.objective._arguments import COEFFICIENTS, FitOptions, planned
-from jaxmuscle.objective._consequences import expand
+from jaxmuscle.objective._consequences import derived_names, expand
 from jaxmuscle.response._expected import expected_moments
 from jaxmuscle.spectra._bin_law import bin_statistics
 from jaxmuscle.spectra._settings import WINDOW
@@ -198,6 +198,13 @@ def test_half_power_frequency_against_a_root_of_the_transfer_function(x64):
 
     found = brentq(lambda f: level(f) / level(1e-9) - 0.5, 1e-3, 20.0)
     assert result.derived["half_power_frequency"].value == pytest.approx(found, rel=0.05)
+
+
+def test_a_band_that_is_hardly_covered_is_left_out():
+    """Bins 0.39 Hz wide up to 8.2 Hz hold a tenth of 8 to 12 Hz, up to 10.2 Hz more than half."""
+    short, longer = (jm.Isometric(settings=jm.SpectrumSettings(last_bin=last)) for last in (21, 26))
+    assert "band_8_12" not in derived_names(short) and "band_4_8" in derived_names(short)
+    assert "band_8_12" in derived_names(longer)
 
 
 @pytest.mark.slow

@@ -36,7 +36,7 @@ from jaxmuscle.uncertainty._designs import design_information, information_of, s
 TRUTH = jm.Isometric().replace(harmonic_amplitude=0.012, harmonic_frequency=5.0)
 LOADED = TRUTH.as_task(jm.PrescribedForce, P_w=0.0)
 SEGMENTS = 24
-LEVELS = ("a second force level, 2 times as high", "a second force level, 0.5 times as high")
+LEVELS = ("a second force level 2 times as high", "a second force level 0.5 times as high")
 MOVED = ["60 s with the insertion moved by 0.1 mm rms to 10 Hz", "60 s with the insertion moved by 1 mm rms to 5 Hz"]
 AMPLITUDES = ("noise_K_w", "noise_K_z", "harmonic_amplitude")
 # Central differences with this step of a logarithm: truncation and rounding leave five digits of a slope.

@@ -97,7 +97,7 @@ def test_information_adds_up(x64):
     assert {"high_frequency_floor@low", "high_frequency_floor@high", "C_w0"} <= set(found.present.quantities)
     # A force level beyond each end, and of each target a longer recording.
     levels = [design.name for design in found.designs if "force level" in design.name]
-    assert levels == ["a second force level, 0.5 times as high (low)", "a second force level, 2 times as high (high)"]
+    assert levels == ["a second force level 0.5 times as high (low)", "a second force level 2 times as high (high)"]
     assert sum("10 times as long" in design.name for design in found.designs) == 2
     assert "low: Isometric, P_w = 4 N; high: Isometric, P_w = 8 N" in found.present.task
 

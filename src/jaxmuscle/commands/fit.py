@@ -256,6 +256,6 @@ def _fit_one(target: Any, model: Any, folder: Path, options: dict[str, Any], for
     for sentence in new:
         out.print(plain(sentence), highlight=False)
     if new and printed[0].derived != result.derived:
-        out.print("New simulations move the last digits a little: the files have the final numbers.", highlight=False)
+        out.print("The checks moved the last digits a little: the final numbers are in the files.", highlight=False)
     out.print(f"Written: {folder}/{', '.join(files)}", highlight=False, soft_wrap=True)
     return result.success

@@ -13,7 +13,7 @@ from jaxmuscle.model._parameters import PARAMETERS, USUALLY_FREE
 from jaxmuscle.model._resonant_noise import ResonantNoise
 from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.response._expected import Moments
-from jaxmuscle.spectra._fluctuations import BANDS
+from jaxmuscle.spectra._fluctuations import BANDS, EDGES
 
 from ._coordinates import Coordinates, task_at
 from ._moment_models import Linear
@@ -64,8 +64,7 @@ def derived_names(task: Any, spectrum: bool = True) -> tuple[str, ...]:
     """The derived quantities that a task has; without a spectrum among the data those of the muscle alone."""
     frequency, resonances = task.settings.frequency, sum(isinstance(n, ResonantNoise) for n in task.noise.components)
     covered = np.sum(in_bands(frequency, task.settings.resolution), axis=1) * task.settings.resolution
-    least = 0.5 * np.diff([*BANDS.values()])[:, 0]
-    bands = {name for name, enough in zip(BANDS, covered >= least, strict=True) if enough}
+    bands = {name for name, there, width in zip(BANDS, covered, np.diff(EDGES), strict=True) if there >= 0.5 * width}
     missing = set(BANDS) - bands | (set() if spectrum else OF_SPECTRUM)
     missing |= set() if task.activation is not None else {"contraction_time"}
     missing |= {"tremor_frequency", "tremor_width", "tremor_share"} if resonances < 1 else set()
@@ -77,10 +76,10 @@ def derived_names(task: Any, spectrum: bool = True) -> tuple[str, ...]:
 
 def in_bands(frequency: Any, resolution: float) -> Any:
     """How much of each bin lies in each band, from 0 to 1: a bin holds what is up to half the resolution away from it."""
-    low, high = np.array([*BANDS.values()], frequency.dtype).T[:, :, None]
-    half = 0.5 * resolution
     kind = np if isinstance(frequency, np.ndarray) else jnp
-    return kind.clip((kind.minimum(frequency + half, high) - kind.maximum(frequency - half, low)) / resolution, 0.0, 1.0)
+    edges = np.array(EDGES, frequency.dtype)[:, None]
+    below = kind.clip((edges - frequency) / resolution + 0.5, 0.0, 1.0)
+    return below[1:] - below[:-1]
 
 
 def derived(task: Any, moments: Moments, frequency: Float[Array | np.ndarray, " bins"] | None = None) -> dict[str, Any]:
@@ -112,9 +111,8 @@ def derived(task: Any, moments: Moments, frequency: Float[Array | np.ndarray, " 
         peak = at >= 0.5 * jax.lax.stop_gradient(noise.frequency)
         found[f"{name}_share"] = jnp.sum(jnp.where(peak, own, 0.0)) / whole
     proportional = moments.power / whole
-    found |= dict(
-        zip(BANDS, in_bands(jnp.asarray(at, proportional.dtype), task.settings.resolution) @ proportional, strict=True)
-    )
+    inside = in_bands(jnp.asarray(at, proportional.dtype), task.settings.resolution)
+    found |= dict(zip(BANDS, inside @ proportional, strict=True))
     found |= {
         "harmonic_share": seen["harmonic_share"],
         "harmonic_frequency": task.harmonic.frequency * jnp.ones(()),

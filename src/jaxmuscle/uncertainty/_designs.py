@@ -39,7 +39,7 @@ class Design(eqx.Module):
 
     **Arguments:**
 
-    - `name`: a noun phrase, "a second force level, 2 times as high": reports make sentences of it.
+    - `name`: a noun phrase, "a second force level 2 times as high": reports make sentences of it.
     - `task`: what is measured, at the values expected; the fitted task itself by default.
     - `segments`: Welch segments of its spectrum, of one trial or of several; as many as the target's by default; 0 for
       no new recording, only the numbers that follow.
@@ -191,7 +191,7 @@ def _designs_for(part: Part, moments: Moments, factors: tuple[float, ...], separ
     forces = {n: float(task[n]) for n in FORCES if n in task.parameter_names and float(task[n]) != 0}
     if forces:
         for factor in factors:
-            name = f"a second force level, {factor:g} times as high"
+            name = f"a second force level {factor:g} times as high"
             moved = task.replace(**{n: factor * v for n, v in forces.items()})
             designs.append(Design(name, moved, coefficient_of_variation=varying, separate=separate))
     more = tuple((LONGER - 1) * k for k in segments_of(part.target))
