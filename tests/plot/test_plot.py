@@ -16,6 +16,7 @@ from jaxmuscle._common.figures import write_figure
 from jaxmuscle.checks._recovery import Bootstrap, Recovery
 from jaxmuscle.data._target import Target, load_target
 from jaxmuscle.model._resonant_noise import ResonantNoise
+from jaxmuscle.model._rungs import on_rung
 from jaxmuscle.model._tasks import Isometric, PrescribedForce, PrescribedLength, PrescribedMotion
 from jaxmuscle.model._white_noise import BandLimitedNoise
 from jaxmuscle.plot import _fit as _plot_fit
@@ -320,7 +321,8 @@ def test_the_parts_of_a_model_with_tremor_are_areas_that_add_up_to_the_fit():
     f = result().frequency_hz
     tremor = np.where(np.abs(f - 9) < 1, 0.8, 0.0)
     parts = {"relaxation": 0.7 * (1 - tremor), "floor": 0.3 * (1 - tremor), "harmonic": 0 * f, "tremor": tremor}
-    found = result(components=parts, model="Isometric, BandLimitedNoise + ResonantNoise, activation")
+    task = on_rung(Isometric(), 2)
+    found = result(components=parts, task=task, model="Isometric, BandLimitedNoise + ResonantNoise, activation")
     figure = plot.fit(found)
     linear, logarithmic, _, _ = panels(figure)
     labels = [label for label in key(figure) if label.endswith("% of power")]
@@ -329,6 +331,46 @@ def test_the_parts_of_a_model_with_tremor_are_areas_that_add_up_to_the_fit():
     top = max(path.vertices[:, 1].max() for area in linear.collections[-3:] for path in area.get_paths())
     assert top == pytest.approx(found.fitted.max())
     assert len(logarithmic.lines) == len(linear.lines) + 3  # a line for each instead
+
+
+def of_two_resonances(tremor, **changes):
+    """A fit with so large a share of tremor, and with a second resonance."""
+    f = result().frequency_hz
+    second = np.where(f < 4, 0.13, 0.0)
+    rest = 1 - tremor - second
+    parts = {"relaxation": 0.9 * rest, "floor": 0.1 * rest, "tremor": tremor + 0 * f, "resonance_2": second}
+    task = on_rung(Isometric(), 3).replace(**({"resonance_frequency": 9.22, "resonance_2_frequency": 3.7} | changes))
+    return result(components=parts, task=task, profile=None)
+
+
+def test_the_frequencies_of_resonances_are_marked_in_the_colours_of_their_parts():
+    figure = plot.fit(of_two_resonances(0.2))
+    linear, logarithmic, _, _ = panels(figure)
+    for label, where, color in (("tremor", 9.22, plot.GREEN), ("resonance 2", 3.7, plot.PURPLE)):
+        name = f"{label} in the drive: {where:.2f} Hz"
+        assert key(figure).count(name) == 1
+        for ax in (linear, logarithmic):
+            mark = named(ax, name)
+            assert list(mark.get_xdata()) == [where] and (mark.get_marker(), mark.get_color()) == ("^", color)
+            assert [line.get_color() for line in ax.lines if list(line.get_xdata()) == [where, where]] == [color]
+    assert not any(label.startswith("harmonic") for label in key(figure))
+
+
+def test_the_words_below_a_fit_of_two_resonances_find_room_in_its_width():
+    figure = plot.fit(of_two_resonances(0.2))
+    figure.canvas.draw()
+    words = figure.legends[0].get_window_extent()
+    assert words.x0 >= 0 and words.x1 <= figure.bbox.width
+
+
+@pytest.mark.parametrize(("frequency", "share", "words"), [
+    (25.0, 0.2, ["tremor in the drive: 25.00 Hz"]), (9.22, 1e-6, []),
+])  # fmt: skip
+def test_a_tremor_outside_the_bins_or_without_power_is_not_marked_there(frequency, share, words):
+    ax = panels(plot.fit(of_two_resonances(share, resonance_frequency=frequency)))[0]
+    marks = [line for line in ax.lines if str(line.get_label()).startswith("tremor in")]
+    assert [line.get_label() for line in marks] == words
+    assert all(np.size(line.get_xdata()) == 0 for line in marks)
 
 
 def test_fit_draws_the_fitted_spectrum_twice_with_target_and_harmonic():

@@ -11,7 +11,8 @@ from ._spectra import target as draw_target
 from ._style import BLUE, GREEN, ORANGE, PURPLE, SKY, axes_or_new, styled
 
 PARTS = {"floor": ("0.75", "floor"), "relaxation": (SKY, "relaxation"), "harmonic": (ORANGE, "harmonic"),
-         "tremor": (GREEN, "tremor (whole)"), "resonance_2": (PURPLE, "second resonance (whole)")}  # fmt: skip
+         "tremor": (GREEN, "tremor (whole)"), "resonance_2": (PURPLE, "resonance 2 (whole)")}  # fmt: skip
+RHYTHMS = {"harmonic": "harmonic", "tremor": "tremor in the drive", "resonance_2": "resonance 2 in the drive"}
 LEAST = 1e-4  # share of the power below which a part is not drawn
 DECADE = 10.0  # by which a part may lie below the spectrum to be seen
 
@@ -21,7 +22,7 @@ def parts_of_power(ax: Axes, part: Any, *, log: bool, named: bool = True) -> Non
     frequency, fitted = np.asarray(part.frequency_hz), np.asarray(part.fitted)
     below = np.zeros(len(fitted))
     for name, (color, words) in PARTS.items():
-        power = fitted * np.maximum(part.components.get(name, 0.0), 0.0)
+        power = _power_of(part, name)
         total = float(np.sum(power))
         if not total > LEAST:
             continue
@@ -31,6 +32,30 @@ def parts_of_power(ax: Axes, part: Any, *, log: bool, named: bool = True) -> Non
             continue
         ax.fill_between(frequency, below, below + power, color=color, alpha=0.7, lw=0, zorder=2, label=label)
         below = below + power
+
+
+def rhythms(ax: Axes, part: Any) -> None:
+    """Marks the frequency of every rhythm that has power: of a resonance that in the drive, above its hill in the force."""
+    resonances = [noise for noise in part.task.noise.components if noise.sort == "resonance"]
+    for (name, words), rhythm in zip(RHYTHMS.items(), (part.task.harmonic, *resonances), strict=False):
+        if np.sum(_power_of(part, name)) > LEAST:
+            where = float(rhythm.frequency)
+            mark(ax, part, where, PARTS[name][0], f"{words}: {where:.2f} Hz")
+
+
+def mark(ax: Axes, part: Any, where: float, color: str, label: str) -> None:
+    """A triangle at the foot of the axes and a dashed line; of a frequency outside the bins the label alone."""
+    frequency = np.asarray(part.frequency_hz)
+    inside = frequency[0] / 2 <= where <= frequency[-1] * 1.05
+    ax.plot([where] if inside else [], [0.03] if inside else [], color=color, marker="^", ms=5, lw=0, label=label,
+            transform=ax.get_xaxis_transform(), clip_on=False, zorder=5)  # fmt: skip
+    if inside:
+        ax.axvline(where, color=color, lw=0.8, ls=(0, (4, 2)), zorder=0)
+
+
+def _power_of(part: Any, name: str) -> Any:
+    """What a part of the model holds of every bin's fitted power."""
+    return np.asarray(part.fitted) * np.maximum(part.components.get(name, 0.0), 0.0)
 
 
 @styled

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure, SubFigure
 
 from jaxmuscle._common.text import probability
 
-from ._components import parts_of_power
+from ._components import mark, parts_of_power, rhythms
 from ._spectra import target
 from ._stiffness import gain, phase, stiffness_residuals
 from ._style import (
@@ -122,6 +122,7 @@ def _spectra(ax: Axes, part: Any, *, log: bool, title: str = "") -> None:
         ax.plot(frequency, fitted, color=BLUE, label="fit", zorder=4)
         if set(part.components) - {"relaxation", "floor", "harmonic"}:
             parts_of_power(ax, part, log=log, named=not log)
+            rhythms(ax, part)
         else:
             _harmonic(ax, part, frequency, fitted)
     ax.set_title(title or ("Logarithmic" if log else "Linear"), parse_math=False)
@@ -151,12 +152,7 @@ def _harmonic(ax: Axes, part: Any, frequency: Any, fitted: Any) -> None:
     held = fitted * share > 0
     ax.fill_between(frequency, fitted * (1 - share), fitted, where=held | np.roll(held, 1) | np.roll(held, -1),
                     color=ORANGE, alpha=0.7, lw=0, zorder=2)  # fmt: skip
-    label = f"harmonic: {where:.2f} Hz, {percent} % of power"
-    inside = frequency[0] / 2 <= where <= frequency[-1] * 1.05
-    ax.plot([where] if inside else [], [0.03] if inside else [], color=ORANGE, marker="^", ms=5, lw=0, label=label,
-            transform=ax.get_xaxis_transform(), clip_on=False, zorder=5)  # fmt: skip
-    if inside:
-        ax.axvline(where, color=ORANGE, lw=0.8, ls=(0, (4, 2)), zorder=0)
+    mark(ax, part, where, ORANGE, f"harmonic: {where:.2f} Hz, {percent} % of power")
 
 
 def _residuals(ax: Axes, part: Any, verdict: tuple[str, float | None] = ("", None)) -> None:
