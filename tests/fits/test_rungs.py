@@ -11,7 +11,9 @@ from scipy.optimize import brentq
 
 import jaxmuscle as jm
 from jaxmuscle.fits._adequacy import Endpoint
+from jaxmuscle.fits._checks import twitch_notices
 from jaxmuscle.fits._ladder import criterion, told_apart
+from jaxmuscle.fits._part import Estimate
 from jaxmuscle.model._rungs import RUNGS
 from jaxmuscle.objective._arguments import COEFFICIENTS, FitOptions, planned
 from jaxmuscle.objective._consequences import derived_names, expand
@@ -162,6 +164,44 @@ def test_alike_is_said_and_different_is_said():
     assert "cannot be told apart" in told_apart(-100.0, -101.9)
     assert "prefer the line" in told_apart(-110.0, -101.0)
     assert "prefer the resonance" in told_apart(-100.0, -120.0)
+
+
+# --- is the twitch one of human muscle?
+
+
+@pytest.mark.parametrize(("interval", "words"), [
+    ((0.15, 0.31), "(0.15 to 0.31 s) is longer than in human muscle, 0.05 to 0.11 s: it also takes up"),
+    ((0.111, None), "(above 0.111 s) is longer"),
+    ((0.01, 0.049), "(0.01 to 0.049 s) is shorter than in human muscle, 0.05 to 0.11 s: the relaxation"),
+    ((None, 0.03), "(below 0.03 s) is shorter"),
+    ((0.09, 0.31), ""),
+    ((0.01, 0.06), ""),
+    ((None, 0.31), ""),
+    (None, ""),
+])  # fmt: skip
+def test_a_contraction_time_that_no_human_twitch_has_is_told(interval, words):
+    whole = Estimate(0.6, "Hz", 0.1, interval=(0.4, 0.8))
+    told = twitch_notices({"contraction_time": Estimate(0.2, "s", 0.03, interval=interval), "half_power_frequency": whole})
+    assert len(told) == bool(words)
+    assert all(words in one and one.startswith("contraction_time (") for one in told)
+    assert all("What to do: report half_power_frequency" in one for one in told)
+
+
+def test_no_remedy_names_what_the_fit_does_not_have():
+    slow = Estimate(0.2, "s", 0.03, interval=(0.15, 0.31))
+    (told,) = twitch_notices({"contraction_time@a": slow, "contraction_time@b": Estimate(0.2, "s", interval=(0.15, 0.31))})
+    assert told.startswith("contraction_time@a ") and "half_power_frequency" not in told
+    assert "What to do: hold activation_time" in told
+
+
+@pytest.mark.slow
+def test_a_slow_twitch_is_told_by_the_fit():
+    """A twitch of 0.25 s and ten times as many segments as above, so that the interval excludes that of human muscle."""
+    task = jm.on_rung(TASK, 2).replace(activation_time=0.25, noise_K_z=5e-4, **TREMOR)
+    result = jm.fit(task, drawn(expected(task), 900, 1), **QUICK)
+    low, _ = result.derived["contraction_time"].interval or (None, None)
+    assert low is not None and low > 0.11
+    assert any(notice.startswith("contraction_time (") for notice in result.notices)
 
 
 # --- what it gives

@@ -7,6 +7,7 @@ import jax
 import numpy as np
 
 from jaxmuscle.data._target import Target
+from jaxmuscle.objective._arguments import base_of
 from jaxmuscle.objective._consequences import BATCH, Expansion, consequences, expand, quantities
 from jaxmuscle.objective._covariance import Identifiability
 from jaxmuscle.objective._least_squares import SMALL, Minima
@@ -25,6 +26,11 @@ MISSED = 3.0
 NONLINEAR = 0.1
 LEFT = 1e-3
 RISEN = 1.5
+TWITCH = (0.05, 0.11)  # s; its source stands in the row of activation_time in the parameter table
+SLOW = ("it also takes up what else is slow: the nervous drive, the relaxation of the muscle, a low-pass filter of the "
+        "recording")  # fmt: skip
+FAST = ("the relaxation of the muscle smooths the force in the same way and may have taken its place. Or power at high "
+        "frequencies comes from elsewhere, as from the sensor")  # fmt: skip
 
 
 class Stage(NamedTuple):
@@ -185,6 +191,23 @@ def further_notices(further: Mapping[str, float]) -> tuple[str, ...]:
     return tuple(f"the fitted {words[name]} is {abs(off):.1f} standard deviations {'above' if off > 0 else 'below'} the "
                  "given one: the model cannot have both it and the spectrum" for name, off in further.items()
                  if abs(off) > MISSED)  # fmt: skip
+
+
+def twitch_notices(found: Mapping[str, Estimate]) -> tuple[str, ...]:
+    """The notice of a contraction time whose interval lies outside the range of human muscle."""
+    instead = "report half_power_frequency, which holds twitch and relaxation together, or "
+    instead *= any(base_of(name) == "half_power_frequency" for name in found)
+    said = []
+    for name, p in found.items():
+        if base_of(name) != "contraction_time" or p.stderr is None or p.interval is None:
+            continue
+        low, high = p.interval
+        slow, fast = low is not None and low > TWITCH[1], high is not None and high < TWITCH[0]
+        if slow or fast:
+            said.append(f"{name} ({p.interval_in_words()} s) is {'longer' if slow else 'shorter'} than in human muscle, "
+                        f"{TWITCH[0]:g} to {TWITCH[1]:g} s: {SLOW if slow else FAST}. Do not report it as that of the "
+                        f"muscle. What to do: {instead}hold activation_time at a value that you know")  # fmt: skip
+    return tuple(said)
 
 
 def notices_of(target: Any, statistics: BinStatistics, check: dict[str, float | int], left: float) -> tuple[str, ...]:

@@ -37,6 +37,7 @@ from ._checks import (
     polish_check,
     polish_notices,
     rivals,
+    twitch_notices,
     unsettled,
 )
 from ._harmonic_evidence import harmonic_test
@@ -151,7 +152,15 @@ def report_fit(
         singular_values=known.singular_values,
         profile=None if line_test is None else (line_test.frequency, line_test.rise),
         harmonic_p_value=None if line_test is None else line_test.p_value,
-        notices=(*notices, *other, *polish_notices(polish), *of_several(parts), *unsimulated(plan, stages), *beyond),
+        notices=(
+            *notices,
+            *other,
+            *twitch_notices(derived),
+            *polish_notices(polish),
+            *of_several(parts),
+            *unsimulated(plan, stages),
+            *beyond,
+        ),
         **common,
     )
 
