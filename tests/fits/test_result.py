@@ -239,6 +239,16 @@ def test_text_shows_what_is_known_and_what_is_not():
     assert str(failed_result()).startswith("Not fitted: no start has a finite spectrum")
 
 
+def test_text_counts_trials_and_segments_and_tells_how_much_the_trials_differ():
+    def printed(**given):
+        return str(made_result(target=jm.Target("made", POWER, **given))).splitlines()
+
+    assert "  2 trials, 13 Welch segments" in printed(segments=[6, 7])
+    alike = "  2 trials, 13 Welch segments, dispersion 1.12 ± 0.08 (1 if they are alike)"
+    assert alike in printed(segments=[6, 7], dispersion=[1.12, 0.08])
+    assert not any("trials" in line for given in ({}, {"segments": [12]}) for line in printed(**given))
+
+
 def test_a_fit_that_misses_the_data_says_so_first():
     missed = Adequacy(145.0, 25.0, 0.001, "the data have more power than the model from 7 to 9 Hz (12.0 standard errors)")
     found = made_result(adequacy=missed, chi2_per_bin=5.0)

@@ -7,6 +7,7 @@ import numpy as np
 
 from jaxmuscle._common.cards import Card
 from jaxmuscle._common.text import folded
+from jaxmuscle.data._target import Target
 from jaxmuscle.model._parameters import PARAMETERS
 from jaxmuscle.objective._arguments import base_of
 from jaxmuscle.objective._consequences import BANDS, MEANINGS
@@ -55,9 +56,10 @@ def text_of(result: "FitResult") -> str:
     single = len(result.parts) == 1
     lines = [_heading(result), f"  {_head(result)}"]
     lines += [f"  {result.message}"] * result.success
-    lines += [f"  {HEAD}", *(f"  {rung}" for rung in result.ladder)] if len(result.ladder) > 1 else []
     if not single:
         lines += [f"  {name}: {p.target.name}, {p.model}{_closeness(p, ', ')}" for name, p in result.parts.items()]
+    lines += [f"  {'' if single else f'{name}: '}{words}" for name, p in result.parts.items() for words in _trials(p.target)]
+    lines += [f"  {HEAD}", *(f"  {rung}" for rung in result.ladder)] if len(result.ladder) > 1 else []
     lines += [f"  {sentence}" for sentence in result.advice]
     lines += [f"  note: {notice}" for notice in result.notices]
     if single and result.rms_log_error is not None:
@@ -145,6 +147,17 @@ def _closeness(part: FittedPart, before: str = "", *, verdict: str = "") -> str:
     off = part.rms_log_error
     said += [] if off is None else [f"rms log error {off:.3f} (bins are off by a factor of {np.exp(off):.2f})"]
     return before * bool(said) + ", ".join(said)
+
+
+def _trials(target: Target) -> list[str]:
+    """How many trials and segments were averaged, and how much the trials differ; nothing of a single trial."""
+    if target.segments is None or len(target.segments) < 2:
+        return []
+    counted = f"{len(target.segments)} trials, {sum(target.segments)} Welch segments"
+    if target.dispersion is None:
+        return [counted]
+    spread = " ± ".join(f"{number:.2f}" for number in target.dispersion[:2])
+    return [f"{counted}, dispersion {spread} (1 if they are alike)"]
 
 
 def _stiffness(part: FittedPart) -> list[str]:
