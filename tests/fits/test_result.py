@@ -249,6 +249,13 @@ def test_text_counts_trials_and_segments_and_tells_how_much_the_trials_differ():
     assert not any("trials" in line for given in ({}, {"segments": [12]}) for line in printed(**given))
 
 
+def test_the_text_and_the_report_say_what_a_richer_model_gains():
+    said = "with activation the AIC falls by 9.9 (chi2 per bin 0.90 instead of 1.90)"
+    found = made_result()
+    assert f"  {said}" in str(found).splitlines() and said in found.summary().remarks
+    assert not any("AIC" in words for words in (str(made_result(ladder=())), *made_result(ladder=()).summary().remarks))
+
+
 def test_a_fit_that_misses_the_data_says_so_first():
     missed = Adequacy(145.0, 25.0, 0.001, "the data have more power than the model from 7 to 9 Hz (12.0 standard errors)")
     found = made_result(adequacy=missed, chi2_per_bin=5.0)

@@ -12,7 +12,7 @@ from scipy.optimize import brentq
 import jaxmuscle as jm
 from jaxmuscle.fits._adequacy import Endpoint
 from jaxmuscle.fits._checks import twitch_notices
-from jaxmuscle.fits._ladder import criterion, told_apart
+from jaxmuscle.fits._ladder import Rung, criterion, gains, told_apart
 from jaxmuscle.fits._part import Estimate
 from jaxmuscle.model._rungs import RUNGS
 from jaxmuscle.objective._arguments import COEFFICIENTS, FitOptions, planned
@@ -116,6 +116,8 @@ def test_a_tremor_is_climbed_to_and_found():
     assert found.stderr is not None and abs(found.value - 9.0) < 3 * found.stderr < 1.5
     text = str(result)
     assert "models tried" in text and "-> 2 with tremor instead of the harmonic" in text
+    poorer, words = result.ladder[1], " ".join(text.split())
+    assert f"with tremor instead of the harmonic the AIC falls by {poorer.aic - chosen.aic:.1f} (chi2 per bin" in words
 
 
 @pytest.mark.slow
@@ -164,6 +166,40 @@ def test_alike_is_said_and_different_is_said():
     assert "cannot be told apart" in told_apart(-100.0, -101.9)
     assert "prefer the line" in told_apart(-110.0, -101.0)
     assert "prefer the resonance" in told_apart(-100.0, -120.0)
+
+
+# --- what a part gains
+
+
+def tried(*aics: tuple[int, float], chosen: int) -> tuple[Rung, ...]:
+    """Models of these numbers and AICs; the chi² of each is a tenth of the distance of its AIC from -100."""
+    return tuple(Rung(n, f"{n}", aic, 5.0, (aic + 100) / 10, 0.3, n == chosen) for n, aic in aics)
+
+
+def test_every_part_of_the_chosen_model_says_what_it_gains_over_the_poorer_one():
+    said = gains(tried((0, -10.0), (1, -60.0), (2, -59.5), (3, -90.0), chosen=2), describes=True)
+    assert said[:-1] == (
+        "with activation the AIC falls by 50.0 (chi2 per bin 4.00 instead of 9.00)",
+        "with tremor instead of the harmonic the AIC rises by 0.5 (chi2 per bin 4.05 instead of 4.00)",
+    )
+    assert "2 or less says nothing" in said[-1] and "no p-value" in said[-1] and "No model" not in said[-1]
+
+
+def test_what_was_not_tried_is_counted_with_the_next_model():
+    (gain, _) = gains(tried((0, -10.0), (2, -60.0), chosen=2), describes=True)
+    assert gain.startswith("with activation and with tremor instead of the harmonic the AIC falls by 50.0 (")
+    (gain, _) = gains(tried((-1, -10.0), (0, -20.0), chosen=0), describes=True)
+    assert gain.startswith("with a harmonic the AIC falls by 10.0 (")
+
+
+def test_nothing_is_gained_where_the_simplest_model_was_chosen_or_only_one_was_fitted():
+    assert gains(tried((0, -10.0), (2, -10.5), chosen=0), describes=True) == ()
+    assert gains(tried((2, -10.0), chosen=2), describes=True) == gains((), describes=None) == ()
+
+
+def test_where_no_model_describes_the_data_a_lower_aic_does_not_show_a_part():
+    *_, meaning = gains(tried((0, -10.0), (1, -60.0), chosen=1), describes=False)
+    assert "No model that was tried describes the data" in meaning and "not that the muscle has this part" in meaning
 
 
 # --- is the twitch one of human muscle?

@@ -1,6 +1,7 @@
 """The ladder: richer models, one after the other, until one describes the data."""
 
 import dataclasses
+import itertools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -13,7 +14,7 @@ from jaxmuscle._common.text import probability
 from jaxmuscle.model._noise import NoiseSum
 from jaxmuscle.model._parameters import HARMONIC, default
 from jaxmuscle.model._resonant_noise import ResonantNoise
-from jaxmuscle.model._rungs import on_rung, rung_name
+from jaxmuscle.model._rungs import QUIET, on_rung, rung_name
 from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.objective._arguments import FitOptions, Plan
 from jaxmuscle.objective._covariance import effective_parameters
@@ -60,6 +61,32 @@ class Climbed(NamedTuple):
     known: Any
     ended: Endpoint
     rung: Rung
+
+
+def gains(ladder: tuple[Rung, ...], *, describes: bool | None) -> tuple[str, ...]:
+    """What every part of the chosen model gains over the model before it, in sentences; and what such a number says.
+
+    `describes`: whether the chosen model describes the data.
+    """
+    number = next((rung.number for rung in ladder if rung.chosen), QUIET)
+    climbed = [rung for rung in ladder if rung.number <= number]
+    said = tuple(_gain(before, after) for before, after in itertools.pairwise(climbed))
+    if not said:
+        return ()
+    meaning = ("the AIC weighs the fit against the number of parameters; the lower, the better. A difference of "
+               f"{ALIKE:g} or less says nothing. It is no p-value")  # fmt: skip
+    if describes is False:
+        meaning += (". No model that was tried describes the data: then a lower AIC says that a model misses less, not that "
+                    "the muscle has this part")  # fmt: skip
+    return (*said, meaning)
+
+
+def _gain(before: Rung, after: Rung) -> str:
+    """AIC and chi² of a model against those of a poorer one."""
+    added = " and ".join("with a harmonic" if n == 0 else rung_name(n) for n in range(before.number + 1, after.number + 1))
+    change = after.aic - before.aic
+    return (f"{added} the AIC {'falls' if change < 0 else 'rises'} by {abs(change):.1f} (chi2 per bin "
+            f"{after.chi2_per_bin:.2f} instead of {before.chi2_per_bin:.2f})")  # fmt: skip
 
 
 def options_for(task: AbstractTask, options: FitOptions) -> FitOptions:

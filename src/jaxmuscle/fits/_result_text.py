@@ -13,7 +13,7 @@ from jaxmuscle.objective._arguments import base_of
 from jaxmuscle.objective._consequences import BANDS, MEANINGS
 from jaxmuscle.objective._covariance import spelt
 
-from ._ladder import HEAD
+from ._ladder import HEAD, gains
 from ._part import Estimate, FittedPart
 
 if TYPE_CHECKING:
@@ -39,7 +39,7 @@ def card_of(result: "FitResult") -> Card:
         rows.append((name, p.in_words(), p.interval_in_words(), unit, state, words))
     order = ("determined", "not determined", "fixed")
     rows.sort(key=lambda row: order.index(row[4]))
-    remarks = (f"{_head(result)}: {result.message}", *result.advice, *result.notices, *result.remarks)
+    remarks = (f"{_head(result)}: {result.message}", *_gains(result), *result.advice, *result.notices, *result.remarks)
     return Card(text_of(result), _heading(result), COLUMNS, tuple(rows), remarks)
 
 
@@ -60,6 +60,7 @@ def text_of(result: "FitResult") -> str:
         lines += [f"  {name}: {p.target.name}, {p.model}{_closeness(p, ', ')}" for name, p in result.parts.items()]
     lines += [f"  {'' if single else f'{name}: '}{words}" for name, p in result.parts.items() for words in _trials(p.target)]
     lines += [f"  {HEAD}", *(f"  {rung}" for rung in result.ladder)] if len(result.ladder) > 1 else []
+    lines += [f"  {sentence}" for sentence in _gains(result)]
     lines += [f"  {sentence}" for sentence in result.advice]
     lines += [f"  note: {notice}" for notice in result.notices]
     if single and result.rms_log_error is not None:
@@ -147,6 +148,11 @@ def _closeness(part: FittedPart, before: str = "", *, verdict: str = "") -> str:
     off = part.rms_log_error
     said += [] if off is None else [f"rms log error {off:.3f} (bins are off by a factor of {np.exp(off):.2f})"]
     return before * bool(said) + ", ".join(said)
+
+
+def _gains(result: "FitResult") -> tuple[str, ...]:
+    """What the parts of the chosen model gain, where several models were tried."""
+    return gains(result.ladder, describes=result.adequate)
 
 
 def _trials(target: Target) -> list[str]:
