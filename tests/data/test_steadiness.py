@@ -15,6 +15,7 @@ import scipy.stats
 import jaxmuscle as jm
 from jaxmuscle.data._steadiness import RANGES, _error, _own, _peak, _segments
 from jaxmuscle.objective._consequences import derived_names
+from jaxmuscle.spectra._bin_law import student
 from jaxmuscle.spectra._fluctuations import dfa
 from jaxmuscle.spectra._measures import approximate_entropy, sample_entropy
 
@@ -147,6 +148,17 @@ def test_three_trials_scatter_and_two_do_not(found):
         assert two[name].value == pytest.approx(np.mean(values))
         assert two[name].stderr == pytest.approx(np.hypot(*errors) / 2)
         assert two[name].error_from == two.trials["trial 0"][name].error_from
+
+
+def test_the_interval_is_that_of_student(found):
+    """With t the interval holds the expected value in 95 % of a thousand people with five trials, with 1.96 in 88 %."""
+    text = " ".join(str(found).split())
+    assert "between the 3 trials" in text and "A 95 % interval is ± 4.3 of it (Student's t)" in text
+    assert "Student" not in str(jm.steadiness(trials()[:2]))
+    values = forces(5000, 10.0, seed=4).std(axis=1).reshape(1000, 5)
+    far = np.abs(values.mean(axis=1) - values.mean()) / scipy.stats.sem(values, axis=1)
+    held, too_few = (scipy.stats.binomtest(int(np.sum(far < reach)), 1000, 0.95).pvalue for reach in (student(5), 1.96))
+    assert held > 1e-3 > 1e-9 > too_few
 
 
 def test_the_peak_is_the_tremor(found):

@@ -7,11 +7,13 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 import scipy.signal
+import scipy.stats
 
 import jaxmuscle as jm
 from jaxmuscle._common.errors import TargetError
 from jaxmuscle.data._as_target import as_target, is_recording
-from jaxmuscle.spectra._bin_law import bin_statistics
+from jaxmuscle.objective._problem import target_variation
+from jaxmuscle.spectra._bin_law import bin_statistics, mean_error
 
 RATE, SECONDS, LEVEL = 200, 15.0, 40.5
 
@@ -134,6 +136,37 @@ def test_mean_force_and_its_error():
     assert predicted == pytest.approx(means.std(), rel=4 / np.sqrt(2 * 200) + 0.1)  # the sum over bins leaves out bin 0
     several = trials(rng, 4).target()
     assert several.mean_force[1] >= np.std(several.mean, ddof=1) / 2 * 0.999
+
+
+@pytest.mark.parametrize("count", [3, 5, 10])
+def test_the_error_by_the_scatter_of_trials_has_students_t(count):
+    """± 1.96 of it hold the mean in 95 %. It counts where it is larger than what is expected."""
+    draws = np.random.default_rng(count).standard_normal((4000, count))
+    errors = np.array([mean_error(each, 0.0) for each in draws])
+    held = np.sum(np.abs(draws.mean(axis=1)) < 1.96 * errors)
+    assert scipy.stats.binomtest(int(held), 4000, 0.95).pvalue > 1e-3
+    t = scipy.stats.t.ppf(0.975, count - 1) / 1.96
+    sem = scipy.stats.sem(draws[0])
+    assert (
+        mean_error(draws[0], 0.99 * sem) == pytest.approx(t * sem, rel=1e-6)
+        and mean_error(draws[0], 1.01 * sem) == 1.01 * sem
+    )
+    traced = jax.jit(lambda expected: mean_error(draws[0], expected))
+    assert float(traced(0.0)) == pytest.approx(t * sem, rel=1e-5) and float(traced(9.0)) == 9.0
+
+
+def test_one_trial_has_no_scatter_and_two_have_it_without_t():
+    two = np.array([1.0, 2.0])
+    assert mean_error(two[:1], 0.3) == 0.3 and mean_error(two, 0.3) == pytest.approx(0.5)
+
+
+def test_trials_that_differ_widen_the_error_of_their_variation():
+    alike, unlike = (0.02 * np.exp(spread * np.array([-1.0, -0.5, 0.0, 0.5, 1.0])) for spread in (1e-3, 0.5))
+    made = [jm.Target("x", np.ones(30), segments=[10] * 5, coefficient_of_variation=v.tolist()) for v in (alike, unlike)]
+    (_, expected), (_, wide) = map(target_variation, made)
+    t = scipy.stats.t.ppf(0.975, 4) / 1.96
+    assert scipy.stats.sem(np.log(alike)) < expected < scipy.stats.sem(np.log(unlike))
+    assert wide == pytest.approx(t * scipy.stats.sem(np.log(unlike)), rel=1e-6)
 
 
 @pytest.mark.parametrize(("unit", "known"), [("kN", True), ("% MVC", False), ("N m", False), ("mm", False)])

@@ -19,6 +19,7 @@ from jaxmuscle.fits._adequacy import Adequacy
 from jaxmuscle.fits._fit_file import FORMAT
 from jaxmuscle.fits._ladder import Rung
 from jaxmuscle.fits._part import Start
+from jaxmuscle.fits._result_text import card_of
 from jaxmuscle.model._task_tables import task_from_table, task_to_table
 
 POWER = 1 / (1 + np.arange(1, 31) ** 2)
@@ -159,6 +160,22 @@ def test_a_result_as_a_table():
     bins = result.only.to_dataframe()
     np.testing.assert_array_equal(bins["fitted"], result.fitted)
     np.testing.assert_array_equal(bins["frequency_hz"], TARGET.frequency)
+
+
+@pytest.mark.parametrize("whose", ["", "@a"])
+@pytest.mark.parametrize("free", [True, False])
+def test_a_tremor_is_listed_once_by_the_name_that_people_use(free, whose):
+    frequency = Estimate(9.0, "Hz", 0.2 if free else None, free, free or None)
+    result = made_result(
+        parameters={f"resonance_frequency{whose}": frequency, "harmonic_frequency": frequency, "m_w": Estimate(1.0, "kg")},
+        derived={f"tremor_frequency{whose}": frequency, "harmonic_frequency": frequency, "mean": Estimate(2.5, "N")},
+    )
+    kinds = result.to_dataframe().set_index("quantity")["kind"].to_dict()
+    assert kinds == {"harmonic_frequency": "parameter", "m_w": "parameter", f"tremor_frequency{whose}": "parameter",
+                     "mean": "derived"}  # fmt: skip
+    names = [row[0] for row in card_of(result).rows]
+    assert f"tremor_frequency{whose}" in names and f"resonance_frequency{whose}" not in names
+    assert result[f"resonance_frequency{whose}"] == frequency  # by either name
 
 
 def test_the_table_of_a_failed_fit_has_numbers_in_its_columns_of_numbers():

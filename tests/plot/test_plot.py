@@ -769,6 +769,32 @@ def test_words_are_legible_in_a_column_of_a_journal_and_do_not_touch(draw):
     assert small_words(draw()) == ([], [], [])
 
 
+@pytest.mark.parametrize("power", [1.0, 1e-6], ids=["fractions", "small"])
+@pytest.mark.parametrize("draw", [plot.spectrum, plot.target, plot.fit, plot.components])
+def test_no_number_of_a_logarithmic_axis_has_a_small_exponent(draw, power):
+    """Mathematics and raised digits are drawn at 0.7 of the letters or less: 4.3 points in a column of 85 mm."""
+    if draw is plot.spectrum:
+        figure = draw(Spectrum(F, power * 1e-3 / (1 + F**2) ** 2, SETTINGS, "N"), log=True, proportional=False).figure
+    elif draw is plot.target:
+        figure = draw(Target("t", power + 1 / (1 + F**2), segments=12), log=True).figure
+    else:
+        figure = draw(result()) if draw is plot.fit else draw(result(), log=True).figure
+    figure.canvas.draw()
+    numbers = []
+    for axis in (axis for ax in figure.axes for axis in (ax.xaxis, ax.yaxis) if axis.get_scale() == "log"):
+        low, high = sorted(axis.get_view_interval())
+        ticks = [*axis.get_major_ticks(), *axis.get_minor_ticks()]
+        numbers.append([tick.label1.get_text() for tick in ticks if low <= tick.get_loc() <= high])
+    assert len(numbers) > 1 and all(len([n for n in own if n]) > 1 for own in numbers)
+    for number in filter(None, (n for own in numbers for n in own)):
+        assert float(number.replace("\N{MINUS SIGN}", "-")) > 0
+
+
+def test_numbers_of_axes():
+    values = (20.0, 0.0005, 5e-5, 2e6)
+    assert [_plot_numbers.number_in_print(v) for v in values] == ["20", "0.0005", "5e\N{MINUS SIGN}5", "2e6"]
+
+
 def test_small_singular_values_are_counted_and_the_legend_says_so():
     figure = plot.identifiability(identified())
     upper = figure.axes[0]

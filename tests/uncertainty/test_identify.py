@@ -299,6 +299,11 @@ def test_the_usual_designs(result, names):
         assert (design.separate == AMPLITUDES) is design.name.startswith("a second force level")
 
 
+def test_no_design_is_above_the_maximal_force():
+    names = [[d.name for d in jm.standard_designs(fitted(mvc_fraction=level))] for level in (0.5, 0.6)]
+    assert set(names[0]) - set(names[1]) == {LEVELS[0]} and LEVELS[1] in names[1]
+
+
 # --- the report
 
 
@@ -346,9 +351,24 @@ def test_the_report_in_words():
     assert "the displacement under a load of 2.18 N would determine" in said and f"K_w0 to {percent}" in said
     assert "noise_K_w, noise_K_z, harmonic_amplitude of its own" in said
     assert "k_w to" not in said  # K_w0 says it
-    assert said.endswith("nothing stays open")  # with the insertion moved by 1 mm
+    assert "mm rms to 5 Hz together with a recording 10 times as long: nothing stays open - no design knows fatigue" in said
     for sentence in report().present.undetermined:
         assert sentence in said
+
+
+def test_the_report_names_what_it_knows_and_the_fit_does_not():
+    sure, unsure = jm.fits.Estimate(1.0, "Hz", 0.1), jm.fits.Estimate(1.0, "Hz", None, True, False)
+    quantities = {"corner_frequency": sure, "harmonic_share": unsure, "K_w0": unsure, "mean": unsure}
+    result = eqx.tree_at(lambda r: r.derived, fitted(), quantities, is_leaf=lambda x: isinstance(x, dict))
+    found = jm.identifiability(result, designs=())
+    known = found.present.quantities
+    assert known["harmonic_share"].determined and not known["K_w0"].determined
+    assert "harmonic_share" in found.open_in_fit and not {"corner_frequency", "K_w0"} & set(found.open_in_fit)
+    said = " ".join(str(found).split())
+    assert f"known here, but not determined in the fit: {', '.join(found.open_in_fit)}. The fit is stricter" in said
+    assert found.to_dict()["not_determined_in_fit"] == list(found.open_in_fit)
+    other = jm.identifiability(result, result.target, designs=())  # of another target the fit has said nothing
+    assert not other.open_in_fit and "not determined in the fit" not in str(other)
 
 
 def test_the_numbers_in_the_table_are_those_of_the_report():

@@ -248,13 +248,16 @@ def test_the_standard_designs_know_what_a_flat_motion_tells():
     designs = [d for d in jm.standard_designs(fitted()) if d.lengthening is not None]
     report = jm.identifiability(fitted(), designs=designs)
     assert [d.name for d in report.designs] == MOVED
-    (small, large), made = report.designs, designed()
+    usual = inspect.signature(jm.design_input).parameters["band"].default
+    bands = [(d.lengthening.frequency[0], d.lengthening.frequency[-1]) for d in designs]
+    assert bands == [(0.5, 10.0), pytest.approx(usual)] and usual[0] == 0.5
+    (small, large), made = report.designs, designed(band=usual)
     assert {"K_w0", "K_z0", "C_w0", "C_z0"} <= set(large.gained)
     for name in ("K_w0", "K_z0", "C_w0", "C_z0"):
         assert large.quantities[name].stderr == pytest.approx(made.flat[name], rel=1e-6)
         assert small.quantities[name].stderr > large.quantities[name].stderr
     assert large.task == "PrescribedLength, P_w = 5 N"
-    assert large.data.endswith("response to a lengthening of 1 mm rms, 0.1 to 5 Hz, for 60 s")
+    assert large.data.endswith("response to a lengthening of 1 mm rms, 0.5 to 5 Hz, for 60 s")
 
 
 @pytest.mark.slow
@@ -311,7 +314,7 @@ def test_in_words():
     said = " ".join(text.split())
     assert f"would tell K_w0 to {100 * designed().stderr['K_w0'] / designed().values['K_w0']:.2g} %" in said
     assert f"with it the relative variance of K_w0 is {designed().gain:.2g} times as large" in said
-    assert "A reflex can change K_w0" in said and "also fits m_z" in said
+    assert "A reflex can change K_w0" in said and "also fits m_z" in said and "no fatigue. Split a long" in said
     assert "1 mm rms, peak" in said and "most of the motion: 81 % at 0.7 to 0.93 Hz" in said
 
 

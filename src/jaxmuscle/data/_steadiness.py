@@ -16,6 +16,7 @@ from jaxmuscle._common.environment import versions
 from jaxmuscle._common.files import nulled, write_json
 from jaxmuscle._common.tables import frame
 from jaxmuscle._common.text import choices, folded, rounded, squared
+from jaxmuscle.spectra._bin_law import ENOUGH, student
 from jaxmuscle.spectra._fluctuations import BANDS, dfa, variance_spectrum
 from jaxmuscle.spectra._measures import regularity
 from jaxmuscle.spectra._settings import require
@@ -29,7 +30,6 @@ if TYPE_CHECKING:
 
 
 ALL = "all"
-ENOUGH = 3  # trials, for the scatter between them to give the errors
 PARTS, SLOWEST = 4, 4  # parts of a recording; ordinates that say how sure its mean is
 ALIKE = 1.2  # longest trial over shortest
 TREMOR, RISE, HALF = 6.0, 4.0, 3  # Hz; standard deviations of a bin; bins on either side
@@ -118,11 +118,18 @@ class Steadiness(Printed, Result, eqx.Module):
         lines[5:5] = ["power by band, and its share of the variance"]
         lines[6:6] = [f"  {_range(*edges):<26}{said[f'power{name}']:<25} {said[f'share{name}']}"
                       for name, edges in RANGES.items()]  # fmt: skip
-        errors = (f"± is the standard error, from the scatter between the {count} trials." if count >= ENOUGH else
-                  "± is the standard error, from within the recording: of entropies and DFA from its four parts, of the "
-                  "peak from its Welch segments, of all else from its spectrum.")  # fmt: skip
         head = f"Steadiness of {what}: {self.quantity or 'signal'} [{self.unit}], {long}"
-        return folded([head, *lines, errors, *(f"notice: {notice}" for notice in self.notices)])
+        return folded([head, *lines, _of_errors(count), *(f"notice: {notice}" for notice in self.notices)])
+
+
+def _of_errors(count: int) -> str:
+    """What the errors contain, and how an interval follows from them."""
+    if count < ENOUGH:
+        return ("± is the standard error, from within the recording: of entropies and DFA from its four parts, of the peak "
+                "from its Welch segments, of all else from its spectrum.")  # fmt: skip
+    return (f"± is the standard error, from the scatter between the {count} trials. A 95 % interval is ± "
+            f"{student(count):.2g} of it (Student's t). A fit's errors may be larger: it takes the trials to scatter at "
+            "least as much as chance makes them.")  # fmt: skip
 
 
 def _plain(measures: dict[str, Measure]) -> dict[str, Any]:
@@ -178,7 +185,9 @@ def steadiness(recordings: Recording | Iterable[Recording]) -> Steadiness:
     **Standard errors**, by the number of trials:
 
     - Three or more, "trials": the standard deviation between the trials over √n; of the peak, the jackknife over trials. For
-      a 95 % interval use Student's t with n - 1 degrees of freedom.
+      a 95 % interval use Student's t with n - 1 degrees of freedom: ± 4.3 errors of three trials, 2.8 of five, 2.3 of ten.
+      A fit takes the larger of this scatter, with that t, and of what trials of this length scatter by chance: five trials
+      may happen to agree.
     - One or two, "spectrum": the ordinates of the spectrum are independent, with variance 2/3 of their square, as in a
       stationary Gaussian signal; of the mean, from the four slowest. What is slower than the recording is not in it: where
       the level wanders, the mean of the next trial differs by more.

@@ -15,7 +15,7 @@ from jaxmuscle._common.cards import Card, Shown, facts
 from jaxmuscle._common.errors import TargetError
 from jaxmuscle._common.files import write_text
 from jaxmuscle._common.units import NEWTONS
-from jaxmuscle.spectra._bin_law import bin_statistics, dispersion_of, trial_samples
+from jaxmuscle.spectra._bin_law import bin_statistics, dispersion_of, mean_error, trial_samples
 from jaxmuscle.spectra._settings import SpectrumSettings
 
 from . import _target_fields as check
@@ -150,9 +150,10 @@ class Target(Shown, eqx.Module):
     def mean_force(self) -> tuple[float, float] | None:
         """Mean force and its standard error [N]; `None` without a mean in newtons.
 
-        The error: that of the trials' scatter and that of a recording of this length, whichever is larger. The latter from
-        the density S₁ in the lowest bin, `√(S₁ / 2T)`, T the time recorded; 2 % of the mean where the target does not
-        state segments and coefficient of variation, and at least 0.2 %.
+        The error: that of the trials' scatter and that of a recording of this length, whichever is larger. The former with
+        Student's t, so that ± 1.96 of it hold 95 % (of three trials or more). The latter from the density S₁ in the lowest
+        bin, `√(S₁ / 2T)`, T the time recorded; 2 % of the mean where the target does not state segments and coefficient of
+        variation, and at least 0.2 %.
         """
         if self.mean is None or self.unit not in NEWTONS or self.quantity != "force":
             return None
@@ -164,8 +165,7 @@ class Target(Shown, eqx.Module):
             )
             time = len(self.segments) * trial_samples(self) / self.settings.rate
             relative = np.sqrt(density / (2 * time))
-        scatter = means.std(ddof=1) / np.sqrt(len(means)) if len(means) > 1 else 0.0
-        return float(means.mean()), float(max(scatter, max(relative, LEAST_MEAN_ERROR) * means.mean()))
+        return float(means.mean()), float(mean_error(means, max(relative, LEAST_MEAN_ERROR) * means.mean()))
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write TOML that `load_target` reads back equal; an existing file is replaced in one step.

@@ -28,7 +28,7 @@ from ._adequacy import Adequacy
 from ._fit_file import FORMAT, FORMATS, FitTable, PartTable, disagreement
 from ._ladder import Rung
 from ._part import Estimate, FittedPart, Start, estimates_to_table, part_to_table, read_estimates, read_part
-from ._result_text import card_of, in_use, per_newton
+from ._result_text import card_of, in_use, once, per_newton
 
 if TYPE_CHECKING:
     import pandas
@@ -94,12 +94,15 @@ class FitResult(Result, eqx.Module):
     def to_dataframe(self) -> "pandas.DataFrame":
         """A row for each parameter and derived quantity, in the units of `result[name]`.
 
+        What is both has one row. It counts as a parameter, and has the name that people use, as `tremor_frequency`.
+
         Columns: `quantity`; `kind`, "parameter" or "derived"; `value`; `stderr`, NaN where the data do not determine it;
         `low` and `high`, ends of the 95 % interval, NaN where one is open or was not computed; `unit`; `free`, whether it
         was fitted; `determined`, whether it has a standard error.
         """
-        return frame([{"quantity": name, "kind": "parameter" if name in self.parameters else "derived", **p.row()}
-                      for name, p in (self.parameters | self.derived).items()])  # fmt: skip
+        own = self.parameters.keys() | {in_use(name) for name in self.parameters}
+        return frame([{"quantity": name, "kind": "parameter" if name in own else "derived", **p.row()}
+                      for name, p in once(self.parameters, self.derived).items()])  # fmt: skip
 
     @property
     def only(self) -> FittedPart:
@@ -213,8 +216,7 @@ class FitResult(Result, eqx.Module):
     @property
     def found(self) -> dict[str, Estimate]:
         """Fitted parameters and derived quantities; what is both, once, by the name that people use."""
-        fitted = {name: p for name, p in self.parameters.items() if p.free and in_use(name) not in self.derived}
-        return fitted | self.derived
+        return once({name: p for name, p in self.parameters.items() if p.free}, self.derived)
 
     @property
     def remarks(self) -> tuple[str, ...]:

@@ -32,7 +32,7 @@ def card_of(result: "FitResult") -> Card:
     """The result as text, and as a table of all its numbers: those that the data determine first, then what was fixed."""
     rows = []
     fixed = {name: p for name, p in result.parameters.items() if not p.free}
-    for name, p in result.as_shown(fixed | result.found).items():
+    for name, p in result.as_shown(once(fixed, result.found)).items():
         state = ("determined" if p.stderr is not None else "not determined") if p.free else "fixed"
         row, unit = PARAMETERS.get(base_of(name)), "" if p.unit == "1" else p.unit
         words = MEANINGS.get(base_of(name), "") if row is None else row.meaning.partition(";")[0]
@@ -180,3 +180,8 @@ def in_use(name: str) -> str | None:
     """The name that people use for a parameter, of one target or "name@target"; None where that is its own."""
     base, at, target = name.partition("@")
     return ALIASES[base] + at + target if base in ALIASES else None
+
+
+def once(parameters: Mapping[str, Estimate], derived: Mapping[str, Estimate]) -> dict[str, Estimate]:
+    """Parameters and derived quantities; what is both, once, by the name that people use."""
+    return {name: p for name, p in parameters.items() if in_use(name) not in derived} | dict(derived)

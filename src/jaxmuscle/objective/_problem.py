@@ -20,7 +20,7 @@ from jaxmuscle.response._expected import Moments, log_variation_sd
 from jaxmuscle.response._linearised import has_response
 from jaxmuscle.simulation._grid import Grid
 from jaxmuscle.simulation._simulate import DURATION, MAX_RATE_STEP, steps_per_sample
-from jaxmuscle.spectra._bin_law import bin_statistics, samples_of, trial_samples
+from jaxmuscle.spectra._bin_law import bin_statistics, mean_error, samples_of, trial_samples
 from jaxmuscle.spectra._settings import WINDOW
 
 from ._coordinates import Coordinates, task_at
@@ -35,7 +35,7 @@ def target_variation(target: Target, task: AbstractTask | None = None) -> tuple[
 
     With a task and where the target states its segments: `log_variation_sd` of recordings that give so many. Else half the
     relative error of the power in the bins, `½ √(pᵀ V p)` with V the covariance of the log powers, which is too much where
-    power lies elsewhere or in a harmonic. The standard error over trials where there are several and it is larger.
+    power lies elsewhere or in a harmonic. The `mean_error` of several trials where their scatter is larger.
     """
     values = target.coefficient_of_variation
     if values is None:
@@ -48,8 +48,7 @@ def target_variation(target: Target, task: AbstractTask | None = None) -> tuple[
         each = {k: log_variation_sd(arrays, settings, samples_of(k, settings)) for k in set(counts)}
         each = as_numbers(each) if all_concrete(each) else each
         sd = sum(each[k] ** 2 for k in counts) ** 0.5 / len(counts)
-    if len(logs) > 1:
-        sd = (np if is_concrete(sd) else jnp).maximum(sd, logs.std(ddof=1) / np.sqrt(len(logs)))
+    sd = mean_error(logs, sd)
     return float(logs.mean()), float(sd) if is_concrete(sd) else sd
 
 

@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from jaxmuscle._common.files import replacing
-from jaxmuscle.plot._style import BLUE, GREEN, GREY, PALETTE, VERMILLION, ink, styled
+from jaxmuscle.plot._style import BLUE, GREEN, GREY, PALETTE, VERMILLION, ink, log_axis, styled
 from jaxmuscle.simulation._trajectory import Trajectory
 from jaxmuscle.spectra._measures import peaks
 from jaxmuscle.spectra._settings import WINDOW
@@ -119,7 +119,7 @@ def _frequency(ax: Axes, log: bool) -> None:
         ax.set_ylim(bottom=0)
         return
     ax.set_xscale("log")
-    ax.set_yscale("log")
+    log_axis(ax, "y")
     ax.set_xticks([0.4, 1, 2, 4, 10], ["0.4", "1", "2", "4", "10"])
     ax.set_xticks([], minor=True)
 

@@ -7,7 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure, SubFigure
 
 from ._spectra import target
-from ._style import COLUMN, GREY, PALETTE, canvas, fitted_to, heading, ink, key, shade, styled, without_legend
+from ._style import COLUMN, GREY, PALETTE, canvas, fitted_to, heading, ink, key, log_axis, shade, styled, without_legend
 
 SPECTRA, ROW = 2.4, 0.24  # inches
 MARK: dict[str, Any] = {"ms": 5.5, "zorder": 3}
@@ -44,6 +44,7 @@ def _spectra(ax: Axes, comparison: Any, colours: dict[str, str]) -> None:
         style = {"color": colours[noise], "ls": DASHES[number % len(DASHES)], "lw": 1.3, "zorder": 5 - 0.1 * number}
         ax.plot(frequency, comparison.fitted[noise, best.harmonic], label=best.label, **style)
     ax.set(title="Best fit of each noise", ylim=(0.5 * power.min(), 2 * power.max()))
+    log_axis(ax, "y")
     without_legend(ax).set_ylabel("Power (fraction per bin)")
 
 

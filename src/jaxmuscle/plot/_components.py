@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from jaxmuscle._common.text import choices
 
 from ._spectra import target as draw_target
-from ._style import BLUE, GREEN, ORANGE, PURPLE, SKY, axes_or_new, styled
+from ._style import BLUE, GREEN, ORANGE, PURPLE, SKY, axes_or_new, log_axis, styled
 
 PARTS = {"floor": ("0.75", "floor"), "relaxation": (SKY, "relaxation"), "harmonic": (ORANGE, "harmonic"),
          "tremor": (GREEN, "tremor (whole)"), "resonance_2": (PURPLE, "resonance 2 (whole)")}  # fmt: skip
@@ -88,6 +88,7 @@ def components(result: Any, ax: Axes | None = None, target: str | None = None, *
     if log:
         seen = np.concatenate([fitted, part.target.proportional_power])
         ax.set_ylim(seen[seen > 0].min() / DECADE, 1.5 * seen.max())
+        log_axis(ax, "y")
     ax.set_title(part.target.name, parse_math=False)
     ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.2), ncols=2, frameon=False, columnspacing=1.2)
     return ax

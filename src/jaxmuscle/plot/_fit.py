@@ -26,6 +26,7 @@ from ._style import (
     heading,
     ink,
     key,
+    log_axis,
     named,
     output_label,
     shade,
@@ -140,6 +141,7 @@ def _log_limits(ax: Axes, part: Any, fitted: Any) -> None:
     seen = np.concatenate([part.target.proportional_power, fitted, *(band or ())])
     seen = seen[np.isfinite(seen) & (seen > 0)]
     ax.set_ylim(seen.min() / 1.4, seen.max() * 1.4)
+    log_axis(ax, "y")
 
 
 def _harmonic(ax: Axes, part: Any, frequency: Any, fitted: Any) -> None:

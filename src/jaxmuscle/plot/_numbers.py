@@ -28,9 +28,9 @@ DIGITS = str.maketrans("0123456789-", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻")
 
 
 def number_in_print(value: float) -> str:
-    """A number of an axis: `20`, `0.0005`, `5·10⁻⁵`."""
+    """A number of an axis: `20`, `0.0005`, `5e−5`. A raised exponent would be too small in a column of 85 mm."""
     digits, _, power = f"{value:g}".partition("e")
-    return f"{digits}·10{str(int(power)).translate(DIGITS)}" if power else digits
+    return f"{digits}e{int(power)}".replace("-", "\N{MINUS SIGN}") if power else digits
 
 
 def unit_in_print(unit: str, power: int = 0) -> str:

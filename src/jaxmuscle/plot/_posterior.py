@@ -24,6 +24,7 @@ from ._style import (
     canvas,
     fitted_to,
     heading,
+    log_axis,
     styled,
 )
 
@@ -146,7 +147,7 @@ def predictive(found: Any, ax: Axes | None = None, target: str | None = None) ->
         ax.fill_between(f, *np.quantile(power, (low, high), axis=0), color=SKY, alpha=alpha + 0.1, lw=0, label=label)
     ax.plot(f, np.median(expected, axis=0), color=BLUE, lw=1.2, label="model, median")
     ax.plot(f, np.asarray(part.target.proportional_power), color=VERMILLION, marker="o", ms=3, lw=0, label="target")
-    ax.set_yscale("log")
+    log_axis(ax, "y")
     ax.set(xlabel="Frequency (Hz)", ylabel=PROPORTIONAL, xlim=(0, f[-1] + f[0]))
     ax.set_title(f"{part.target.name}, p = {part.replicates.p_value:.2g}", parse_math=False)
     ax.legend(frameon=False, loc="lower left")

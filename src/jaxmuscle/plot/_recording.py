@@ -108,7 +108,7 @@ def _spectrum_axes(ax: Axes, unit: str, log: bool) -> None:
     _label(ax, "Frequency (Hz)", f"Power ({density_unit(unit)})")
     ax.set_title("Logarithmic" if log else "Linear")
     if log:
-        ax.set_yscale("log")
+        log_axis(ax, "y")
         log_axis(ax)
     else:
         ax.set_xlim(left=0, auto=None)

@@ -173,7 +173,7 @@ def frequency_axis(ax: Axes, log: bool) -> None:
         if ax.get_yscale() == "linear":
             ax.set_ylim(bottom=0, auto=None)
         return
-    ax.set_yscale("log")
+    log_axis(ax, "y")
     log_axis(ax)
 
 

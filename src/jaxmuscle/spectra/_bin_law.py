@@ -4,13 +4,18 @@ import functools
 from collections import Counter
 from typing import Any, NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Complex, Float
-from scipy.special import digamma, polygamma
+from scipy.special import digamma, polygamma, stdtrit
+
+from jaxmuscle._common.arrays import is_concrete
 
 from ._settings import LONGEST, WINDOW, SpectrumSettings, samples_in, tapers_of
 
 LEAST = 1e-3  # share of a bin that scatters, at least
+ENOUGH = 3  # trials, for their scatter to say what the error of their mean is
+NORMAL = 1.96  # standard errors to either side that hold 95 %
 
 
 class BinLaw(NamedTuple):
@@ -83,6 +88,25 @@ def dispersion_of(
     by_law = np.sqrt(2 * np.sum(a**2) / effective) / np.trace(a)
     by_trials = np.sqrt(len(each)) * np.std(each, ddof=1) / np.sum(each)
     return float(value), float(value * max(by_law, by_trials) / 2)
+
+
+def student(count: int) -> float:
+    """How many standard errors, by the scatter of so many values, to either side of their mean hold 95 % (Student's t)."""
+    return float(stdtrit(count - 1, 0.975))
+
+
+def mean_error(values: Float[np.ndarray, " trials"], expected: Any) -> Any:
+    """The error of a mean over trials: the `expected` one, or that by their scatter where this is larger.
+
+    The scatter of a few values is uncertain itself. So of three trials or more it is multiplied by t / 1.96, with Student's
+    t: then ± 1.96 of it hold 95 %. Of two it would be 6.5 times as much, so that the mean told nothing.
+    """
+    count = len(values)
+    if count < 2:
+        return expected
+    scatter = float(np.std(values, ddof=1)) / np.sqrt(count)
+    stated = scatter * (student(count) / NORMAL if count >= ENOUGH else 1.0)
+    return (np if is_concrete(expected) else jnp).where(scatter > expected, stated, expected)
 
 
 class BinStatistics(NamedTuple):

@@ -25,6 +25,7 @@ DOUBTFUL = 30.0  # percent
 ASSUMED = (
     "  assumed: the masses are known. A fit of the record also fits m_z, so its error of K_z0 is larger",
     "  assumed: no reflex. A reflex can change K_w0 by 10 to 45 %, and the fit does not notice: call it muscle plus reflex",
+    "  assumed: no fatigue. Split a long or strong hold into trials with rests between, and give all trials to one fit",
 )
 OF_MUSCLE = tuple(BASE.values())
 

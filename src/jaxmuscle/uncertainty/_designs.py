@@ -26,7 +26,7 @@ AMPLITUDES = ("noise_K_w", "noise_K_z", "noise_C_w", "noise_C_z", "harmonic_ampl
 MEAN_ERROR = 0.02
 LEVELS = (2.0, 0.5)
 LONGER = 10
-MOVED = ((1e-4, (0.1, 10.0)), (1e-3, (0.1, 5.0)))  # rms [m] and band [Hz] of standard perturbations
+MOVED = ((1e-4, (0.5, 10.0)), (1e-3, (0.5, 5.0)))  # rms [m] and band [Hz] of standard perturbations; slower, force drifts
 MOST_VARIATION = 1e3
 VAGUE = 1e-6  # prior precision of what is separate
 
@@ -190,7 +190,7 @@ def _designs_for(part: Part, moments: Moments, factors: tuple[float, ...], separ
         designs.append(Design("the force with the insertion held", fixed, coefficient_of_variation=True))
     forces = {n: float(task[n]) for n in FORCES if n in task.parameter_names and float(task[n]) != 0}
     if forces:
-        for factor in factors:
+        for factor in (f for f in factors if f * (part.target.mvc_fraction or 0.0) <= 1.0):
             name = f"a second force level {factor:g} times as high"
             moved = task.replace(**{n: factor * v for n, v in forces.items()})
             designs.append(Design(name, moved, coefficient_of_variation=varying, separate=separate))

@@ -64,7 +64,12 @@ def identifiability(
     pairs.sort(key=lambda pair: (-len(pair.gained), pair.log_left))
     notices = tuple(n for n in result.notices if " ambiguous: " in n)
     mean_force = result.derived["mean"].value if result.per_newton else None
-    return IdentifiabilityReport(problem.title, problem.coordinates.names, present, alone, tuple(pairs), notices, mean_force)
+    # Of another target the fit has said nothing.
+    fitted = {} if target is not None else result.found
+    known = {n for n, k in present.quantities.items() if k.determined}
+    doubted = tuple(n for n, p in fitted.items() if n in known and p.stderr is None)
+    return IdentifiabilityReport(problem.title, problem.coordinates.names, present, alone, tuple(pairs), notices, mean_force,
+                                 doubted)  # fmt: skip
 
 
 def standard_designs(result: FitResult, target: Target | None = None) -> tuple[Design, ...]:
@@ -76,8 +81,9 @@ def standard_designs(result: FitResult, target: Target | None = None) -> tuple[D
     The coefficient of variation and the mean (to 2 %) of the same recording, if the fit does not have them; of an
     `Isometric` fit the displacement under the load that the sensor had held (`PrescribedForce` at the same operating point,
     perturbations included), of a `PrescribedForce` fit the force of `Isometric`; 60 s in which a motor moves the insertion,
-    by 0.1 mm rms to 10 Hz and by 1 mm rms to 5 Hz (`Lengthening`); twice and half the force, where noise and harmonic have
-    other, unknown amplitudes and the muscle is as before; a recording ten times as long.
+    by 0.1 mm rms to 10 Hz and by 1 mm rms to 5 Hz, both from 0.5 Hz on (`Lengthening`); twice and half the force (none above
+    100 % MVC where the target states its level), where noise and harmonic have other, unknown amplitudes and the muscle is
+    as before; a recording ten times as long. None knows fatigue.
     """
     with jax.enable_x64(True):
         problem, theta = fitted_problem(result, target)

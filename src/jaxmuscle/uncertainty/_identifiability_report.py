@@ -26,6 +26,11 @@ COLUMNS = 4
 PAIRS_TOLD = 3
 TOGETHER = " together with "
 SAME = 1e-6
+STRICTER = "The fit is stricter: it also looks for other solutions, and at combinations that are open. Believe the fit"
+TIRING = (
+    "no design knows fatigue: split a long or strong hold into short trials with rests between, and give all trials "
+    "to one fit"
+)
 BASE = {"k_w": "K_w0", "k_z": "K_z0", "c_w": "C_w0", "c_z": "C_z0"}
 
 
@@ -111,7 +116,7 @@ class IdentifiabilityReport(Printed, Result, eqx.Module):
 
     `target` and `free` name the data and the fitted parameters; the pairs are sorted, best first; `notices` of the fit;
     `mean_force` [N] of the fitted muscle where the data have no newtons: print states values per newton of it, as the fit
-    does, and `to_dict` in newtons.
+    does, and `to_dict` in newtons; `open_in_fit`, what is determined here and was not in the fit, which is stricter.
     """
 
     target: str
@@ -121,6 +126,7 @@ class IdentifiabilityReport(Printed, Result, eqx.Module):
     pairs: tuple[Outlook, ...]
     notices: tuple[str, ...]
     mean_force: float | None = None
+    open_in_fit: tuple[str, ...] = ()
 
     @property
     def telling_pairs(self) -> tuple[Outlook, ...]:
@@ -147,6 +153,7 @@ class IdentifiabilityReport(Printed, Result, eqx.Module):
             "format": 1, "target": self.target, "free": list(self.free), "threshold": DETERMINED,
             "present": self.present.to_dict(), "designs": [d.to_dict() for d in self.designs],
             "pairs": [d.to_dict() for d in self.pairs], "notices": list(self.notices),
+            "not_determined_in_fit": list(self.open_in_fit),
         }  # fmt: skip
 
     def to_dataframe(self) -> "pandas.DataFrame":
@@ -203,6 +210,8 @@ def _present(report: IdentifiabilityReport) -> list[str]:
     lines += _wrapped("  ".join([*values[: now.determined], "|", *values[now.determined :]]), 4)
     if now.products:
         lines += _wrapped(f"known are: {_products(now)}", 4, "  ")
+    if doubted := [name for name in told(now.quantities) if name in report.open_in_fit]:
+        lines += _wrapped(f"known here, but not determined in the fit: {', '.join(doubted)}. {STRICTER}", 4, "  ")
     if now.undetermined:
         lines += ["  the data leave open:"]
         for sentence in now.undetermined:
@@ -275,6 +284,7 @@ def _sentences(report: IdentifiabilityReport) -> list[str]:
         count = len(report.free) - best.determined
         rest = f"{count} of {len(report.free)} combinations stay open" if count else "nothing stays open"
         lines += _wrapped(f"most would be learnt from {best.name}: {rest}", 4, "  - ")
+        lines += _wrapped(TIRING, 4, "  - ")
     return lines
 
 
