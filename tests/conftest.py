@@ -47,7 +47,7 @@ QUICK_COMPILER = "--xla_cpu_use_fusion_emitters=false --xla_backend_optimization
 
 def _compile_quickly(known: Path) -> None:
     """XLA's older emitters, and LLVM at its first level: compiled in less than half the time, as fast when run, the same
-    numbers to rounding.
+    numbers to rounding. Without optimisation a whole run compiles 0.8 of 1.7 ks less and computes 0.6 ks longer.
 
     An XLA that no longer has them ends the process at the flag: tried once for every version, in a process of its own.
     """
@@ -66,6 +66,8 @@ def _compile_quickly(known: Path) -> None:
 
 
 MOST_MAPS = 25_000
+# Tracing makes objects by the million, few of them in circles: looking for these at Python's own pace takes a tenth of it.
+gc.set_threshold(5_000, 20, 10)
 
 _keep_compiled_programs(OUT / "jax-cache")
 _compile_quickly(OUT / "compiler.txt")

@@ -1,9 +1,13 @@
 """Where results are computed: versions, and the cache of compiled programs."""
 
+import contextlib
 import functools
 import os
+import threading
+from collections.abc import Iterator
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 import platformdirs
 
@@ -67,3 +71,40 @@ def usable_cores() -> int:
 def versions() -> dict[str, str]:
     """Versions of what computed a result."""
     return {name: version(name) for name in ("jaxmuscle", "jax", "diffrax", "optimistix", "equinox", "numpy")}
+
+
+class _OneThread:
+    """NumPy's linear algebra on one thread from the first that enters until the last has left."""
+
+    def __init__(self) -> None:
+        self.lock, self.inside = threading.Lock(), 0
+        self.limits: Any = None
+
+    def __enter__(self) -> None:
+        from threadpoolctl import threadpool_limits
+
+        with self.lock:
+            if not self.inside:
+                self.limits = threadpool_limits(1, user_api="blas")
+            self.inside += 1
+
+    def __exit__(self, *_: object) -> None:
+        with self.lock:
+            self.inside -= 1
+            if not self.inside:
+                self.limits.restore_original_limits()
+
+
+_ONE_THREAD = _OneThread()
+
+
+@contextlib.contextmanager
+def fitting() -> Iterator[None]:
+    """Double precision in JAX, and one thread in NumPy's linear algebra.
+
+    The matrices of a fit are small. OpenBLAS's other threads would spin between them, a fifth of the processor time.
+    """
+    import jax
+
+    with _ONE_THREAD, jax.enable_x64(True):
+        yield

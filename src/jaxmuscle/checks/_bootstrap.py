@@ -3,9 +3,9 @@
 from collections.abc import Callable
 from typing import Any
 
-import jax
 import numpy as np
 
+from jaxmuscle._common.environment import fitting
 from jaxmuscle._common.keys import number_of
 from jaxmuscle._common.progress import told
 from jaxmuscle._common.types import Key
@@ -60,7 +60,7 @@ def bootstrap(
     stated = result.determined
     if not stated:
         raise ValueError(f"{result.title}: the fit determines no quantity, so there is no stated error to check")
-    with told(progress, f"bootstrap of {result.title}") as tell, jax.enable_x64(True):
+    with told(progress, f"bootstrap of {result.title}") as tell, fitting():
         problem = reopened(result, key=key)
         tell("making data", 0.0)
         made, failed = replicates_of(problem, tuple(result.tasks.values()), replicates)

@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from jaxmuscle import plot
 from jaxmuscle._common.cards import Printed, Result
-from jaxmuscle._common.environment import versions
+from jaxmuscle._common.environment import fitting, versions
 from jaxmuscle._common.keys import number_of
 from jaxmuscle._common.parts import of_only, only
 from jaxmuscle._common.tables import frame
@@ -197,7 +197,7 @@ def goodness(result: FitResult, target: Target | None = None, *, replicates: int
     if replicates < 19:
         raise ValueError(f"replicates = {replicates} must be at least 19: with fewer no p-value can be as small as 0.05")
     _check(result, target)
-    with jax.enable_x64(True):
+    with fitting():
         problem = reopened(result, key=key)
         drawn, moments = _drawn(problem, result, replicates)
         refits = refitted(problem, problem.theta_of(tuple(result.tasks.values())), drawn)

@@ -3,11 +3,11 @@
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any, TypeVar
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
 from jaxmuscle._common.arrays import as_numbers
+from jaxmuscle._common.environment import fitting
 from jaxmuscle._common.keys import number_of
 from jaxmuscle._common.progress import told
 from jaxmuscle._common.text import choices
@@ -78,7 +78,7 @@ def compare_noise(
     """
     if not 2 <= groups <= len(target.bins):
         raise ValueError(f"groups = {groups}: give a number from 2 to that of the target's bins, {len(target.bins)}")
-    with told(progress, f"comparing models on {target.name}") as tell, jax.enable_x64(True):
+    with told(progress, f"comparing models on {target.name}") as tell, fitting():
         fixed = proper_values(fix)
         carried, left_out = _carried(task, noises, fixed)
         problems = _setups(carried, target, free, fixed, proper_values(priors), proper_values(bounds), key)

@@ -5,12 +5,11 @@ from collections.abc import Callable, Iterable, Mapping
 from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
-import jax
 import numpy as np
 
 from jaxmuscle import plot
 from jaxmuscle._common.cards import Card, Result, in_columns
-from jaxmuscle._common.environment import versions
+from jaxmuscle._common.environment import fitting, versions
 from jaxmuscle._common.progress import told
 from jaxmuscle._common.tables import frame
 from jaxmuscle._common.text import folded
@@ -208,7 +207,7 @@ def fit_cohort(
     options = FitOptions(free=free, fix=fix, residual=residual, starts=starts, key=key, bounds=bounds, priors=priors,
                          coefficient_of_variation=coefficient_of_variation, max_steps=max_steps)  # fmt: skip
     results: dict[str, FitResult] = {}
-    with told(progress, f"fitting {len(loaded)} targets") as tell, jax.enable_x64(True):
+    with told(progress, f"fitting {len(loaded)} targets") as tell, fitting():
         batches: dict[Any, dict[str, Plan]] = {}
         for name, target in loaded.items():
             model = with_noise(task_for(target, task), noise, fix)

@@ -3,8 +3,7 @@
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any, Literal
 
-import jax
-
+from jaxmuscle._common.environment import fitting
 from jaxmuscle._common.progress import told
 from jaxmuscle._common.types import Key
 from jaxmuscle.data._as_target import as_target
@@ -89,7 +88,7 @@ def fit(
     require_task(task, "fit(task, target)")
     recordings = recordings_of(target, task)
     aim = recordings[0].name if recordings else (target := as_target(target)).name
-    with told(progress, f"fitting {aim}") as tell, jax.enable_x64(True):
+    with told(progress, f"fitting {aim}") as tell, fitting():
         options = FitOptions(
             free=free, fix=fix, method=method, residual=residual, starts=starts, seeds=seeds, check_seeds=check_seeds,
             key=key, bounds=bounds, priors=priors, coefficient_of_variation=coefficient_of_variation,

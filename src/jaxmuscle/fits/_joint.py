@@ -4,8 +4,7 @@ import dataclasses
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
-import jax
-
+from jaxmuscle._common.environment import fitting
 from jaxmuscle._common.progress import told
 from jaxmuscle._common.text import choices
 from jaxmuscle._common.types import Key
@@ -98,7 +97,7 @@ def fit_joint(
     if mean_force is None and not tasks and "P_w" not in map(base_of, fix or ()):
         models, mean_force, factor = _at_means(models, loaded)
         carried, options = tuple(mean_force), dataclasses.replace(options, carried=factor)
-    with told(progress, f"fitting {', '.join(loaded)}") as tell, jax.enable_x64(True):
+    with told(progress, f"fitting {', '.join(loaded)}") as tell, fitting():
         options = dataclasses.replace(options, progress=tell)
         return search(planned_jointly(models, loaded, options, separate, proportional, mean_force, carried))
 

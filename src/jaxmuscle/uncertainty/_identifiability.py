@@ -9,6 +9,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
+from jaxmuscle._common.environment import fitting
 from jaxmuscle._common.errors import OperatingPointError
 from jaxmuscle.data._target import Target
 from jaxmuscle.fits._reopened import reopened
@@ -44,7 +45,7 @@ def identifiability(
     **Raises:** `ValueError` for a fit that failed, a target that states neither segments nor sigma, two designs of one name,
     a design that names unknown parameters. A design without stable equilibrium is reported as impossible.
     """
-    with jax.enable_x64(True):
+    with fitting():
         problem, theta = fitted_problem(result, target)
         seen = seen_here(problem, theta)
         tried = designs_for(problem, seen) if designs is None else tuple(designs)
@@ -85,7 +86,7 @@ def standard_designs(result: FitResult, target: Target | None = None) -> tuple[D
     100 % MVC where the target states its level), where noise and harmonic have other, unknown amplitudes and the muscle is
     as before; a recording ten times as long. None knows fatigue.
     """
-    with jax.enable_x64(True):
+    with fitting():
         problem, theta = fitted_problem(result, target)
         return designs_for(problem, seen_here(problem, theta))
 

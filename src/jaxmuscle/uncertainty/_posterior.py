@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from jaxmuscle._common.environment import versions
+from jaxmuscle._common.environment import fitting, versions
 from jaxmuscle._common.keys import number_of
 from jaxmuscle._common.programs import kept
 from jaxmuscle._common.progress import told
@@ -72,7 +72,7 @@ def posterior(
     for name, count, least in (("chains", chains, 2), ("draws", draws, 100), ("warmup", warmup, 1)):
         if count < least:
             raise ValueError(f"{name} = {count} must be at least {least}")
-    with told(progress, f"posterior of {result.title}") as tell, jax.enable_x64(True):
+    with told(progress, f"posterior of {result.title}") as tell, fitting():
         problem = reopened(result, target, free=free, priors=priors, bounds=bounds, key=key)
         likelihood = Likelihood.of(problem)
         tell("searching the most probable parameters", 0.0)

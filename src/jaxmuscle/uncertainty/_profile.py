@@ -4,13 +4,13 @@ from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
-import jax
 import numpy as np
 import scipy
 from jaxtyping import Float
 
 from jaxmuscle import plot
 from jaxmuscle._common.cards import Printed, Result
+from jaxmuscle._common.environment import fitting
 from jaxmuscle._common.tables import frame
 from jaxmuscle._common.text import choices, folded
 from jaxmuscle.data._target import Target
@@ -129,7 +129,7 @@ def profile(
     """
     if not 0 < level < 1:
         raise ValueError(f"level = {level}: give a probability between 0 and 1, 0.95 say")
-    with jax.enable_x64(True):
+    with fitting():
         problem = reopened(result, target, free=free, priors=priors, bounds=bounds)
         names = problem.coordinates.names
         known = (*names, *(n for n in result.derived_names if n not in names))
