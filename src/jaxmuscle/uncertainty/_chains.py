@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxmuscle._common.keys import fold_in
 from jaxmuscle._common.programs import kept, kept_to_run_long
 
 Density = Any  # has `size`, `centre`, `scale` that whiten, and `log_density` of whitened coordinates
@@ -60,14 +61,16 @@ def _strong(tree: Any) -> Any:
 
 
 @kept
-def _first(density: Density, positions: Array) -> Any:
+def _first(density: Density, positions: Array | np.ndarray) -> Any:
     hmc, _, (start, _, _), _ = _tools()
     chains = jax.vmap(lambda x: hmc.init(x, density.log_density))(positions)
     return _strong(_State(tuple(chains), tuple(start(jnp.asarray(0.5)))))
 
 
 @kept_to_run_long
-def _block(density: Density, key: Array, state: Any, adapting: Array, longest: Array) -> tuple[Any, Any]:
+def _block(
+    density: Density, key: Array, state: Any, adapting: Array | np.ndarray, longest: Array | np.ndarray
+) -> tuple[Any, Any]:
     """`BLOCK` draws of every chain; while `adapting` the step size follows the mean acceptance of all chains.
 
     All chains make the same number of steps: none waits for another.
@@ -134,13 +137,13 @@ def _sample(
     shares = np.cumsum(ADAPTATIONS) / sum(ADAPTATIONS)
     renewals = {max(1, round(blocks * share)) for share in shares[:-1]}
     total = blocks + -(-draws // BLOCK)
-    state = _first(density, _dispersed(density, jax.random.fold_in(key, 0), chains))
+    state = _first(density, _dispersed(density, fold_in(key, 0), chains))
     longest = LONGEST
     recent: list[np.ndarray] = []
     kept: list[Any] = []
     for number in range(total):
         adapting = number < blocks
-        its, told = jax.random.fold_in(key, number + 1), (jnp.asarray(adapting), jnp.asarray(longest))
+        its, told = fold_in(key, number + 1), (np.asarray(adapting), np.asarray(longest))
         state, made = _block(density, its, state, *told)
         white = np.asarray(made[0])
         if not adapting:
@@ -152,7 +155,7 @@ def _sample(
             if number + 1 == max(renewals) and _alike(density, seen) > ALIKE:
                 longest *= 2
             new = _learnt(density, seen.reshape(-1, white.shape[-1]))
-            state = _first(new, jnp.asarray(_moved(density, new, state.chains[0])))
+            state = _first(new, _moved(density, new, state.chains[0]))
             density, recent = new, []
         else:
             recent.append(white)
@@ -163,12 +166,17 @@ def _sample(
     return Chains(s, height, acceptance, steps, diverging, float(parts[5][-1])), density
 
 
-def _dispersed(density: Density, key: Array, chains: int) -> Array:
+def _dispersed(density: Density, key: Array, chains: int) -> np.ndarray:
     """Starts about the maximum, wider than the posterior; nearer where the density is not finite."""
-    away = SPREAD * jax.random.normal(key, (chains, density.size))
+    away = SPREAD * np.asarray(_normal(key, (chains, density.size)))
     for _ in range(6):
-        _, height, _ = _first(density, away).chains
-        if bool(jnp.all(jnp.isfinite(height))):
+        finite = np.isfinite(np.asarray(_first(density, away).chains[1]))
+        if np.all(finite):
             return away
-        away = jnp.where(jnp.isfinite(height)[:, None], away, 0.5 * away)
+        away = np.where(finite[:, None], away, 0.5 * away)
     raise ValueError("the posterior density is not finite about its maximum: the fitted task is at the edge of stability")
+
+
+@kept
+def _normal(key: Array, shape: tuple[int, int]) -> Array:
+    return jax.random.normal(key, shape)

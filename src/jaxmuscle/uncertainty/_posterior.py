@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array
 
 from jaxmuscle._common.environment import fitting, versions
-from jaxmuscle._common.keys import number_of
+from jaxmuscle._common.keys import fold_in, number_of
 from jaxmuscle._common.programs import kept
 from jaxmuscle._common.progress import told
 from jaxmuscle._common.types import Key
@@ -77,7 +77,7 @@ def posterior(
         likelihood = Likelihood.of(problem)
         tell("searching the most probable parameters", 0.0)
         density, _, _ = density_about(problem, likelihood, problem.theta_of(tuple(result.tasks.values())))
-        found, density = sample(density, jax.random.fold_in(problem.key, 5), chains, draws, warmup, tell)
+        found, density = sample(density, fold_in(problem.key, 5), chains, draws, warmup, tell)
         return _reported(problem, density, found, result, key, warmup)
 
 
@@ -104,8 +104,8 @@ def _reported(
     modes = {band.name: modes_of(samples[band.name].ravel()) for band in density.bands}
     parts = {}
     for i, (name, part) in enumerate(zip(result.parts, problem.parts, strict=True)):
-        drawing = jax.random.fold_in(problem.key, 7)
-        drawing = jax.random.fold_in(drawing, i) if i else drawing
+        drawing = fold_in(problem.key, 7)
+        drawing = fold_in(drawing, i) if i else drawing
         drawn = replicates(density.likelihood.bins[i], part.target, moments[i], shape, drawing)
         own = part.coordinates.values_of(part.own(flat))
         task = part.task.replace(**{n: float(np.median(own[:, j])) for j, n in enumerate(part.coordinates.names)})
@@ -119,16 +119,14 @@ def _thetas(problem: FitProblem, density: PosteriorDensity, found: Chains) -> tu
     """θ of every draw, each harmonic's frequency drawn from its grid given the rest, anywhere in its cell; s and offsets."""
     coordinates, names = problem.coordinates, problem.coordinates.names
     both = found.s.reshape(-1, found.s.shape[-1])
-    parts = [np.asarray(_placed(density, jnp.asarray(part))) for part in _filled(both)]
+    parts = [np.asarray(_placed(density, part)) for part in _filled(both)]
     s = np.concatenate(parts)[: len(both)]
     theta = np.asarray(coordinates.theta(s))
     if density.bands:
         white = np.linalg.solve(np.asarray(density.scale), (both - np.asarray(density.centre)).T).T
         for number, (band, heights) in enumerate(zip(density.bands, _heights(density, white), strict=True)):
-            key = jax.random.fold_in(problem.key, 6)
-            keys = jax.random.split(jax.random.fold_in(key, number) if number else key)
-            chosen = np.asarray(jax.random.categorical(keys[0], jnp.asarray(heights)))
-            place = np.asarray(jax.random.uniform(keys[1], (len(both),)))
+            key = fold_in(problem.key, 6)
+            chosen, place = map(np.asarray, _cells(fold_in(key, number) if number else key, heights))
             edges = edges_of(np.asarray(band.frequency))
             frequency = edges[chosen] + place * (edges[chosen + 1] - edges[chosen])
             theta[:, names.index(band.name)] = coordinates.theta_of(band.name, frequency)
@@ -138,17 +136,24 @@ def _thetas(problem: FitProblem, density: PosteriorDensity, found: Chains) -> tu
 
 
 @kept
-def _placed(density: PosteriorDensity, both: Array) -> Array:
+def _cells(key: Array, heights: Array | np.ndarray) -> tuple[Array, Array]:
+    """A cell of the grid for every draw, and a place within it from 0 to 1."""
+    keys = jax.random.split(key)
+    return jax.random.categorical(keys[0], heights), jax.random.uniform(keys[1], heights.shape[:1])
+
+
+@kept
+def _placed(density: PosteriorDensity, both: Array | np.ndarray) -> Array:
     return jax.lax.map(lambda row: density.placed(row)[0], both, batch_size=16)
 
 
 @kept
-def _frequencies(density: PosteriorDensity, white: Array) -> tuple[Array, ...]:
+def _frequencies(density: PosteriorDensity, white: Array | np.ndarray) -> tuple[Array, ...]:
     return jax.lax.map(density.at_frequencies, white, batch_size=16)
 
 
 def _heights(density: PosteriorDensity, white: np.ndarray) -> tuple[np.ndarray, ...]:
-    parts = [_frequencies(density, jnp.asarray(part)) for part in _filled(white)]
+    parts = [_frequencies(density, part) for part in _filled(white)]
     return tuple(np.concatenate(x)[: len(white)] for x in zip(*parts, strict=True))
 
 
