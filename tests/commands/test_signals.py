@@ -94,6 +94,18 @@ def test_what_is_ignored_on_purpose_stays_so():
     assert "goes on" in ended(begun(code), 0)
 
 
+def test_what_ends_in_silence_is_told_all_the_same():
+    """Typer makes an exit code of an interruption that comes while it reads the options."""
+    code = """
+with signals.heard():
+    try:
+        send(signal.SIGINT)
+        time.sleep(60)
+    except KeyboardInterrupt:
+        sys.exit(130)"""
+    assert ended(begun(code), 130).strip() == "interrupted"
+
+
 @pytest.mark.parametrize("module", ["typer", pytest.param("jax", marks=pytest.mark.slow)])
 def test_while_a_module_is_imported(module, tmp_path):
     """Of the command, and of what a fit needs."""

@@ -36,6 +36,7 @@ class Ear:
         self.code = 0
         self.stays = STAYS
         self.raised = False
+        self.told = False
         self.working = True
         self.wakes, self.woken = socket.socketpair()
         self.wakes.setblocking(False)
@@ -121,7 +122,9 @@ def ears() -> list[Ear]:
 
 
 def interrupted() -> int:
-    """Exit code of a command that was interrupted: 130, after a SIGTERM 143."""
+    """Exit code of a command that was interrupted and has said so: 130, after a SIGTERM 143."""
+    for ear in ears():
+        ear.told = True
     return next((ear.code for ear in ears() if ear.code), 128 + signal.SIGINT)
 
 
@@ -192,8 +195,9 @@ def heard() -> Iterator[None]:
         yield
     except KeyboardInterrupt:
         ear.code = ear.code or 128 + signal.SIGINT
-        print("interrupted", file=sys.stderr)
     finally:
         ear.working = False
         if ear.code:
+            if not ear.told:  # typer ends in silence if it is interrupted while it reads the options
+                print("interrupted", file=sys.stderr)
             leave(ear.code)
