@@ -1,4 +1,4 @@
-"""Where results are computed: versions, and the cache of compiled programs."""
+"""Where and how results are computed: versions, the cache of compiled programs, precision and threads of a fit."""
 
 import contextlib
 import functools
