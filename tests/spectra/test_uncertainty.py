@@ -137,7 +137,8 @@ def test_statistics_of_several_trials_add_their_degrees_of_freedom():
     nu = welch_law(jm.SpectrumSettings(), BINS, (6,)).degrees
     np.testing.assert_allclose(one.sd**2, log_power_moments(nu)[1])
     np.testing.assert_allclose(three.sd**2, log_power_moments(3 * nu)[1])
-    np.testing.assert_allclose(three.correlation, one.correlation)
+    # Far from each other two bins have about 1e-31 in common, which is rounding and differs between processors.
+    np.testing.assert_allclose(three.correlation, one.correlation, atol=1e-15)
 
 
 @pytest.mark.parametrize("overlap", [0.0, 0.5])
