@@ -55,7 +55,7 @@ def intervals(
 def _some(
     problem: FitProblem, objective: Residuals, seen: Expansion, covariance: np.ndarray, names: list[str]
 ) -> dict[str, Interval]:
-    here = _Point.of(problem, objective, jax.tree.map(lambda x: np.asarray(x)[None], seen))
+    here = Point.of(problem, objective, jax.tree.map(lambda x: np.asarray(x)[None], seen))
     curvature = here.jacobian[0].T @ here.jacobian[0] + np.diag(problem.prior)
     gain = np.linalg.pinv(curvature, hermitian=True)
     seen_here = [here.quantity(name) for name in names]
@@ -100,7 +100,7 @@ class _Look(NamedTuple):
     jacobian: np.ndarray
     cost: np.ndarray
 
-    def rise(self, here: "_Point") -> np.ndarray:
+    def rise(self, here: "Point") -> np.ndarray:
         """Root of twice the rise of the cost above that of the fit."""
         return np.sqrt(np.maximum(2 * (self.cost - here.cost[0]), 0.0))
 
@@ -124,7 +124,7 @@ class _Look(NamedTuple):
 
 def _look(problem: FitProblem, objective: Residuals, theta: np.ndarray, names: list[str], log: np.ndarray) -> _Look:
     """Every row with its own quantity, two rows each."""
-    point = _Point.of(problem, objective, expand(objective, theta))
+    point = Point.of(problem, objective, expand(objective, theta))
     value, slope = np.empty(len(log)), np.empty(theta.shape)
     for i, name in enumerate(names):
         values, slopes = point.quantity(name)
@@ -134,7 +134,7 @@ def _look(problem: FitProblem, objective: Residuals, theta: np.ndarray, names: l
     return _Look(problem, theta, at, slope, point.residual, point.jacobian, point.cost)
 
 
-class _Point(NamedTuple):
+class Point(NamedTuple):
     """What a fit sees at rows of θ: data residuals, their slopes, cost `½ Σ r² + ½ Σ θ²`, tables of quantities."""
 
     problem: FitProblem
@@ -145,7 +145,7 @@ class _Point(NamedTuple):
     tables: tuple[Mapping[str, np.ndarray], Mapping[str, np.ndarray]]
 
     @classmethod
-    def of(cls, problem: FitProblem, objective: Residuals, seen: Expansion) -> "_Point":
+    def of(cls, problem: FitProblem, objective: Residuals, seen: Expansion) -> "Point":
         count = len(seen.theta)
         rows = np.minimum(np.arange(MOST_ROWS), count - 1)  # one size, so that one program serves all
         found = consequences_of_rows(objective, jax.tree.map(lambda x: np.asarray(x)[rows], seen))

@@ -40,6 +40,7 @@ from ._checks import (
     twitch_notices,
     unsettled,
 )
+from ._half_power import HALF_POWER, half_power_intervals
 from ._harmonic_evidence import harmonic_test
 from ._intervals import intervals
 from ._ladder import Rung
@@ -131,7 +132,9 @@ def report_fit(
     moved |= too_curved(problem, derived, known)
     parameters, derived = (widened(without_errors(moved, table), factor) for table in (parameters, derived))
     stated = [n for n, p in (parameters | derived).items() if p.stderr and (n in derived or n in c.names)]
-    ends = intervals(problem, objective, seen, factor**2 * covariance, stated)
+    bent = [n for n in stated if base_of(n) == HALF_POWER]
+    ends = intervals(problem, objective, seen, factor**2 * covariance, [n for n in stated if n not in bent])
+    ends |= half_power_intervals(problem, objective, seen, factor**2 * covariance, bent)
     parameters, derived = (with_intervals(table, ends) for table in (parameters, derived))
     polish = polish_check(problem, stages, derived)
     parts, notices = _parts(plan, stages, tasks, seen.moments, made, polish)

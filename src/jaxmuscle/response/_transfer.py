@@ -89,25 +89,37 @@ def polynomial(coefficients: Float[Array, " powers"], s: Complex[Array, "*grid"]
     return value
 
 
+def half_power_level(task: AbstractTask, system: Linearisation, log_f: Float[Array, "*any"]) -> Float[Array, "*any"]:
+    """`ln(2 |H(f)|² / |H(0)|²)`, H the response to noise on K_w: zero where half its power is left.
+
+    Smooth in the parameters everywhere, which the frequency of its first zero is not (docs/fitting.md).
+    """
+    return _level(log_f, *_active_response(task, system))
+
+
+def _active_response(task: AbstractTask, system: Linearisation) -> tuple[Array, Array]:
+    return polynomials(system_of(task, system, jnp.zeros(5, system.A.dtype).at[0].set(task.muscle.base()[0])))
+
+
+def _level(log_f: Float[Array, "*any"], above: Array, below: Array) -> Float[Array, "*any"]:
+    s = times_i(2 * jnp.pi * jnp.exp(log_f))
+    gain = jnp.abs(polynomial(above, s) / polynomial(below, s)) * jnp.abs(below[-1] / above[-1])
+    return 2 * jnp.log(gain) + np.log(2.0)
+
+
 def half_power_frequency(task: AbstractTask, system: Linearisation) -> Float[Array, ""]:
     """Frequency [Hz] at which white noise on K_w has fallen to half its power at 0: relaxation and activation together.
 
     The lowest one between 1 mHz and 100 Hz; not a number where there is none. Between two points of a grid, then by one
     Newton step, the only one that is differentiated (the implicit function theorem), with the slope of the grid.
     """
-    above, below = polynomials(system_of(task, system, jnp.zeros(5, system.A.dtype).at[0].set(task.muscle.base()[0])))
-
-    def level(log_f, above, below):
-        s = times_i(2 * jnp.pi * jnp.exp(log_f))
-        gain = jnp.abs(polynomial(above, s) / polynomial(below, s)) * jnp.abs(below[-1] / above[-1])
-        return 2 * jnp.log(gain) + np.log(2.0)
-
+    above, below = _active_response(task, system)
     grid = jnp.linspace(np.log(1e-3), np.log(100.0), POINTS)
-    levels = jax.lax.stop_gradient(level(grid, above, below))
+    levels = jax.lax.stop_gradient(_level(grid, above, below))
     i = jnp.argmax(levels < 0)
     step = grid[1] - grid[0]
     x = grid[i] - levels[i] / (levels[i] - levels[i - 1]) * step
     before, here, after = (levels[i + k] - levels[i + k - 1] for k in (-1, 0, 1))
     slope = (here + (after - before) / 2 * ((x - grid[i]) / step + 0.5)) / step
-    found = jnp.exp(x - level(x, above, below) / slope)
+    found = jnp.exp(x - _level(x, above, below) / slope)
     return jnp.where((i > 0) & (levels[i] < 0), found, jnp.nan)

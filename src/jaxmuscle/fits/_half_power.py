@@ -1,0 +1,216 @@
+"""95 % interval of a half-power frequency: the frequencies at which the response may have half its power."""
+
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxmuscle._common.programs import kept
+from jaxmuscle.objective._consequences import Expansion, expand
+from jaxmuscle.objective._coordinates import task_at
+from jaxmuscle.objective._moment_models import Linear
+from jaxmuscle.objective._problem import FitProblem
+from jaxmuscle.objective._residuals import PartResiduals, Residuals
+from jaxmuscle.response._linearised import linearise
+from jaxmuscle.response._transfer import half_power_level
+
+from ._intervals import HELD, REACH, Interval, Point
+
+HALF_POWER = "half_power_frequency"
+EACH = 16  # frequencies on either side
+NEAREST = 0.5  # standard deviations from the value to the first of them
+TURNS, QUIET = 16, 2  # it ends early after so many turns in a row that gain little
+GAIN, NEAR = 0.02, 2.0  # of the cost; of the rise at the end of the interval
+LOOSE = 0.05  # of the level, at most: 5 % of the power
+MOST = 8.0  # prior standard deviations
+OPEN = Interval(None, None, log=True)
+
+
+def half_power_intervals(
+    problem: FitProblem, objective: Residuals, seen: Expansion, covariance: np.ndarray, names: list[str]
+) -> dict[str, Interval]:
+    """The frequencies at which the response may have half its power, from the lowest to the highest; of each of the names.
+
+    `L(f) = ln(2 |H(f)|² / |H(0)|²)` is zero at the true one, whatever the shape of the response. So f belongs to the
+    interval if L(f) can be held at zero, all else fitted anew, and twice the cost rises by at most
+    `3.84 gᵀ C g / gᵀ G g`: g is the slope of L(f) with respect to θ, C the covariance of the estimates, G the inverse
+    curvature of the cost. Open at both ends, which means not determined, if it leaves the compared bins: no data are there.
+
+    Of fits in linear response with log residuals only (empty otherwise).
+
+    **Source:** the inversion of a test is Fieller's (1954, doi:10.1111/j.2517-6161.1954.tb00159.x).
+    """
+    if not objective.linear or problem.residual != "log":
+        return {}
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # a row that runs away belongs to no interval
+        return {name: _interval(problem, objective, seen, covariance, name) for name in names}
+
+
+def _interval(problem: FitProblem, objective: Residuals, seen: Expansion, covariance: np.ndarray, name: str) -> Interval:
+    """Damped Gauss-Newton steps from the ridge `θ - G g L / (gᵀ G g)`, all frequencies at once.
+
+    After each step a frequency goes on from where it stands best, be it another's place.
+    """
+    found = _Search.of(problem, objective, seen, covariance, name)
+    if found is None:
+        return OPEN
+    search, theta = found
+    here = search.look(theta).shared(search)
+    damping, merit, quiet = np.full(len(theta), 1e-2), here.merit(search), 0
+    for _ in range(TURNS):
+        tried = search.look(here.theta + here.step(search, damping))
+        better = tried.merit(search) < merit
+        damping = np.where(better, 0.2 * damping, 10 * damping)
+        here, before = here.where(better, tried).shared(search), merit
+        merit = here.merit(search)
+        gain = (before - merit)[search.rise(merit) < NEAR]
+        quiet = quiet + 1 if np.max(gain, initial=0.0) < GAIN else 0
+        if quiet == QUIET or search.reaches_an_edge(merit):
+            break
+    return search.ends(merit)
+
+
+class _Search(NamedTuple):
+    """One row for each frequency [ln Hz] that is tried: below the value `top` and then above it, outward.
+
+    `tight`, how closely its level is held; `wanted`, root of the rise of twice the `cost` that ends the interval.
+    """
+
+    problem: FitProblem
+    objective: Residuals
+    part: int
+    top: float
+    log_f: Float[np.ndarray, " rows"]
+    tight: Float[np.ndarray, " rows"]
+    wanted: Float[np.ndarray, " rows"]
+    cost: float
+
+    @classmethod
+    def of(
+        cls, problem: FitProblem, objective: Residuals, seen: Expansion, covariance: np.ndarray, name: str
+    ) -> "tuple[_Search, Float[np.ndarray, 'rows free']] | None":
+        """With the point of the ridge of each frequency; nothing where the value is outside the compared bins."""
+        part, _ = problem.where(name)
+        target = problem.parts[part].target
+        here = Point.of(problem, objective, jax.tree.map(lambda x: np.asarray(x)[None], seen))
+        value, slope = (pair[0] for pair in here.quantity(name))
+        low, high = np.log(target.frequency[[0, -1]] + target.settings.resolution * np.array([-0.5, 0.5]))
+        top = float(np.log(value))
+        if not low < top < high:
+            return None
+        sd = float(np.sqrt(slope @ covariance @ slope) / value)
+        log_f = np.concatenate([_aims(top, sd, edge) for edge in (low, high)])
+        everywhere = np.tile(here.theta, (len(log_f), 1)), np.tile(log_f, (len(log_f), 1))  # one size, one program
+        level, g = (x[0] for x in _levels_of(objective, part, *everywhere))
+        gain = np.linalg.pinv(here.jacobian[0].T @ here.jacobian[0] + np.diag(problem.prior), hermitian=True)
+        ours, stated = (np.einsum("fi,ij,fj->f", g, matrix, g) for matrix in (gain, covariance))
+        tight = np.minimum(HELD * np.sqrt(ours), LOOSE)
+        search = cls(problem, objective, part, top, log_f, tight, REACH * np.sqrt(stated / ours), float(here.cost[0]))
+        return search, here.theta[0] - (g @ gain) * (level / ours)[:, None]
+
+    def look(self, theta: Float[np.ndarray, "rows free"]) -> "_Rows":
+        """What the fit sees at each row."""
+        theta = np.clip(theta, -MOST, MOST)
+        point = Point.of(self.problem, self.objective, expand(self.objective, theta))
+        levels, slopes = _levels_of(self.objective, self.part, theta, np.tile(self.log_f, (len(theta), 1)))
+        return _Rows(theta, levels, slopes, point.residual, point.jacobian, point.cost)
+
+    def rise(self, merit: Float[np.ndarray, " rows"]) -> Float[np.ndarray, " rows"]:
+        """Root of twice the rise of the cost, over that at the end of the interval."""
+        return np.sqrt(np.maximum(2 * (merit - self.cost), 0.0)) / self.wanted
+
+    def reaches_an_edge(self, merit: Float[np.ndarray, " rows"]) -> bool:
+        """Whether the last frequency of a side belongs to the interval. A merit only falls."""
+        return bool(np.any(self.rise(merit)[[EACH - 1, -1]] <= 1))
+
+    def ends(self, merit: Float[np.ndarray, " rows"]) -> Interval:
+        """The outermost points where the rise is 1; its root is nearly linear in between."""
+        if self.reaches_an_edge(merit):
+            return OPEN
+        low, high = (self._end(rows, self.rise(merit)) for rows in (slice(EACH), slice(EACH, None)))
+        return Interval(low - self.top, high - self.top, log=True)
+
+    def _end(self, rows: slice, rise: Float[np.ndarray, " rows"]) -> float:
+        """Of one side."""
+        at, rise = np.append(self.top, self.log_f[rows]), np.append(0.0, rise[rows])
+        last = int(np.flatnonzero(rise <= 1)[-1])
+        return float(np.interp(1.0, rise[last : last + 2], at[last : last + 2]))
+
+
+class _Rows(NamedTuple):
+    """Of each row θ, the level at every frequency with its slopes, data residuals with slopes, and cost."""
+
+    theta: Float[np.ndarray, "rows free"]
+    level: Float[np.ndarray, "rows rows"]
+    slope: Float[np.ndarray, "rows rows free"]
+    residual: Float[np.ndarray, "rows residuals"]
+    jacobian: Float[np.ndarray, "rows residuals free"]
+    cost: Float[np.ndarray, " rows"]
+
+    def merits(self, search: _Search) -> Float[np.ndarray, "rows rows"]:
+        """The cost with the level at one frequency (second axis) held at zero."""
+        merits = self.cost[:, None] + 0.5 * (self.level / search.tight) ** 2
+        return np.where(np.isfinite(merits), merits, np.inf)
+
+    def merit(self, search: _Search) -> Float[np.ndarray, " rows"]:
+        """That of each row's own frequency."""
+        return np.diagonal(self.merits(search))
+
+    def shared(self, search: _Search) -> "_Rows":
+        """For every frequency the row that suits it best."""
+        pick = np.argmin(self.merits(search), axis=0)
+        return _Rows(*(x[pick] for x in self))
+
+    def where(self, better: np.ndarray, other: "_Rows") -> "_Rows":
+        """The other where it is better."""
+        return _Rows(*(np.where(better.reshape(-1, *[1] * (np.ndim(old) - 1)), new, old)
+                       for new, old in zip(other, self, strict=True)))  # fmt: skip
+
+    def step(self, search: _Search, damping: np.ndarray) -> Float[np.ndarray, "rows free"]:
+        """A damped Gauss-Newton step of the merit, at most one prior standard deviation."""
+        rows, prior = np.arange(len(self.theta)), np.diag(search.problem.prior)
+        pull, rise = self.level[rows, rows] / search.tight, self.slope[rows, rows] / search.tight[:, None]
+        curvature = np.einsum("rki,rkj->rij", self.jacobian, self.jacobian) + prior + rise[:, :, None] * rise[:, None]
+        gradient = np.einsum("rki,rk->ri", self.jacobian, self.residual) + self.theta @ prior + pull[:, None] * rise
+        size = np.maximum(np.diagonal(curvature, axis1=1, axis2=2), 1e-8)
+        curvature = curvature + (damping[:, None] * size)[:, None] * np.eye(len(prior))
+        fine = np.isfinite(self.cost) & np.all(np.isfinite(gradient), axis=1)
+        step = np.zeros_like(self.theta)
+        step[fine] = -np.linalg.solve(curvature[fine], gradient[fine][..., None])[..., 0]
+        return step * np.minimum(1.0, 1.0 / np.maximum(np.max(np.abs(step), axis=1, keepdims=True), 1e-300))
+
+
+def _aims(top: float, sd: float, edge: float) -> Float[np.ndarray, " each"]:
+    """Frequencies [ln Hz] from near the value to an edge of the bins, ever further apart."""
+    reach = abs(edge - top)
+    return top + np.sign(edge - top) * np.geomspace(min(NEAREST * sd, reach / EACH), reach, EACH)
+
+
+def _levels_of(
+    objective: Residuals, part: int, theta: Float[np.ndarray, "rows free"], log_f: Float[np.ndarray, "rows points"]
+) -> tuple[Float[np.ndarray, "rows points"], Float[np.ndarray, "rows points free"]]:
+    """`ln(2 |H(f)|² / |H(0)|²)` of one part at every row's frequencies [ln Hz], and its slopes with respect to θ.
+
+    It is zero where f is the half-power frequency, in a fit that was corrected by simulation the corrected one.
+    """
+    model = objective.parts[part].model
+    shift = float(np.log(model.correction.half)) if isinstance(model, Linear) else 0.0
+    levels, slopes = _levels(objective.parts[part], np.asarray(objective.own(theta, part)), log_f - shift)
+    return np.asarray(levels), objective.spread(np.asarray(slopes), part)
+
+
+@kept
+def _levels(
+    part: PartResiduals, theta: Float[Array | np.ndarray, "rows own"], log_f: Float[Array | np.ndarray, "rows points"]
+) -> tuple[Any, Any]:
+    def one(theta, log_f):
+        def levels(theta):
+            task = task_at(part.task, part.coordinates, theta)
+            levels = half_power_level(task, linearise(task), log_f)
+            return levels, levels
+
+        slopes, levels = jax.jacfwd(levels, has_aux=True)(theta)
+        return levels, slopes
+
+    return jax.vmap(one)(theta, log_f)
