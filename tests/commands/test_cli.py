@@ -839,6 +839,8 @@ def test_steadiness_of_trials(tmp_path):
         measure = found[row["quantity"]]
         assert row["unit"] == measure.unit and row["error_from"] == "trials"
         assert (row["value"] == "" and np.isnan(measure.value)) or float(row["value"]) == pytest.approx(measure.value)
+        ends = tuple(float(row[end]) for end in ("low", "high") if row[end])
+        assert ends == (() if measure.interval is None else pytest.approx(measure.interval))
     read = json.loads((tmp_path / "out" / "steadiness.json").read_text())
     assert read["measures"]["mean"]["stderr"] == pytest.approx(found["mean"].stderr)
     assert (tmp_path / "out" / "steadiness.png").stat().st_size > 10_000

@@ -374,6 +374,8 @@ def test_the_command(file, tmp_path):
     wanted = {name: (m.value, m.stderr, m.unit) for name, m in held.second_order().items()}
     for name, numbers in wanted.items():
         assert tuple(found["second_order"][name].values()) == pytest.approx(numbers)
+        value, error, _ = numbers
+        assert held.second_order()[name].interval == pytest.approx((value - 1.96 * error, value + 1.96 * error))
     assert found["second_order"]["delay"]["unit"] == "s"
     code, text = analyse(file, *columns)
     assert code == 2

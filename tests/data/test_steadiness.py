@@ -3,6 +3,7 @@
 import functools
 import json
 import math
+import re
 
 import jaxtyping
 import matplotlib.pyplot as plt
@@ -10,10 +11,15 @@ import numpy as np
 import pandas
 import pytest
 import scipy.signal
+import scipy.special
 import scipy.stats
+from hypothesis import given
+from hypothesis import strategies as st
 
 import jaxmuscle as jm
-from jaxmuscle.data._steadiness import RANGES, _error, _own, _peak, _segments
+from jaxmuscle.data import Measure, _steadiness
+from jaxmuscle.data._measure import log_interval, logit_interval, student_interval
+from jaxmuscle.data._steadiness import RANGES, _error, _interval, _own, _peak, _segments, _stated, _together
 from jaxmuscle.objective._consequences import derived_names
 from jaxmuscle.spectra._bin_law import student
 from jaxmuscle.spectra._fluctuations import dfa
@@ -152,9 +158,8 @@ def test_three_trials_scatter_and_two_do_not(found):
 
 def test_the_interval_is_that_of_student(found):
     """With t the interval holds the expected value in 95 % of a thousand people with five trials, with 1.96 in 88 %."""
-    text = " ".join(str(found).split())
-    assert "between the 3 trials" in text and "A 95 % interval is ± 4.3 of it (Student's t)" in text
-    assert "Student" not in str(jm.steadiness(trials()[:2]))
+    low, high = found["mean"].interval
+    assert (low, high) == pytest.approx(scipy.stats.t.interval(0.95, 2, found["mean"].value, found["mean"].stderr))
     values = forces(5000, 10.0, seed=4).std(axis=1).reshape(1000, 5)
     far = np.abs(values.mean(axis=1) - values.mean()) / scipy.stats.sem(values, axis=1)
     held, too_few = (scipy.stats.binomtest(int(np.sum(far < reach)), 1000, 0.95).pvalue for reach in (student(5), 1.96))
@@ -206,14 +211,14 @@ def test_units_are_said_as_they_are(unit, square):
     one = jm.steadiness(jm.Recording(forces(3, 15.0)[0], RATE, unit=unit))
     assert one["mean"].unit == unit and one["power_0_0.5"].unit == square.replace("²", "^2") and one[CV].unit == "1"
     text = str(one)
-    assert f"[{unit}]" in text and f" {square}" in text and (unit == "N" or " N\n" not in text)
+    assert f"[{unit}]" in text and f"power by band [{square}]" in text and f" {unit}  " in text
     assert max(len(line) for line in text.splitlines()) <= 80
 
 
 def test_mistakes_are_named(user_view):
     x = forces(3, 15.0)[0]
     newtons, share = jm.Recording(x, RATE, name="a"), jm.Recording(x, RATE, name="b", unit="% MVC")
-    for given, message in (
+    for wrong, message in (
         ([], "give at least one"),
         ([newtons, share], r"units differ \(b in % MVC, a in N\); convert them"),
         ("trial.csv", r"load_recording\(...\) reads a file"),
@@ -221,7 +226,7 @@ def test_mistakes_are_named(user_view):
         (jm.Recording(np.concatenate([x, np.ones(600)]), RATE, window=(15.5, 20.5)), "is constant in the window"),
     ):
         with pytest.raises(ValueError, match=message):
-            jm.steadiness(given)
+            jm.steadiness(wrong)
     with pytest.raises(ValueError, match="did you mean 'sample_entropy'"):
         jm.steadiness(newtons)["sample_entrpy"]
 
@@ -240,16 +245,154 @@ def test_trials_of_different_length_are_noticed():
 
 def test_tables_and_files(found, tmp_path):
     table = found.to_dataframe()
-    assert list(table) == ["trial", "duration_s", "quantity", "value", "stderr", "unit", "error_from"]
+    assert list(table) == ["trial", "duration_s", "quantity", "value", "stderr", "low", "high", "unit", "error_from"]
     assert len(table) == 4 * len(found.measures) and list(table.trial.unique()) == [*found.trials, "all"]
     wide = table.pivot(index="trial", columns="quantity", values="value")
     assert wide.loc["all", CV] == found[CV].value and wide.loc["trial 1", CV] == found.trials["trial 1"][CV].value
     assert table[table.trial == "all"].duration_s.unique() == [45.0]
     found.save(tmp_path / "steadiness.json")
     read = json.loads((tmp_path / "steadiness.json").read_text())
-    assert read["measures"][CV] == vars(found[CV]) and found[CV].unit == "1"
+    assert read["measures"][CV] == vars(found[CV]) | {"interval": list(found[CV].interval)} and found[CV].unit == "1"
+    assert tuple(table[(table.trial == "all") & (table.quantity == CV)][["low", "high"]].iloc[0]) == found[CV].interval
     assert read["trials"]["trial 2"]["duration_s"] == 15.0 and read["unit"] == "N" and "jaxmuscle" in read["versions"]
     assert isinstance(table, pandas.DataFrame)
     figure = found.plot()
     assert len(figure.axes) == 3
     plt.close(figure)
+
+
+# --- 95 % intervals
+
+ROUNDED = 2e-5  # of 1.96, which is 1.959964
+POSITIVE = st.floats(1e-12, 1e12)
+PARTS = 1 - 1e-9
+
+
+def expected_interval(name, m, count, segments):
+    """The law of `docs/recordings.md`, by SciPy."""
+    if count >= 3:
+        degrees = count - 1
+    elif name in ("approximate_entropy", "sample_entropy", "dfa_exponent"):
+        degrees = 3 * count
+    elif name == "mean":
+        degrees = 4 * count
+    elif name == "peak_frequency":
+        degrees = segments - 1
+    elif name.startswith("share"):
+        logit = scipy.special.logit(m.value)
+        return scipy.special.expit(scipy.stats.norm.interval(0.95, logit, m.stderr / (m.value * (1 - m.value))))
+    else:
+        return scipy.stats.lognorm.interval(0.95, m.stderr / m.value, scale=m.value)
+    low, high = scipy.stats.t.interval(0.95, degrees, m.value, m.stderr)
+    return max(low, 0), min(high, 1) if name.startswith("share") else high
+
+
+@pytest.mark.parametrize("count", [1, 2, 3])
+def test_every_error_has_the_interval_of_its_law(count, found):
+    one = found if count == 3 else jm.steadiness(trials()[:count])
+    segments = [recording.segments() for recording in trials()]
+    for name, m in one.measures.items():
+        wanted = expected_interval(name, m, count, sum(segments[:count]))
+        assert m.interval == pytest.approx(wanted, rel=3 * ROUNDED, abs=1e-12), name
+    for i, own in enumerate(one.trials.values()):
+        for name, m in own.items():
+            assert (m.interval is None) == (m.stderr is None)
+            if m.interval is not None:
+                assert m.interval == pytest.approx(expected_interval(name, m, 1, segments[i]), rel=3 * ROUNDED), name
+
+
+@given(POSITIVE, st.floats(0, 1e3))
+def test_the_interval_in_the_logarithm(value, ratio):
+    low, high = log_interval(value, ratio * value)
+    assert 0 < low <= value <= high < math.inf
+    assert low * high == pytest.approx(value**2)
+
+
+@given(st.floats(1e-9, PARTS), st.floats(0, 1e3))
+def test_the_interval_of_a_share(share, ratio):
+    low, high = logit_interval(share, ratio * share * (1 - share))
+    rounding = 1e-12
+    assert 0 <= low <= share + rounding and share - rounding <= high <= 1
+    assert logit_interval(1 - share, ratio * share * (1 - share)) == pytest.approx((1 - high, 1 - low), abs=1e-6)
+
+
+def test_the_limits_of_the_law():
+    """A small share is as a power; what is certain has no width; many trials make t that of the normal law."""
+    small = 1e-9
+    assert logit_interval(small, 0.5 * small) == pytest.approx(log_interval(small, 0.5 * small), rel=1e-7)
+    low, high = log_interval(small, 0.5 * small)
+    assert [1 - end for end in logit_interval(1 - small, 0.5 * small)] == pytest.approx([high, low], rel=1e-6)
+    for certain in (0.0, 1.0, 1 + 1e-15):
+        assert logit_interval(certain, 0.0) == (certain, certain) == log_interval(certain, 0.0)
+    assert logit_interval(1.0, 1e-20) == (1.0, 1.0)
+    assert student_interval(5.0, 0.0, 2) == (5.0, 5.0)
+    assert student_interval(0.0, 1.0, 10**6) == pytest.approx((-1.96, 1.96), rel=1e-5 + ROUNDED)
+    error = 1e-3
+    assert log_interval(2.0, error) == pytest.approx((2 - 1.96 * error, 2 + 1.96 * error), abs=4 * error**2)
+
+
+def test_intervals_by_scatter_are_cut_where_no_value_can_lie():
+    """Three trials: t is 4.3. A mean and a DFA exponent may be negative."""
+    for name, value, error, ends in (
+        ("power_1_2", 0.1, 0.1, (0.0, 0.1 + 0.1 * student(3))),
+        ("share_1_2", 0.5, 0.2, (0.0, 1.0)),
+        ("mean", 0.1, 0.1, (0.1 - 0.1 * student(3), 0.1 + 0.1 * student(3))),
+        ("dfa_exponent", 0.1, 0.1, (0.1 - 0.1 * student(3), 0.1 + 0.1 * student(3))),
+    ):
+        assert _interval(name, Measure(value, error, "1", "trials"), 2) == pytest.approx(ends)
+    assert _interval("mean", Measure(math.nan, None, "N", "trials"), 2) is None
+
+
+@pytest.mark.parametrize("count", [1, 3])
+def test_what_is_printed_is_what_is_saved(count, found):
+    one = found if count == 3 else jm.steadiness(trials()[0])
+    rows = re.findall(r"(\S+) ± (\S+)(?: N| %| Hz)? +(\S+) to (\S+)$", str(one), re.MULTILINE)
+    words = list(_steadiness.WORDS)
+    names = words[:5] + [f"{kind}{name}" for kind in ("power", "share") for name in RANGES] + words[5:]
+    saved = one.to_dict()["measures"]
+    assert len(rows) == len(names) == len(saved)
+    for name, row in zip(names, rows, strict=True):
+        scale = 100 if name.startswith((CV, "share")) else 1
+        numbers = [saved[name]["value"], saved[name]["stderr"], *saved[name]["interval"]]
+        half_a_place = 0.5 * 10.0 ** -len(row[1].partition(".")[2])
+        np.testing.assert_allclose([float(x) for x in row], np.multiply(scale, numbers), atol=1.001 * half_a_place, rtol=0)
+
+
+CHANCE = 1e-4
+
+
+@pytest.fixture(scope="module")
+def without_entropies():
+    """They take most of the time."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(_steadiness, "regularity", lambda x: (1.0, 1.0))
+        patch.setattr(_steadiness, "dfa", lambda x: 1.0)
+        yield
+
+
+def held(name, truth, measures):
+    return sum(m[name].interval[0] <= truth <= m[name].interval[1] for m in measures)
+
+
+@pytest.mark.slow
+def test_intervals_of_the_mean_hold_it(without_entropies):
+    """Of a white signal the four slowest ordinates and the mean are independent, so t is exact; 1.96 errors hold 88 %."""
+    own = [_own(x, "N") for x in LEVEL + SD * np.random.default_rng(6).standard_normal((400, 400))]
+    one = [_stated(m, 1, 2) for m in own]
+    two = [_stated({"mean": _together([a["mean"], b["mean"]])}, 2, 4) for a, b in zip(own[::2], own[1::2], strict=True)]
+    for measures in (one, two):
+        low, high = scipy.stats.binom.ppf([CHANCE / 2, 1 - CHANCE / 2], len(measures), 0.95)
+        assert low <= held("mean", LEVEL, measures) <= high
+
+
+@pytest.fixture(scope="module")
+def recordings_of_20_s(without_entropies):
+    return [_stated(_own(x, "N"), 1, 2) for x in forces(200, 20.0, seed=7)]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["power_0_0.5", "power_0.5_1", "power_1_2", "share_0.5_1", CV])
+def test_intervals_of_a_power_hold_it(name, recordings_of_20_s):
+    """91 % or more by the table in docs/recordings.md, of which 1 % is chance."""
+    truth = np.mean([m[name].value for m in recordings_of_20_s])
+    assert held(name, truth, recordings_of_20_s) >= scipy.stats.binom.ppf(CHANCE, len(recordings_of_20_s), 0.90)

@@ -23,7 +23,8 @@ def steadiness(
 ) -> None:
     """How steady is a force? Variability, power by band, regularity of one or several trials, without a model.
 
-    Give the trials of one person in one condition. From three trials on, the errors follow from how much the trials differ.
+    Give the trials of one person in one condition. Prints every value with its standard error and 95 % interval. From three
+    trials on, they follow from how much the trials differ.
     Writes DIR/steadiness.json, DIR/steadiness.csv (a row per trial and quantity) and DIR/steadiness.png.
 
     Example:

@@ -5,13 +5,13 @@ from ._as_target import is_recording as is_recording
 from ._frequency_response import FrequencyResponse as FrequencyResponse
 from ._frequency_response_files import is_frequency_response as is_frequency_response
 from ._frequency_response_files import load_frequency_response as load_frequency_response
+from ._measure import Measure as Measure
 from ._perturbed import PerturbedRecording as PerturbedRecording
 from ._recording import Recording as Recording
 from ._recording_files import load_recording as load_recording
 from ._recording_files import read_table as read_table
 from ._recording_quality import RecordingSummary as RecordingSummary
 from ._recording_table import Table as Table
-from ._steadiness import Measure as Measure
 from ._steadiness import Steadiness as Steadiness
 from ._steadiness import steadiness as steadiness
 from ._target import Target as Target

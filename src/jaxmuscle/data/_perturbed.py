@@ -15,10 +15,10 @@ from jaxmuscle.spectra._cross_spectrum import Response, response_of
 from jaxmuscle.spectra._settings import SpectrumSettings, require
 
 from ._frequency_response import FrequencyResponse
+from ._measure import Measure, normal_interval
 from ._perturbed_target import perturbed_target
 from ._recording import Recording, recorded_settings
 from ._second_order import SecondOrder, lengthens, second_order_fit
-from ._steadiness import Measure
 from ._target import Target
 from ._units import scale_to_si
 
@@ -176,13 +176,14 @@ class PerturbedRecording(Printed, eqx.Module):
         Least squares, weighted with the errors of the response. If the response has another shape, the errors are multiplied
         by √(chi² / its expectation): the muscle is more than a spring, a damper and a mass.
 
-        **Returns:** `{"K": ..., "B": ..., "I": ...}` [N/m, N s/m, kg], each a `Measure` with `value` and `stderr`.
+        **Returns:** `{"K": ..., "B": ..., "I": ...}` [N/m, N s/m, kg], each a `Measure` with `interval`.
 
         **Source:** Kearney & Hunter 1990, Crit Rev Biomed Eng 18(1):55-87.
         """
         found = self._second_order(settings, False)
         rows = zip("KBI", found.value, found.stderr, UNITS, strict=False)
-        return {name: Measure(float(value), float(error), unit, "spectrum") for name, value, error, unit in rows}
+        return {name: Measure(float(value), float(error), unit, "spectrum", normal_interval(float(value), float(error)))
+                for name, value, error, unit in rows}  # fmt: skip
 
     def _second_order(self, settings: SpectrumSettings | str | None, delayed: bool) -> SecondOrder:
         return second_order_fit(self._response(settings), delayed)

@@ -16,11 +16,12 @@ from jaxmuscle._common.environment import versions
 from jaxmuscle._common.files import nulled, write_json
 from jaxmuscle._common.tables import frame
 from jaxmuscle._common.text import choices, folded, rounded, squared
-from jaxmuscle.spectra._bin_law import ENOUGH, student
+from jaxmuscle.spectra._bin_law import ENOUGH
 from jaxmuscle.spectra._fluctuations import BANDS, dfa, variance_spectrum
 from jaxmuscle.spectra._measures import regularity
 from jaxmuscle.spectra._settings import require
 
+from ._measure import Measure, log_interval, logit_interval, student_interval
 from ._recording import RECORDED, SEGMENTS, Recording
 
 if TYPE_CHECKING:
@@ -35,6 +36,7 @@ ALIKE = 1.2  # longest trial over shortest
 TREMOR, RISE, HALF = 6.0, 4.0, 3  # Hz; standard deviations of a bin; bins on either side
 RANGES = {name.removeprefix("band"): edges for name, edges in BANDS.items()} | {"_above_12": (12.0, math.inf)}
 FAST = 0.5  # Hz
+SIGNED = ("mean", "dfa_exponent")  # all else is 0 or more
 VARIATION = "coefficient_of_variation"
 REGULARITY = ("approximate_entropy", "sample_entropy", "dfa_exponent")
 WORDS = {
@@ -48,19 +50,6 @@ WORDS = {
     "dfa_exponent": "DFA exponent",
     "peak_frequency": "peak between 6 and 12 Hz",
 }
-
-
-class Measure(eqx.Module):
-    """A `value` with its standard error `stderr` (`None` if there is none), both in `unit` ("1" for pure numbers).
-
-    `error_from` says what the error stands on: "trials", the scatter between three or more trials; or, of fewer trials,
-    what is within them: "spectrum", "parts" or "segments", see `steadiness`. A value that does not exist is NaN.
-    """
-
-    value: float
-    stderr: float | None
-    unit: str
-    error_from: str
 
 
 class Steadiness(Printed, Result, eqx.Module):
@@ -94,15 +83,12 @@ class Steadiness(Printed, Result, eqx.Module):
     def to_dataframe(self) -> "pandas.DataFrame":
         """A row per trial and quantity, then those of all trials together, whose `trial` is "all".
 
-        Columns `trial`, `duration_s`, `quantity`, `value`, `stderr`, `unit`, `error_from`.
+        Columns `trial`, `duration_s`, `quantity`, `value`, `stderr`, `low` and `high` (ends of the 95 % interval), `unit`,
+        `error_from`.
         """
-        together = {ALL: self.measures}
-        rows = [
-            {"trial": name, "duration_s": self.durations.get(name, sum(self.durations.values())), "quantity": quantity,
-             **vars(m), "stderr": math.nan if m.stderr is None else m.stderr}
-            for name, own in (self.trials | together).items()
-            for quantity, m in own.items()
-        ]  # fmt: skip
+        lasted = self.durations | {ALL: sum(self.durations.values())}
+        rows = [{"trial": name, "duration_s": lasted[name], "quantity": quantity, **m.row()}
+                for name, own in (self.trials | {ALL: self.measures}).items() for quantity, m in own.items()]  # fmt: skip
         return frame(rows)
 
     def plot(self, ax: "Axes | None" = None) -> "Figure | SubFigure":
@@ -113,23 +99,23 @@ class Steadiness(Printed, Result, eqx.Module):
         count, seconds = len(self.trials), sorted(self.durations.values())
         long = f"{seconds[0]:.3g} s" + (f" to {seconds[-1]:.3g} s each" if seconds[-1] > 1.01 * seconds[0] else "")
         what = f"{count} trials" if count > 1 else next(iter(self.trials))
-        said = {name: _said(name, measure) for name, measure in self.measures.items()}
-        lines = [f"{words:<28}{said[name]}" for name, words in WORDS.items()]
-        lines[5:5] = ["power by band, and its share of the variance"]
-        lines[6:6] = [f"  {_range(*edges):<26}{said[f'power{name}']:<25} {said[f'share{name}']}"
-                      for name, edges in RANGES.items()]  # fmt: skip
+        lines = [_line(words, name, self.measures[name]) for name, words in WORDS.items()]
+        bands = [[_line(f"  {_range(*edges)}", f"{kind}{name}", self.measures[f"{kind}{name}"])
+                  for name, edges in RANGES.items()] for kind in ("power", "share")]  # fmt: skip
+        square = squared(self.unit).replace("^2", "²")
+        lines[5:5] = [f"power by band [{square}]", *bands[0], "share of the variance", *bands[1]]
         head = f"Steadiness of {what}: {self.quantity or 'signal'} [{self.unit}], {long}"
-        return folded([head, *lines, _of_errors(count), *(f"notice: {notice}" for notice in self.notices)])
+        columns = f"{'':<28}{'value ± standard error':<25} 95 % interval"
+        return folded([head, columns, *lines, _of_errors(count), *(f"notice: {notice}" for notice in self.notices)])
 
 
 def _of_errors(count: int) -> str:
-    """What the errors contain, and how an interval follows from them."""
+    """What the errors contain."""
     if count < ENOUGH:
         return ("± is the standard error, from within the recording: of entropies and DFA from its four parts, of the peak "
                 "from its Welch segments, of all else from its spectrum.")  # fmt: skip
-    return (f"± is the standard error, from the scatter between the {count} trials. A 95 % interval is ± "
-            f"{student(count):.2g} of it (Student's t). A fit's errors may be larger: it takes the trials to scatter at "
-            "least as much as chance makes them.")  # fmt: skip
+    return (f"± is the standard error, from the scatter between the {count} trials. A fit's errors may be larger: it takes "
+            "the trials to scatter at least as much as chance makes them.")  # fmt: skip
 
 
 def _plain(measures: dict[str, Measure]) -> dict[str, Any]:
@@ -140,15 +126,18 @@ def _range(low: float, high: float) -> str:
     return f"{low:g} to {high:g} Hz" if math.isfinite(high) else f"above {low:g} Hz"
 
 
-def _said(name: str, m: Measure) -> str:
-    if math.isnan(m.value):
-        return "no sharp one" if name == "peak_frequency" else "none"
+def _line(words: str, name: str, m: Measure) -> str:
+    """The ends of the interval have as many places as value and error."""
     percent = name.startswith((VARIATION, "share"))
-    scale, unit = (100.0, " %") if percent else (1.0, f" {m.unit.replace('^2', '²')}" * (m.unit != "1"))
-    if m.stderr is None:
-        return f"{scale * m.value:.3g}{unit}"
-    value, error = rounded(scale * m.value, scale * m.stderr)
-    return f"{value} ± {error}{unit}"
+    bare = m.unit == "1" or name.startswith("power")
+    scale, unit = (100.0, " %") if percent else (1.0, "" if bare else f" {m.unit.replace('^2', '²')}")
+    said, ends = f"{scale * m.value:.3g}{unit}", ""
+    if math.isnan(m.value):
+        said = "no sharp one" if name == "peak_frequency" else "none"
+    if m.stderr is not None and m.interval is not None:
+        said = " ± ".join(rounded(scale * m.value, scale * m.stderr)) + unit
+        ends = " to ".join(rounded(scale * end, scale * m.stderr)[0] for end in m.interval)
+    return f"{words:<28}{said:<25} {ends}".rstrip()
 
 
 def steadiness(recordings: Recording | Iterable[Recording]) -> Steadiness:
@@ -184,17 +173,19 @@ def steadiness(recordings: Recording | Iterable[Recording]) -> Steadiness:
 
     **Standard errors**, by the number of trials:
 
-    - Three or more, "trials": the standard deviation between the trials over √n; of the peak, the jackknife over trials. For
-      a 95 % interval use Student's t with n - 1 degrees of freedom: ± 4.3 errors of three trials, 2.8 of five, 2.3 of ten.
-      A fit takes the larger of this scatter, with that t, and of what trials of this length scatter by chance: five trials
-      may happen to agree.
+    - Three or more, "trials": the standard deviation between the trials over √n; of the peak, the jackknife over trials. A
+      fit takes the larger of this scatter and of what trials of this length scatter by chance: five may happen to agree.
     - One or two, "spectrum": the ordinates of the spectrum are independent, with variance 2/3 of their square, as in a
       stationary Gaussian signal; of the mean, from the four slowest. What is slower than the recording is not in it: where
       the level wanders, the mean of the next trial differs by more.
     - One or two, "parts" (entropies, DFA exponent): the standard deviation of the values of the four quarters over 2;
       "segments" (peak): the jackknife over Welch segments.
 
-    How often these errors held the expected value in simulated recordings stands in `docs/recordings.md`.
+    **95 % intervals**, value ± t errors, with Student's t of ν degrees of freedom, cut where no value can lie (below 0; of a
+    share above 1): "trials" ν = n - 1; "parts" 3n; "segments" their number less 1; the mean 4n. For if the spectrum is flat
+    up to 2/T, the squared error of the mean is the mean of 4n squares of normal numbers, which are independent of the mean.
+    What else is from the "spectrum": value · exp(± 1.96 error / value); of a share p the same of its odds p / (1 - p). How
+    often they hold the expected value stands in `docs/recordings.md`.
 
     **Arguments:** `recordings`, one or several trials of one condition of one person, in one unit.
 
@@ -217,12 +208,13 @@ def steadiness(recordings: Recording | Iterable[Recording]) -> Steadiness:
     signals = [recording.filtered() for recording in each]
     segments = [_segments(x) for x in signals]
     own = [_own(x, each[0].unit) for x in signals]
-    trials = {name: m | {"peak_frequency": _peak([*s[:, None]], "segments")}
+    trials = {name: _stated(m | {"peak_frequency": _peak([*s[:, None]], "segments")}, 1, len(s))
               for name, m, s in zip(names, own, segments, strict=True)}  # fmt: skip
     many = len(each) >= ENOUGH
     peak = _peak(segments if many else [*np.concatenate(segments)[:, None]], "trials" if many else "segments")
     together = {name: _together([m[name] for m in own]) for name in own[0]} | {"peak_frequency": peak}
     said = [f"{name}: {notice}" for name, recording in zip(names, each, strict=True) for notice in recording.notices]
+    together = _stated(together, len(each), sum(map(len, segments)))
     return Steadiness(together, trials, durations, each[0].unit, each[0].quantity, (*said, *_mind(durations, together)))
 
 
@@ -287,6 +279,24 @@ def _variation(power: Float[np.ndarray, " frequencies"], mean: float, sure: floa
         return _measure(math.nan, math.nan, "1")
     error = math.hypot(_error(power) / (2 * deviation * mean), deviation * sure / mean**2)
     return _measure(deviation / abs(mean), error, "1")
+
+
+def _stated(measures: dict[str, Measure], trials: int, segments: int) -> dict[str, Measure]:
+    """The measures with their 95 % intervals."""
+    degrees = {"trials": trials - 1, "spectrum": SLOWEST * trials, "parts": (PARTS - 1) * trials, "segments": segments - 1}
+    return {name: Measure(m.value, m.stderr, m.unit, m.error_from, _interval(name, m, degrees[m.error_from]))
+            for name, m in measures.items()}  # fmt: skip
+
+
+def _interval(name: str, m: Measure, degrees: int) -> tuple[float, float] | None:
+    """Student's t, cut where no value can lie; but of what the spectrum says besides the mean in the logarithm or logit."""
+    if m.stderr is None:
+        return None
+    share = name.startswith("share")
+    if m.error_from == "spectrum" and name != "mean":
+        return (logit_interval if share else log_interval)(m.value, m.stderr)
+    low, high = student_interval(m.value, m.stderr, degrees)
+    return low if name in SIGNED else max(low, 0.0), min(high, 1.0) if share else high
 
 
 def _together(each: list[Measure]) -> Measure:

@@ -1,0 +1,59 @@
+"""A measured number with its standard error and its 95 % interval."""
+
+import math
+from typing import Any
+
+import equinox as eqx
+
+from jaxmuscle.spectra._bin_law import NORMAL, student
+
+FARTHEST = 300.0  # logarithm of a factor, so that no end overflows
+
+
+class Measure(eqx.Module):
+    """A `value` with its standard error `stderr` (`None` if there is none), both in `unit` ("1" for pure numbers).
+
+    `error_from` says what the error stands on: "trials", the scatter between three or more trials; or, of fewer trials,
+    what is within them: "spectrum", "parts" or "segments", see `steadiness`. `interval` has the ends of the 95 % interval,
+    in `unit`, `None` where there is no error. A value that does not exist is NaN.
+    """
+
+    value: float
+    stderr: float | None
+    unit: str
+    error_from: str
+    interval: tuple[float, float] | None = None
+
+    def row(self) -> dict[str, Any]:
+        """As columns of a table, NaN for what does not exist."""
+        low, high = self.interval or (math.nan, math.nan)
+        error = math.nan if self.stderr is None else self.stderr
+        return {"value": self.value, "stderr": error, "low": low, "high": high, "unit": self.unit,
+                "error_from": self.error_from}  # fmt: skip
+
+
+def normal_interval(value: float, error: float) -> tuple[float, float]:
+    """`value ± 1.96 error`, of a normal law."""
+    return value - NORMAL * error, value + NORMAL * error
+
+
+def student_interval(value: float, error: float, degrees: int) -> tuple[float, float]:
+    """`value ± t error`, with the t of Student that so many degrees of freedom of the squared error ask for."""
+    reach = student(degrees + 1) * error
+    return value - reach, value + reach
+
+
+def log_interval(value: float, error: float) -> tuple[float, float]:
+    """`value · exp(± 1.96 error / value)`, normal in the logarithm; of 0, which has no error, 0 to 0."""
+    if value <= 0:
+        return value, value
+    factor = math.exp(min(NORMAL * error / value, FARTHEST))
+    return value / factor, value * factor
+
+
+def logit_interval(share: float, error: float) -> tuple[float, float]:
+    """That of the odds p / (1 - p), normal in their logarithm, so that both ends are shares; of 0 and 1, themselves."""
+    if share >= 1:
+        return share, share
+    low, high = log_interval(share / (1 - share), error / (1 - share) ** 2)
+    return low / (1 + low), high / (1 + high)
