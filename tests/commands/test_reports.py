@@ -10,6 +10,7 @@ from test_result import POWER, failed_result, made_result
 from test_study import made_study
 
 import jaxmuscle as jm
+from jaxmuscle._common.figures import pixels_of
 from jaxmuscle.commands import cohort as cohort_command
 from jaxmuscle.commands.console import write_fit
 from jaxmuscle.commands.reports import fit_report, posterior_report, study_report
@@ -111,7 +112,8 @@ def posterior(success):
 
 @pytest.mark.parametrize("success", [True, False])
 def test_of_a_posterior(success, tmp_path):
-    posterior_report(posterior(success), {"chains": plt.figure(figsize=(1, 1))}, tmp_path)
+    figure = plt.figure(figsize=(1, 1))
+    posterior_report(posterior(success), {"chains": figure}, tmp_path, {"chains": pixels_of(figure)})
     text, seen = told(tmp_path)
     assert f"Posterior of {HOSTILE}" in text
     if success:

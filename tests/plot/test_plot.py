@@ -12,7 +12,7 @@ import scipy.special
 from matplotlib.colors import to_rgb, to_rgba
 
 from jaxmuscle import plot
-from jaxmuscle._common.figures import write_figure
+from jaxmuscle._common.figures import pixels_of, write_figure
 from jaxmuscle.checks._recovery import Bootstrap, Recovery
 from jaxmuscle.data._target import Target, load_target
 from jaxmuscle.model._resonant_noise import ResonantNoise
@@ -919,6 +919,15 @@ def test_a_figure_is_written_in_the_formats_asked_for_the_same_each_time(tmp_pat
         write(["jpg"])
     write(["svg", "pdf"])
     assert [(tmp_path / name).read_bytes() for name in ("figure.pdf", "figure.svg")] == once
+
+
+def test_pixels_that_are_drawn_already_are_not_drawn_again(tmp_path):
+    figure, _ = plt.subplots(figsize=(2, 1))
+    drawn = pixels_of(figure)
+    write_figure(figure, tmp_path, "plain")
+    assert (tmp_path / "plain.png").read_bytes() == drawn  # the same figure, whoever draws it
+    assert write_figure(figure, tmp_path, "given", ["png", "svg"], pixels=b"given") == ["given.png", "given.svg"]
+    assert (tmp_path / "given.png").read_bytes() == b"given" and b"<svg" in (tmp_path / "given.svg").read_bytes()
 
 
 # --- the drawing of the model

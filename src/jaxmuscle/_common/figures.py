@@ -1,5 +1,6 @@
 """Figures as files: in one or several formats, each whole or not there."""
 
+import io
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -14,8 +15,23 @@ SETTINGS: Any = {"svg.hashsalt": "jaxmuscle", "pdf.fonttype": 42}
 UNDATED: dict[str, dict[str, Any]] = {"png": {}, "pdf": {"CreationDate": None}, "svg": {"Date": None}}
 
 
-def write_figure(figure: Any, folder: Path, name: str, formats: Iterable[str] = FORMATS[:1]) -> list[str]:
-    """Writes `name` in each format, closes the figure, removes an earlier one in other formats; returns the files' names."""
+def pixels_of(figure: Any) -> bytes:
+    """A figure as PNG, to be drawn once and shown in several places."""
+    import matplotlib
+
+    made = io.BytesIO()
+    with matplotlib.rc_context(SETTINGS):
+        figure.savefig(made, format="png", dpi=DPI, metadata=UNDATED["png"])
+    return made.getvalue()
+
+
+def write_figure(
+    figure: Any, folder: Path, name: str, formats: Iterable[str] = FORMATS[:1], *, pixels: bytes | None = None
+) -> list[str]:
+    """Writes `name` in each format, closes the figure, removes an earlier one in other formats; returns the files' names.
+
+    `pixels`: its PNG, where it has been drawn already.
+    """
     import matplotlib
     import matplotlib.pyplot as plt
 
@@ -25,7 +41,10 @@ def write_figure(figure: Any, folder: Path, name: str, formats: Iterable[str] = 
         raise ValueError(f"formats: {unknown[0]!r} is no format of a figure. {choices(unknown[0], FORMATS)}")
     for kind in wanted:
         with replacing(folder / f"{name}.{kind}") as temporary, matplotlib.rc_context(SETTINGS):
-            figure.savefig(temporary, dpi=DPI, metadata=UNDATED[kind])
+            if kind == "png" and pixels is not None:
+                temporary.write_bytes(pixels)
+            else:
+                figure.savefig(temporary, dpi=DPI, metadata=UNDATED[kind])
     plt.close(figure)
     remove_figures(folder, name, kept=wanted)
     return [f"{name}.{kind}" for kind in wanted]

@@ -118,16 +118,20 @@ def _in_words(value: Any) -> str:
     return str(value)
 
 
-def picture(figure: Any, words: str, *, pixels: bool = False) -> Html:
-    """A figure that stands in the page, with words below: as SVG, or in `pixels` where it has too many lines for that."""
-    import matplotlib
-
-    kind, mime = ("png", "image/png") if pixels else ("svg", "image/svg+xml")
-    made = io.BytesIO()
-    with matplotlib.rc_context(SETTINGS):
-        figure.savefig(made, format=kind, dpi=200, metadata=UNDATED[kind])
-    figure.set_layout_engine("none")  # it stays as it is now: to lay it out again for its own file takes as long as drawing
-    data = base64.b64encode(made.getvalue()).decode()
+def picture(figure: Any, words: str, *, pixels: bytes | None = None) -> Html:
+    """A figure that stands in the page, with words below: as SVG, or its PNG where it has too many lines for that."""
+    mime, made = ("image/svg+xml", _drawn(figure)) if pixels is None else ("image/png", pixels)
+    data = base64.b64encode(made).decode()
     said = escape(words)
     size = f"width='{round(96 * figure.get_figwidth() * 1.25)}'"  # letters of 8 points are read as those of the text
     return Html(f"<figure><img {size} alt='{said}' src='data:{mime};base64,{data}'><figcaption>{said}</figcaption></figure>")
+
+
+def _drawn(figure: Any) -> bytes:
+    import matplotlib
+
+    made = io.BytesIO()
+    with matplotlib.rc_context(SETTINGS):
+        figure.savefig(made, format="svg", metadata=UNDATED["svg"])
+    figure.set_layout_engine("none")  # it stays as it is now: to lay it out again for its own file takes as long as drawing
+    return made.getvalue()

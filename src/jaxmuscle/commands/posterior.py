@@ -94,7 +94,7 @@ def posterior(
 
 
 def _write(found: "Posterior", folder: Path, formats: list[str]) -> None:
-    from jaxmuscle._common.figures import remove_figures, write_figure
+    from jaxmuscle._common.figures import pixels_of, remove_figures, write_figure
 
     from .reports import posterior_report
 
@@ -105,9 +105,10 @@ def _write(found: "Posterior", folder: Path, formats: list[str]) -> None:
     if found.success:
         figures |= {"corner": found.plot(), "predictive": found.plot_predictive().figure}
     figures["chains"] = found.plot_chains()
-    posterior_report(found, figures, folder)
+    drawn = {"chains": pixels_of(figures["chains"])}  # thousands of lines: they are drawn once
+    posterior_report(found, figures, folder, drawn)
     for name, figure in figures.items():
-        write_figure(figure, folder, name, formats)
+        write_figure(figure, folder, name, formats, pixels=drawn.get(name))
 
 
 def _show(found: "Posterior", folder: Path) -> None:

@@ -140,8 +140,8 @@ def study_report(study: "StudyResult", folder: Path) -> None:
     pages.write_page(folder / REPORT, "Study", body)
 
 
-def posterior_report(found: "Posterior", figures: dict[str, Any], folder: Path) -> None:
-    """Write report.html of a posterior."""
+def posterior_report(found: "Posterior", figures: dict[str, Any], folder: Path, drawn: dict[str, bytes]) -> None:
+    """Write report.html of a posterior. `drawn` has the PNG of figures that have too many lines for SVG."""
     body = [_verdict(found.message, good=found.success)]
     if found.success:
         summary = found.summary()
@@ -155,7 +155,7 @@ def posterior_report(found: "Posterior", figures: dict[str, Any], folder: Path) 
                  f"{told['r_hat']:.3f}", f"{size:.0f}")
             )  # fmt: skip
         body += [pages.heading("What the data determine"), pages.table(columns, rows[True])]
-        body += _pictures(figures)
+        body += _pictures(figures, drawn)
         body += [pages.heading("What the data do not determine"),
                  pages.paragraph("The prior keeps these where they are. Do not interpret them."),
                  pages.table(columns, rows[False])] if rows[False] else []  # fmt: skip
@@ -164,7 +164,7 @@ def posterior_report(found: "Posterior", figures: dict[str, Any], folder: Path) 
             "All draws are in posterior.nc: `arviz.from_netcdf` reads it.",
         )
     else:
-        body += _pictures(figures)
+        body += _pictures(figures, drawn)
         after = (
             "Do not use these draws.",
             "Draw longer: `--warmup 2000 --draws 4000`.",
@@ -180,8 +180,8 @@ def _unit(unit: str) -> str:
     return "" if unit == "1" else unit
 
 
-def _pictures(figures: dict[str, Any]) -> list[Html]:
-    return [pages.picture(figure, FIGURES[name], pixels=name == "chains") for name, figure in figures.items()]
+def _pictures(figures: dict[str, Any], drawn: dict[str, bytes]) -> list[Html]:
+    return [pages.picture(figure, FIGURES[name], pixels=drawn.get(name)) for name, figure in figures.items()]
 
 
 def _verdict(words: str, *, good: bool | None) -> Html:
