@@ -12,10 +12,13 @@ from jaxmuscle.objective._problem import FitProblem
 from jaxmuscle.objective._residuals import Residuals
 
 REACH = 1.96
-MOST_ROWS = 32  # of one batch
-TURNS, AGAIN = 5, 3
+TURNS = 40  # at most
+FIRST, FASTER, SLOWER = 0.4, 2.5, 0.4  # of the way that the curvature says; how much further or nearer a row aims next
+GAIN = 0.01  # of the rise: what a turn gains less, it need not go on for
+NEAR = 0.05  # of the rise at the end
 HELD = 0.1  # of the standard deviation
 FURTHEST = 4.0  # times as far as the curvature says: beyond, an end is open
+MOST_ROWS = 32  # of one batch
 
 
 class Interval(NamedTuple):
@@ -37,9 +40,10 @@ def intervals(
     """Where twice the cost, all else fitted anew, has risen by 3.84 times the factor that correlated bins ask for.
 
     A quantity q is moved along the ridge `θ + G g (q* - q) / (gᵀ G g)`, G the inverse curvature of the cost and g the slope
-    of q, then held there while damped Gauss-Newton steps lower the cost, and once more further out or in, until the rise is
-    `3.84 gᵀ C g / gᵀ G g`, C the covariance of the estimates. Positive quantities move in their logarithm. All of them at
-    once, so that it takes six evaluations of the model.
+    of q, two fifths of the way at first, then held there while damped Gauss-Newton steps lower the cost until they gain
+    little. From where it stands it goes on along the line from the fit, further out or in, until the rise is
+    `3.84 gᵀ C g / gᵀ G g`, C the covariance of the estimates. Straight to the end it would land where the cost is a hundred
+    times too high, if the ridge bends. Positive quantities move in their logarithm. All of them at once.
 
     Of fits in linear response with log residuals only (empty otherwise).
     """
@@ -67,21 +71,31 @@ def _some(
     stated = np.sqrt(np.einsum("ri,ij,rj->r", slope, covariance, slope))
     wanted = REACH * stated / np.sqrt(ours)  # root of the rise that is sought
     side = np.tile([-1.0, 1.0], len(names))
-    aim = start + side * REACH * stated
-    theta = np.clip(here.theta[0] + (slope @ gain) * ((aim - start) / ours)[:, None], -8, 8)
+    way = np.full(len(start), FIRST)  # that each row is to go, of what the curvature says
     tight = HELD * np.sqrt(ours)
-    best = _look(problem, objective, theta, names, log)
-    damping = np.full(len(aim), 1e-2)
-    for turn in range(TURNS):
-        if turn == AGAIN:
-            stretch = np.clip(wanted / np.maximum(best.rise(here), 1e-6), 0.3, FURTHEST)
-            aim = start + side * np.clip(side * (best.at - start) * stretch, 0.1 * REACH * stated, FURTHEST * REACH * stated)
-            damping[:] = 1e-2
-        tried = _look(problem, objective, np.clip(best.theta + best.step(aim, tight, damping), -8, 8), names, log)
-        better = tried.merit(aim, tight) < best.merit(aim, tight)
-        best = _Look(problem, *(np.where(better.reshape(-1, *[1] * (np.ndim(old) - 1)), new, old)
-                                for new, old in zip(tried[1:], best[1:], strict=True)))  # fmt: skip
+    aim = start + side * way * REACH * stated
+    theta = here.theta[0] + (slope @ gain) * ((aim - start) / ours)[:, None]
+    best = _look(problem, objective, theta, np.arange(len(theta)), names, log)
+    damping, done = np.full(len(aim), 1e-2), np.zeros(len(aim), dtype=bool)
+    for _ in range(TURNS):
+        tried = best.moved(objective, best.theta + best.step(aim, tight, damping), ~done, names, log)
+        gain_of_all = best.merit(aim, tight) - tried.merit(aim, tight)
+        better = gain_of_all > 0
+        best = best.where(better, tried)
         damping = np.where(better, 0.2 * damping, 10 * damping)
+        rise = best.rise(here)
+        settled = np.abs(gain_of_all) < GAIN * np.maximum(rise, NEAR * wanted) ** 2
+        done |= settled & ((np.abs(rise - wanted) < NEAR * wanted) | ((way == FURTHEST) & (rise < wanted)))
+        if np.all(done):
+            break
+        moving = settled & ~done
+        if np.any(moving):
+            stretch = np.where(moving, np.clip(wanted / np.maximum(rise, 1e-6), SLOWER, FASTER), 1.0)
+            stretch = np.minimum(stretch, FURTHEST / way)
+            way, damping = np.where(moving, way * stretch, way), np.where(moving, 1e-2, damping)
+            aim = start + side * way * REACH * stated
+            further = here.theta[0] + (best.theta - here.theta[0]) * stretch[:, None]
+            best = best.moved(objective, further, moving, names, log)
     moved, rise = side * (best.at - start), best.rise(here)
     end = moved * wanted / rise
     good = np.isfinite(end) & (moved > 0) & (rise > 0.5 * wanted)
@@ -99,6 +113,21 @@ class _Look(NamedTuple):
     residual: np.ndarray
     jacobian: np.ndarray
     cost: np.ndarray
+
+    def moved(
+        self, objective: Residuals, theta: np.ndarray, which: np.ndarray, names: list[str], log: np.ndarray
+    ) -> "_Look":
+        """Some rows at another θ, the others as they are."""
+        rows = np.flatnonzero(which)
+        there, found = _look(self.problem, objective, theta[rows], rows, names, log), [x.copy() for x in self[1:]]
+        for all_rows, new in zip(found, there[1:], strict=True):
+            all_rows[rows] = new
+        return _Look(self.problem, *found)
+
+    def where(self, chosen: np.ndarray, other: "_Look") -> "_Look":
+        """The other's rows where they are chosen."""
+        return _Look(self.problem, *(np.where(chosen.reshape(-1, *[1] * (np.ndim(own) - 1)), new, own)
+                                     for new, own in zip(other[1:], self[1:], strict=True)))  # fmt: skip
 
     def rise(self, here: "Point") -> np.ndarray:
         """Root of twice the rise of the cost above that of the fit."""
@@ -122,13 +151,17 @@ class _Look(NamedTuple):
         return step * np.minimum(1.0, 1.0 / np.maximum(np.max(np.abs(step), axis=1, keepdims=True), 1e-300))
 
 
-def _look(problem: FitProblem, objective: Residuals, theta: np.ndarray, names: list[str], log: np.ndarray) -> _Look:
-    """Every row with its own quantity, two rows each."""
+def _look(
+    problem: FitProblem, objective: Residuals, theta: np.ndarray, rows: np.ndarray, names: list[str], log: np.ndarray
+) -> _Look:
+    """Each of these rows with its own quantity: of every name there are two."""
+    theta, log = np.clip(theta, -8, 8), log[rows]
     point = Point.of(problem, objective, expand(objective, theta))
-    value, slope = np.empty(len(log)), np.empty(theta.shape)
-    for i, name in enumerate(names):
-        values, slopes = point.quantity(name)
-        value[2 * i : 2 * i + 2], slope[2 * i : 2 * i + 2] = values[2 * i : 2 * i + 2], slopes[2 * i : 2 * i + 2]
+    value, slope = np.empty(len(rows)), np.empty(theta.shape)
+    for i in np.unique(rows // 2):
+        values, slopes = point.quantity(names[i])
+        own = rows // 2 == i
+        value[own], slope[own] = values[own], slopes[own]
     positive = np.maximum(value, 1e-300)
     at, slope = np.where(log, np.log(positive), value), np.where(log[:, None], slope / positive[:, None], slope)
     return _Look(problem, theta, at, slope, point.residual, point.jacobian, point.cost)

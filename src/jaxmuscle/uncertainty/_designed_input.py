@@ -38,7 +38,8 @@ class DesignedInput(Printed, Result, eqx.Module):
     `rate` [Hz], positive where the muscle gets longer (the motor pulls away from it: x_z = -displacement); `values` and
     `units` of every free parameter and derived quantity, and their standard errors in these units: `now`, without the
     record; `flat`, with the flat motion; `stderr`, with this one; `by_seconds`, with records of it that have other lengths
-    [s]; `needed`, the relative error that was asked for and the length [s] of the record that reaches it, or None.
+    [s]; `needed`, the relative error that was asked for and the length [s] of the record that reaches it, or None;
+    `notices`, what to know before.
     """
 
     quantity: tuple[str, ...] = eqx.field(static=True)
@@ -53,6 +54,7 @@ class DesignedInput(Printed, Result, eqx.Module):
     stderr: dict[str, float]
     by_seconds: dict[float, dict[str, float]]
     needed: tuple[float, float] | None
+    notices: tuple[str, ...] = eqx.field(static=True, default=())
 
     @property
     def time(self) -> Float[np.ndarray, " samples"]:
@@ -119,6 +121,7 @@ class DesignedInput(Printed, Result, eqx.Module):
             "by_seconds": [{"seconds": seconds, "stderr": errors} for seconds, errors in self.by_seconds.items()],
             "needed": None if self.needed is None else {"error": self.needed[0], "seconds": with_nulls(self.needed[1])},
             "frequency_hz": self.frequency.tolist(), "density": self.density.tolist(), "quantities": known,
+            "notices": list(self.notices),
         }  # fmt: skip
 
     def save(self, path: str | Path) -> None:
@@ -150,6 +153,7 @@ class DesignedInput(Printed, Result, eqx.Module):
         )
         return folded([
             f"designed input: one record of {self.lengthening.seconds:g} s would tell {best}",
+            *(f"  note: {notice}" for notice in self.notices),
             f"  a flat input of {1e3 * self.even.rms:.3g} mm rms: {flat}; with it the {variance} is {self.gain:.2g} times "
             "as large",
             f"  lengthening of the muscle: {1e3 * self.rms:.3g} mm rms, peak {1e3 * self.peak:.3g} mm, "

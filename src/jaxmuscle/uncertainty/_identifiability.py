@@ -64,6 +64,8 @@ def identifiability(
              for (a, x), (b, y) in itertools.combinations(possible, 2)]  # fmt: skip
     pairs.sort(key=lambda pair: (-len(pair.gained), pair.log_left))
     notices = tuple(n for n in result.notices if " ambiguous: " in n)
+    if target is None:
+        notices = missed(result) + notices
     mean_force = result.derived["mean"].value if result.per_newton else None
     # Of another target the fit has said nothing.
     fitted = {} if target is not None else result.found
@@ -71,6 +73,15 @@ def identifiability(
     doubted = tuple(n for n, p in fitted.items() if n in known and p.stderr is None)
     return IdentifiabilityReport(problem.title, problem.coordinates.names, present, alone, tuple(pairs), notices, mean_force,
                                  doubted)  # fmt: skip
+
+
+def missed(result: FitResult) -> tuple[str, ...]:
+    """What has to be said before a plan that stands on a fit whose model misses the data."""
+    if result.adequacy is None or result.adequacy.adequate:
+        return ()
+    return (f"the fit does not describe its data (chi2 per bin {result.chi2_per_bin:.2f}). All that follows assumes that "
+            "the model holds. Its errors are not widened; those of the fit are, by a factor of "
+            f"{result.adequacy.widening:.2g}",)  # fmt: skip
 
 
 def standard_designs(result: FitResult, target: Target | None = None) -> tuple[Design, ...]:

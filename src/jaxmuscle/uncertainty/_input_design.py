@@ -23,7 +23,7 @@ from jaxmuscle.response._expected_spectrum import expected_spectrum
 
 from ._designed_input import DesignedInput
 from ._designs import coordinates_of, design_information, moved_insertion, seen_here
-from ._identifiability import Here, fitted_problem
+from ._identifiability import Here, fitted_problem, missed
 from ._identifiability_report import BASE
 from ._lengthening import Lengthening, information_of_lines, lines_in, require_positive
 from ._multisine import multisine, speed_of
@@ -117,7 +117,8 @@ def design_input(
     now, flat, best = (experiment.errors(p) for p in (None, even.power, own.power))
     longer = {one: experiment.errors(own.power, one / seconds) for one in durations}
     needed = None if error is None else (float(error), seconds * experiment.times_for(own.power, error))
-    return DesignedInput(quantities, own, even, motion, float(rate), values, units, now, flat, best, longer, needed)
+    notices = missed(result) if isinstance(result, FitResult) else ()
+    return DesignedInput(quantities, own, even, motion, float(rate), values, units, now, flat, best, longer, needed, notices)
 
 
 class Experiment(NamedTuple):

@@ -1,4 +1,4 @@
-"""The interval of a half-power frequency: against the profile of the cost on a grid, about a shelf; how often it holds."""
+"""95 % intervals against the profile of the cost on a grid; those of a half-power frequency about a shelf."""
 
 import jax
 import jax.numpy as jnp
@@ -70,19 +70,35 @@ def level(task, theta, f):
     return np.asarray(jax.jit(jax.vmap(one))(*(jnp.asarray([task[n] for n in FREE])[:, None] * jnp.exp(theta.T))))
 
 
-def lowest_rise(task, objective, seen, f):
-    """The profile at one frequency: the least over the line on which it is the half-power frequency, by a fine grid.
+def lowest(levels, rises):
+    """The least rise over the line on which the level is zero, of values on the plane.
 
     The line is taken where the level changes its sign between two points, linear in between.
     """
-    theta = seen.theta + PLANE
-    plane, levels = theta.reshape(97, 97, 2), level(task, theta, f).reshape(97, 97)
+    levels, rises = levels.reshape(97, 97), rises.reshape(97, 97)
     on_line = []
     for before, after in ((np.s_[:-1], np.s_[1:]), (np.s_[:, :-1], np.s_[:, 1:])):
-        low, high = levels[before], levels[after]
-        share = (low / (low - high))[..., None]
-        on_line.append((plane[before] + share * (plane[after] - plane[before]))[low * high < 0])
-    return np.min(rise(objective, seen, np.concatenate(on_line)))
+        crossed = levels[before] * levels[after] < 0
+        low, high = levels[before][crossed], levels[after][crossed]
+        first, second = rises[before][crossed] ** 2, rises[after][crossed] ** 2
+        on_line.append(np.sqrt(first + low / (low - high) * (second - first)))
+    return np.min(np.concatenate(on_line))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("task", "segments"), [(STEEP, 6), (BENT, 45), (SHELF, 45)], ids=["steep", "bent", "shelf"])
+def test_an_interval_ends_where_the_profile_does(task, segments, x64):
+    """With the inverse curvature as covariance the root of the rise that is sought is 1.96, at either end."""
+    names = ["corner_frequency", "high_frequency_floor", "coefficient_of_variation"]
+    problem, objective, seen = fitted(task, drawn(task, segments, 3))
+    value, theta = consequences(objective, seen).values[0], seen.theta + PLANE
+    over_plane, rises = consequences_of_rows(objective, expand(objective, theta)).values[0], rise(objective, seen, theta)
+    found = intervals(problem, objective, seen, inverse_curvature(objective, seen), names)
+    for name in names:
+        ends = found[name].about(value[name])
+        assert ends[0] < value[name] < ends[1]
+        at = [lowest(np.log(over_plane[name] / end), rises) for end in ends]
+        np.testing.assert_allclose(at, 1.96, rtol=0.04, err_msg=name)
 
 
 def test_the_level_is_zero_at_the_half_power_frequency(x64):
@@ -106,13 +122,14 @@ def test_the_frequency_jumps_where_the_level_does_not(x64):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("task", [STEEP, BENT], ids=["steep", "bent"])
-def test_an_interval_ends_where_the_profile_does(task, x64):
+def test_that_of_a_half_power_frequency_ends_where_its_profile_does(task, x64):
     """With the inverse curvature as covariance the root of the rise that is sought is 1.96, at either end."""
     problem, objective, seen = fitted(task, drawn(task, 45, 3))
     value, gain = consequences(objective, seen).values[0][NAME], inverse_curvature(objective, seen)
     low, high = half_power_intervals(problem, objective, seen, gain, [NAME])[NAME].about(value)
     assert low < value < high
-    np.testing.assert_allclose([lowest_rise(task, objective, seen, f) for f in (low, high)], 1.96, rtol=0.03)
+    rises = rise(objective, seen, seen.theta + PLANE)
+    np.testing.assert_allclose([lowest(level(task, seen.theta + PLANE, f), rises) for f in (low, high)], 1.96, rtol=0.03)
 
 
 @pytest.mark.slow
@@ -121,7 +138,9 @@ def test_about_a_shelf_there_is_no_interval(x64):
     problem, objective, seen = fitted(SHELF, drawn(SHELF, 45, 3))
     value, gain = consequences(objective, seen).values[0][NAME], inverse_curvature(objective, seen)
     assert value < 0.2 * LAST
-    assert max(lowest_rise(SHELF, objective, seen, f) for f in np.geomspace(value, 2 * LAST, 8)[1:]) < 1.96
+    theta = seen.theta + PLANE
+    rises = rise(objective, seen, theta)
+    assert max(lowest(level(SHELF, theta, f), rises) for f in np.geomspace(value, 2 * LAST, 8)[1:]) < 1.96
     assert half_power_intervals(problem, objective, seen, gain, [NAME])[NAME].about(value) == (None, None)
     assert intervals(problem, objective, seen, gain, [NAME])[NAME].about(value)[1] < LAST
 
