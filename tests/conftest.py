@@ -65,12 +65,30 @@ def _compile_quickly(known: Path) -> None:
         os.environ["XLA_FLAGS"] = QUICK_COMPILER
 
 
+# Kept programs that are computed often, or draw: where random numbers are rounded must not depend on who draws them. All
+# others are computed a few times, and without optimisation compile in half the time.
+OPTIMISED = {"_of_rows", "_moments_and_slopes", "_step", "_start", "run_seeds", "run_points", "_driven", "filtered_power",
+             "_lowpass", "decimated", "_normal", "_cells", "_key", "_folded", "_wrapped", "_frequencies",
+             "_values"}  # fmt: skip
+
+
+def _optimise_only_what_runs_often() -> None:
+    from jaxmuscle._common import programs
+
+    def kept(function: Any) -> Any:
+        return programs.Kept(function, programs.OPTIONS | ({} if function.__name__ in OPTIMISED else plain))
+
+    plain = {"xla_backend_optimization_level": 0}
+    programs.kept = kept
+
+
 MOST_MAPS = 25_000
 # Tracing makes objects by the million, few of them in circles: looking for these at Python's own pace takes a tenth of it.
 gc.set_threshold(5_000, 20, 10)
 
 _keep_compiled_programs(OUT / "jax-cache")
 _compile_quickly(OUT / "compiler.txt")
+_optimise_only_what_runs_often()
 
 
 def pytest_configure(config: pytest.Config) -> None:

@@ -99,12 +99,14 @@ def test_a_line_in_the_bins_is_that_of_a_sine(x64):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("segments", [3, 12, 60])
+@pytest.mark.parametrize("segments", [3, 60])
 def test_p_is_uniform_about_the_models_own_spectra(segments):
-    """benchmarks/verdict.py has 500 for each; 40 here, whose largest deviation exceeds 0.34 once in 10 000 times."""
-    found = jm.fit_cohort([drawn(segments, seed) for seed in range(40)], starts=8)
+    """Few and many; benchmarks/verdict.py has 500 of each and of 12 between, docs/fitting.md what came out."""
+    count = 30
+    found = jm.fit_cohort([drawn(segments, seed) for seed in range(count)], starts=8)
     p = np.array([result.adequacy_p for result in found.results.values()])
-    assert scipy.stats.kstest(p, "uniform").statistic < 0.34
+    # Exceeded once in 10 000 times: 0.39, where 40 spectra have 0.34.
+    assert scipy.stats.kstest(p, "uniform").statistic < scipy.stats.kstwo.ppf(1 - 1e-4, count)
 
 
 # --- a fit that misses the data

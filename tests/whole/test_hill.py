@@ -349,10 +349,11 @@ def test_gradients_of_the_spectrum(x64):
     task = hill.held_task()
     at = jnp.array([float(task[name]) for name in names])
 
+    @jax.jit
     def power(values):
         return jm.expected_spectrum(task.replace(**dict(zip(names, values, strict=True)))).power[10]
 
-    forward, reverse = jax.jacfwd(power)(at), jax.grad(power)(at)
+    forward, reverse = jax.jit(jax.jacfwd(power))(at), jax.jit(jax.grad(power))(at)
     steps = h * np.diag(np.asarray(at))
     difference = [(power(at + s) - power(at - s)) / (2 * s.sum()) for s in steps]
     np.testing.assert_allclose(forward, reverse, rtol=1e-8)
@@ -364,12 +365,13 @@ def test_gradients_of_the_spectrum(x64):
 def test_gradients_of_a_simulation(x64):
     task = TASKS["isometric"](muscle=HillMuscle())
 
+    @jax.jit
     def moved(values):
         run = jm.simulate(task.replace(velocity_max=values[0], tendon_strain=values[1]), KEY, duration=0.6, substeps=4)
         return jnp.sum(run.output[30:] ** 2)
 
     at = jnp.array([3.6, 0.04])
-    forward, reverse = jax.jacfwd(moved)(at), jax.grad(moved)(at)
+    forward, reverse = jax.jit(jax.jacfwd(moved))(at), jax.jit(jax.grad(moved))(at)
     steps = 1e-5 * np.diag(np.asarray(at))
     difference = [(moved(at + s) - moved(at - s)) / (2 * s.sum()) for s in steps]
     np.testing.assert_allclose(forward, reverse, rtol=1e-9)

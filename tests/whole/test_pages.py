@@ -31,6 +31,8 @@ RUN_HERE = {
     "docs/reference/figures.md", "docs/scaling.md", "docs/tutorial.md", "docs/uncertainty.md",
 }  # fmt: skip
 FEWER_SEEDS = {"seeds=100_000": "seeds=1_000"}
+# Data with a rhythm are also tried with a tremor: two more programs of each fit, which fits/test_rungs.py has.
+NO_LADDER = {'"trial3.csv"])  # the trials': '"trial3.csv"], rungs=0)  # the trials'}
 CALLED_OFTEN = ("fit", "ensemble", "profile", "posterior", "identifiability", "compare_noise", "goodness", "bootstrap")
 FEWER: dict[str, dict[str, Any]] = {
     "goodness": {"replicates": 199},
@@ -104,7 +106,7 @@ def readme(once, tmp_path_factory):
         for seed, name in enumerate("abc"):
             write_spectrum(f"{name}.csv", seed)
         with contextlib.redirect_stdout(io.StringIO()) as printed:
-            names = pages.run("README.md", {"printed": printed}, FEWER_SEEDS)
+            names = pages.run("README.md", {"printed": printed}, FEWER_SEEDS | NO_LADDER)
     return names | {"returned": dict(once.last)}
 
 
@@ -174,11 +176,14 @@ def test_identifiability():
 @pytest.mark.slow
 def test_own_data():
     write_spectrum("mine.csv")
-    assert pages.run("docs/fit-a-csv.md")["target"].segments == (6,) * 10
+    once = {"jm.task_for(target), target)": "jm.task_for(target), target, rungs=0)"}
+    assert pages.run("docs/fit-a-csv.md", {}, once)["target"].segments == (6,) * 10
     for number, name in enumerate(("trial.csv", "trial1.csv", "trial2.csv", "trial3.csv")):
         write_recording(name, 5 + number)
     write_tremor("tremor.csv")
-    quick = {"jm.task_for(tremor), tremor": "jm.task_for(tremor), tremor, rungs=0, starts=8, seeds=0, check_seeds=0"}
+    quick = {"jm.task_for(tremor), tremor": "jm.task_for(tremor), tremor, rungs=0, starts=8, seeds=0, check_seeds=0",
+             "held.target())\n": "held.target(), rungs=0)\n",
+             "target)  # the same": "target, rungs=0)  # the same"}  # fmt: skip
     names = pages.run("docs/recordings.md", {}, quick)
     assert names["result"].success and names["moving"].task.quantity == "acceleration"
     assert Path("trial.png").exists()
