@@ -12,7 +12,7 @@ from scipy.optimize import brentq
 import jaxmuscle as jm
 from jaxmuscle.fits._adequacy import Endpoint
 from jaxmuscle.fits._checks import twitch_notices
-from jaxmuscle.fits._ladder import Rung, criterion, gains, told_apart
+from jaxmuscle.fits._ladder import Rung, _fewer, criterion, gains, told_apart
 from jaxmuscle.fits._part import Estimate
 from jaxmuscle.model._rungs import RUNGS
 from jaxmuscle.objective._arguments import COEFFICIENTS, FitOptions, planned
@@ -103,6 +103,12 @@ def test_the_base_model_is_kept_where_it_describes_the_data():
     assert result.task.activation is None
     same = jm.fit(TASK, drawn(expected(TASK), 30, 3), rungs=0, **QUICK)
     assert same.ladder == () and same.parameters == result.parameters
+
+
+@pytest.mark.parametrize(("asked", "found"), [(8, 8), (50, 32), (100, 32), (300, 96)])
+def test_more_starts_count_for_every_model(asked, found):
+    """A third of those of the first model, since the best one so far is among them; but 32 where there are as many."""
+    assert _fewer(asked) == found
 
 
 @pytest.mark.slow

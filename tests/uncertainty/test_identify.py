@@ -371,6 +371,22 @@ def test_the_report_names_what_it_knows_and_the_fit_does_not():
     assert not other.open_in_fit and "not determined in the fit" not in str(other)
 
 
+def test_a_report_about_a_fit_that_misses_its_data_says_so_first():
+    kept = fitted().adequacy
+    missing = eqx.tree_at(lambda r: r.adequacy, fitted(), kept._replace(chi2=4 * kept.expected, p=1e-4),
+                          is_leaf=lambda x: isinstance(x, type(kept)))  # fmt: skip
+    found = jm.identifiability(missing, designs=())
+    assert missing.adequacy.widening == 2.0 and f"chi2 per bin {missing.chi2_per_bin:.2f}" in found.notices[0]
+    said = " ".join(str(found).split())
+    assert "note: the fit does not describe its data" in said and "by a factor of 2" in said
+    assert found.to_dict()["notices"][0] == found.notices[0]
+    for about in (jm.identifiability(fitted(), designs=()), jm.identifiability(missing, missing.target, designs=())):
+        assert "does not describe" not in str(about)
+    motion = jm.design_input(missing, seconds=10.0, band=(0.5, 5.0), rate=50.0)
+    assert motion.notices == found.notices[:1] == tuple(motion.to_dict()["notices"])
+    assert "note: the fit does not describe its data" in " ".join(str(motion).split())
+
+
 def test_the_numbers_in_the_table_are_those_of_the_report():
     first, second = (line.split() for line in str(report()).splitlines() if line.startswith("  K_w0  "))
     known = [o.quantities["K_w0"] for o in (report().present, *report().designs)]

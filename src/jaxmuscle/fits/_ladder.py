@@ -165,12 +165,12 @@ def _warm(plan: Plan, best: Climbed) -> Float[np.ndarray, "starts free"]:
     before = best.plan.problem
     (task,) = before.tasks_at(best.ended.seen.theta)
     known = {name: float(task[name]) for name in before.coordinates.names}
-    return continued(plan.problem, _fewer(plan), known)
+    return continued(plan.problem, _fewer(plan.starts), known)
 
 
-def _fewer(plan: Plan) -> int:
+def _fewer(starts: int) -> int:
     """Starts of a further model: 32 of the usual 100, and more where more were asked for."""
-    return max(min(plan.starts, STARTS), plan.starts * STARTS // 100)
+    return max(min(starts, STARTS), starts * STARTS // 100)
 
 
 def rung_of(ended: Endpoint, number: int) -> Rung:
@@ -231,7 +231,7 @@ def _aic_of(plan: Plan, descend: Descend) -> float | None:
     """What a model reaches; None if no start has a finite spectrum."""
     stages: list[Stage] = []
     plan = _telling(plan, "a line instead of the resonance", 0.95, 1.0)
-    if descend(plan, starting_points(plan.problem, _fewer(plan)), stages) is None:
+    if descend(plan, starting_points(plan.problem, _fewer(plan.starts)), stages) is None:
         return None
     return criterion(Endpoint.of(plan.problem, stages[-1]))[0]
 
