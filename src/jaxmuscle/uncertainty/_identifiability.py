@@ -77,11 +77,12 @@ def identifiability(
 
 def missed(result: FitResult) -> tuple[str, ...]:
     """What has to be said before a plan that stands on a fit whose model misses the data."""
-    if result.adequacy is None or result.adequacy.adequate:
+    found = result.adequacy
+    if found is None or found.adequate:
         return ()
-    return (f"the fit does not describe its data (chi2 per bin {result.chi2_per_bin:.2f}). All that follows assumes that "
-            "the model holds. Its errors are not widened; those of the fit are, by a factor of "
-            f"{result.adequacy.widening:.2g}",)  # fmt: skip
+    return (f"the fit does not describe its data (chi2 {found.chi2:.3g}, expected {found.expected:.3g}). All that follows "
+            f"assumes that the model holds. Its errors are not widened; those of the fit are, by a factor of "
+            f"{found.widening:.2g}",)  # fmt: skip
 
 
 def standard_designs(result: FitResult, target: Target | None = None) -> tuple[Design, ...]:
