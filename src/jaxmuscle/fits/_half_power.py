@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxmuscle._common.programs import kept
+from jaxmuscle.data._target import Target
 from jaxmuscle.objective._consequences import Expansion, expand
 from jaxmuscle.objective._coordinates import task_at
 from jaxmuscle.objective._moment_models import Linear
@@ -35,7 +36,8 @@ def half_power_intervals(
     `L(f) = ln(2 |H(f)|² / |H(0)|²)` is zero at the true one, whatever the shape of the response. So f belongs to the
     interval if L(f) can be held at zero, all else fitted anew, and twice the cost rises by at most
     `3.84 gᵀ C g / gᵀ G g`: g is the slope of L(f) with respect to θ, C the covariance of the estimates, G the inverse
-    curvature of the cost. Open at both ends, which means not determined, if it leaves the compared bins: no data are there.
+    curvature of the cost. Open at both ends, which means not determined, if it leaves the compared bins and points: no
+    data are there.
 
     Of fits in linear response with log residuals only (empty otherwise).
 
@@ -92,10 +94,9 @@ class _Search(NamedTuple):
     ) -> "tuple[_Search, Float[np.ndarray, 'rows free']] | None":
         """With the point of the ridge of each frequency; nothing where the value is outside the compared bins."""
         part, _ = problem.where(name)
-        target = problem.parts[part].target
         here = Point.of(problem, objective, jax.tree.map(lambda x: np.asarray(x)[None], seen))
         value, slope = (pair[0] for pair in here.quantity(name))
-        low, high = np.log(target.frequency[[0, -1]] + target.settings.resolution * np.array([-0.5, 0.5]))
+        low, high = np.log(_compared(problem.parts[part].target, objective.parts[part].model))
         top = float(np.log(value))
         if not low < top < high:
             return None
@@ -179,6 +180,14 @@ class _Rows(NamedTuple):
         step = np.zeros_like(self.theta)
         step[fine] = -np.linalg.solve(curvature[fine], gradient[fine][..., None])[..., 0]
         return step * np.minimum(1.0, 1.0 / np.maximum(np.max(np.abs(step), axis=1, keepdims=True), 1e-300))
+
+
+def _compared(target: Target, model: Any) -> tuple[float, float]:
+    """From where to where [Hz] there are data: edges of the outer bins, or points of a measured dynamic stiffness beyond."""
+    half = target.settings.resolution / 2
+    points = getattr(model, "points", None)
+    found = np.concatenate([target.frequency - half, target.frequency + half, [] if points is None else np.asarray(points)])
+    return float(found.min()), float(found.max())
 
 
 def _aims(top: float, sd: float, edge: float) -> Float[np.ndarray, " each"]:
