@@ -119,6 +119,14 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
 
 
 @pytest.fixture(scope="module", autouse=True)
+def _close_figures():
+    """Those that a file leaves open count for the next one, and the twenty-first is an error there."""
+    yield
+    if "matplotlib.pyplot" in sys.modules:
+        sys.modules["matplotlib.pyplot"].close("all")
+
+
+@pytest.fixture(scope="module", autouse=True)
 def _forget_compiled_programs():
     """Every compiled program takes memory maps, of which Linux allows a process 65530: thousands of tests use them up."""
     yield
