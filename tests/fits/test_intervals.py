@@ -111,7 +111,7 @@ def test_the_level_is_zero_at_the_half_power_frequency(x64):
 
 
 def test_the_frequency_jumps_where_the_level_does_not(x64):
-    """A third more of the passive damping: four times the frequency, and nowhere more than a fifth of the power."""
+    """A third more of the passive damping: four times the frequency, and below it at most a third more power."""
     systems = [linearise(task) for task in (BENT, SHELF)]
     low, high = (float(half_power_frequency(*pair)) for pair in zip((BENT, SHELF), systems, strict=True))
     assert high > 3.5 * low

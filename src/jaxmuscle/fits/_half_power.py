@@ -16,7 +16,7 @@ from jaxmuscle.objective._residuals import PartResiduals, Residuals
 from jaxmuscle.response._linearised import linearise
 from jaxmuscle.response._transfer import half_power_level
 
-from ._intervals import HELD, REACH, Interval, Point
+from ._intervals import HELD, MOST, REACH, Interval, Point, chosen_rows, held_step
 
 HALF_POWER = "half_power_frequency"
 EACH = 16  # frequencies on either side
@@ -24,7 +24,6 @@ NEAREST = 0.5  # standard deviations from the value to the first of them
 TURNS, QUIET = 16, 2  # it ends early after so many turns in a row that gain little
 GAIN, NEAR = 0.02, 2.0  # of the cost; of the rise at the end of the interval
 LOOSE = 0.05  # of the level, at most: 5 % of the power
-MOST = 8.0  # prior standard deviations
 OPEN = Interval(None, None, log=True)
 
 
@@ -165,21 +164,13 @@ class _Rows(NamedTuple):
 
     def where(self, better: np.ndarray, other: "_Rows") -> "_Rows":
         """The other where it is better."""
-        return _Rows(*(np.where(better.reshape(-1, *[1] * (np.ndim(old) - 1)), new, old)
-                       for new, old in zip(other, self, strict=True)))  # fmt: skip
+        return _Rows(*chosen_rows(better, other, self))
 
     def step(self, search: _Search, damping: np.ndarray) -> Float[np.ndarray, "rows free"]:
         """A damped Gauss-Newton step of the merit, at most one prior standard deviation."""
-        rows, prior = np.arange(len(self.theta)), np.diag(search.problem.prior)
+        rows = np.arange(len(self.theta))
         pull, rise = self.level[rows, rows] / search.tight, self.slope[rows, rows] / search.tight[:, None]
-        curvature = np.einsum("rki,rkj->rij", self.jacobian, self.jacobian) + prior + rise[:, :, None] * rise[:, None]
-        gradient = np.einsum("rki,rk->ri", self.jacobian, self.residual) + self.theta @ prior + pull[:, None] * rise
-        size = np.maximum(np.diagonal(curvature, axis1=1, axis2=2), 1e-8)
-        curvature = curvature + (damping[:, None] * size)[:, None] * np.eye(len(prior))
-        fine = np.isfinite(self.cost) & np.all(np.isfinite(gradient), axis=1)
-        step = np.zeros_like(self.theta)
-        step[fine] = -np.linalg.solve(curvature[fine], gradient[fine][..., None])[..., 0]
-        return step * np.minimum(1.0, 1.0 / np.maximum(np.max(np.abs(step), axis=1, keepdims=True), 1e-300))
+        return held_step(search.problem, self, pull, rise, damping)
 
 
 def _compared(target: Target, model: Any) -> tuple[float, float]:

@@ -1,7 +1,7 @@
 """95 % intervals of what a fit determined, from the profile of its cost."""
 
-from collections.abc import Mapping
-from typing import NamedTuple
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import jax
 import numpy as np
@@ -18,6 +18,7 @@ GAIN = 0.01  # of the rise: what a turn gains less, it need not go on for
 NEAR = 0.05  # of the rise at the end
 HELD = 0.1  # of the standard deviation
 FURTHEST = 4.0  # times as far as the curvature says: beyond, an end is open
+MOST = 8.0  # prior standard deviations
 MOST_ROWS = 32  # of one batch
 
 
@@ -40,10 +41,10 @@ def intervals(
     """Where twice the cost, all else fitted anew, has risen by 3.84 times the factor that correlated bins ask for.
 
     A quantity q is moved along the ridge `θ + G g (q* - q) / (gᵀ G g)`, G the inverse curvature of the cost and g the slope
-    of q, two fifths of the way at first, then held there while damped Gauss-Newton steps lower the cost until they gain
-    little. From where it stands it goes on along the line from the fit, further out or in, until the rise is
-    `3.84 gᵀ C g / gᵀ G g`, C the covariance of the estimates. Straight to the end it would land where the cost is a hundred
-    times too high, if the ridge bends. Positive quantities move in their logarithm. All of them at once.
+    of q. It moves in stages, two fifths of the way at first: where the ridge bends, the far end of the straight line costs a
+    hundred times too much. In each stage it is held while damped Gauss-Newton steps lower the cost, until they gain little.
+    The next stage begins on the line from the fit through where it stands, further out or in. The last is where the rise is
+    `3.84 gᵀ C g / gᵀ G g`, C the covariance of the estimates. Positive quantities move in their logarithm. All at once.
 
     Of fits in linear response with log residuals only (empty otherwise).
     """
@@ -126,8 +127,7 @@ class _Look(NamedTuple):
 
     def where(self, chosen: np.ndarray, other: "_Look") -> "_Look":
         """The other's rows where they are chosen."""
-        return _Look(self.problem, *(np.where(chosen.reshape(-1, *[1] * (np.ndim(own) - 1)), new, own)
-                                     for new, own in zip(other[1:], self[1:], strict=True)))  # fmt: skip
+        return _Look(self.problem, *chosen_rows(chosen, other[1:], self[1:]))
 
     def rise(self, here: "Point") -> np.ndarray:
         """Root of twice the rise of the cost above that of the fit."""
@@ -140,22 +140,52 @@ class _Look(NamedTuple):
     def step(self, aim: np.ndarray, tight: np.ndarray, damping: np.ndarray) -> np.ndarray:
         """A damped Gauss-Newton step of that."""
         pull, rise = (self.at - aim) / tight, self.slope / tight[:, None]
-        prior = np.diag(self.problem.prior)
-        curvature = np.einsum("rki,rkj->rij", self.jacobian, self.jacobian) + prior + rise[:, :, None] * rise[:, None]
-        gradient = np.einsum("rki,rk->ri", self.jacobian, self.residual) + self.theta @ prior + pull[:, None] * rise
-        size = np.maximum(np.diagonal(curvature, axis1=1, axis2=2), 1e-8)
-        curvature = curvature + (damping[:, None] * size)[:, None] * np.eye(len(prior))
-        fine = np.isfinite(self.cost) & np.all(np.isfinite(gradient), axis=1)
-        step = np.zeros_like(self.theta)
-        step[fine] = -np.linalg.solve(curvature[fine], gradient[fine][..., None])[..., 0]
-        return step * np.minimum(1.0, 1.0 / np.maximum(np.max(np.abs(step), axis=1, keepdims=True), 1e-300))
+        return held_step(self.problem, self, pull, rise, damping)
+
+
+@runtime_checkable
+class Seen(Protocol):
+    """Rows of θ, of each the data residuals with slopes, and the cost."""
+
+    @property
+    def theta(self) -> np.ndarray: ...
+    @property
+    def residual(self) -> np.ndarray: ...
+    @property
+    def jacobian(self) -> np.ndarray: ...
+    @property
+    def cost(self) -> np.ndarray: ...
+
+
+def held_step(
+    problem: FitProblem, seen: Seen, pull: np.ndarray, rise: np.ndarray, damping: np.ndarray
+) -> Float[np.ndarray, "rows free"]:
+    """A damped Gauss-Newton step of `cost + ½ pull²` in every row, at most one prior standard deviation.
+
+    `pull`, how far what is held is from where it is held, in units of how tightly; `rise`, its slope.
+    """
+    prior = np.diag(problem.prior)
+    curvature = np.einsum("rki,rkj->rij", seen.jacobian, seen.jacobian) + prior + rise[:, :, None] * rise[:, None]
+    gradient = np.einsum("rki,rk->ri", seen.jacobian, seen.residual) + seen.theta @ prior + pull[:, None] * rise
+    size = np.maximum(np.diagonal(curvature, axis1=1, axis2=2), 1e-8)
+    curvature = curvature + (damping[:, None] * size)[:, None] * np.eye(len(prior))
+    fine = np.isfinite(seen.cost) & np.all(np.isfinite(gradient), axis=1)
+    step = np.zeros_like(seen.theta)
+    step[fine] = -np.linalg.solve(curvature[fine], gradient[fine][..., None])[..., 0]
+    return step * np.minimum(1.0, 1.0 / np.maximum(np.max(np.abs(step), axis=1, keepdims=True), 1e-300))
+
+
+def chosen_rows(chosen: np.ndarray, new: Sequence[np.ndarray], old: Sequence[np.ndarray]) -> list[np.ndarray]:
+    """Arrays with a leading axis of rows: the new ones where they are chosen."""
+    return [np.where(chosen.reshape(-1, *[1] * (np.ndim(own) - 1)), other, own)
+            for other, own in zip(new, old, strict=True)]  # fmt: skip
 
 
 def _look(
     problem: FitProblem, objective: Residuals, theta: np.ndarray, rows: np.ndarray, names: list[str], log: np.ndarray
 ) -> _Look:
     """Each of these rows with its own quantity: of every name there are two."""
-    theta, log = np.clip(theta, -8, 8), log[rows]
+    theta, log = np.clip(theta, -MOST, MOST), log[rows]
     point = Point.of(problem, objective, expand(objective, theta))
     value, slope = np.empty(len(rows)), np.empty(theta.shape)
     for i in np.unique(rows // 2):

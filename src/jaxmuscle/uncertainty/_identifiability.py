@@ -80,9 +80,9 @@ def missed(result: FitResult) -> tuple[str, ...]:
     found = result.adequacy
     if found is None or found.adequate:
         return ()
-    return (f"the fit does not describe its data (chi2 {found.chi2:.3g}, expected {found.expected:.3g}). All that follows "
-            f"assumes that the model holds. Its errors are not widened; those of the fit are, by a factor of "
-            f"{found.widening:.2g}",)  # fmt: skip
+    return (f"the fit does not describe its data (chi2 {found.chi2:.3g}, expected {found.expected:.3g}). What follows "
+            "assumes that the model holds. The errors here are not widened; those of the fit are, by a factor of "
+            f"{found.widening:.2g}. What to do: find a model that describes the data first",)  # fmt: skip
 
 
 def standard_designs(result: FitResult, target: Target | None = None) -> tuple[Design, ...]:
