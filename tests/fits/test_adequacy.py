@@ -148,6 +148,18 @@ def test_errors_of_such_a_fit_are_widened_and_its_harmonic_is_not_judged():
 
 
 @pytest.mark.slow
+def test_what_was_measured_is_as_certain_as_its_measurement():
+    """The mean and its error are data. That the spectrum is missed widens the other errors, not this one."""
+    given, error = missed().derived["mean"].value, 0.02
+    result = jm.fit(TASK, missed().target, mean_force=(given, error), rungs=0, **QUICK)
+    assert result.adequate is False and result.adequacy.widening > 1.3
+    mean = result.derived["mean"]
+    assert mean.stderr == pytest.approx(error, rel=0.05)
+    assert mean.interval[1] - mean.interval[0] == pytest.approx(2 * 1.96 * error, rel=0.07)
+    assert result.advice[0].endswith(". Not that of the mean, which you measured")
+
+
+@pytest.mark.slow
 def test_a_good_fit_is_called_so():
     """The same spectrum without the band: one in a hundred would be missed, this one is not."""
     result = jm.fit(TASK, drawn(60, 3), **QUICK)
@@ -203,7 +215,7 @@ def test_an_interval_ends_where_the_profile_says(x64):
     found = consequences(objective, seen)
     gain = np.linalg.inv(found.jacobian.T @ found.jacobian + np.eye(2))
     # With the inverse curvature as covariance the rise that is sought is 1.96².
-    ends = intervals(problem, objective, seen, gain, ["c_w"])["c_w"]
+    ends = intervals(problem, objective, seen, gain, {"c_w": 1.0})["c_w"]
     for end in (ends.low, ends.high):
         assert end is not None
         held = theta[0] + end

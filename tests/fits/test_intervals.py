@@ -93,7 +93,7 @@ def test_an_interval_ends_where_the_profile_does(task, segments, x64):
     problem, objective, seen = fitted(task, drawn(task, segments, 3))
     value, theta = consequences(objective, seen).values[0], seen.theta + PLANE
     over_plane, rises = consequences_of_rows(objective, expand(objective, theta)).values[0], rise(objective, seen, theta)
-    found = intervals(problem, objective, seen, inverse_curvature(objective, seen), names)
+    found = intervals(problem, objective, seen, inverse_curvature(objective, seen), dict.fromkeys(names, 1.0))
     for name in names:
         ends = found[name].about(value[name])
         assert ends[0] < value[name] < ends[1]
@@ -126,7 +126,7 @@ def test_that_of_a_half_power_frequency_ends_where_its_profile_does(task, x64):
     """With the inverse curvature as covariance the root of the rise that is sought is 1.96, at either end."""
     problem, objective, seen = fitted(task, drawn(task, 45, 3))
     value, gain = consequences(objective, seen).values[0][NAME], inverse_curvature(objective, seen)
-    low, high = half_power_intervals(problem, objective, seen, gain, [NAME])[NAME].about(value)
+    low, high = half_power_intervals(problem, objective, seen, gain, {NAME: 1.0})[NAME].about(value)
     assert low < value < high
     rises = rise(objective, seen, seen.theta + PLANE)
     np.testing.assert_allclose([lowest(level(task, seen.theta + PLANE, f), rises) for f in (low, high)], 1.96, rtol=0.03)
@@ -141,8 +141,8 @@ def test_about_a_shelf_there_is_no_interval(x64):
     theta = seen.theta + PLANE
     rises = rise(objective, seen, theta)
     assert max(lowest(level(SHELF, theta, f), rises) for f in np.geomspace(value, 2 * LAST, 8)[1:]) < 1.96
-    assert half_power_intervals(problem, objective, seen, gain, [NAME])[NAME].about(value) == (None, None)
-    assert intervals(problem, objective, seen, gain, [NAME])[NAME].about(value)[1] < LAST
+    assert half_power_intervals(problem, objective, seen, gain, {NAME: 1.0})[NAME].about(value) == (None, None)
+    assert intervals(problem, objective, seen, gain, {NAME: 1.0})[NAME].about(value)[1] < LAST
 
 
 @pytest.mark.slow
@@ -157,7 +157,7 @@ def test_stated_intervals_hold_the_truth(x64):
         scatter = residual_covariance(problem.parts[0].target, objective.parts[0], np.zeros(30))
         covariance = parameter_covariance(found.jacobian, scatter, problem.prior)
         value = float(found.values[0][NAME])
-        low, high = half_power_intervals(problem, objective, seen, covariance, [NAME])[NAME].about(value)
+        low, high = half_power_intervals(problem, objective, seen, covariance, {NAME: 1.0})[NAME].about(value)
         if low is not None:
             known = float(half_power_frequency(truth, linearise(truth)))
             held.append(low <= known <= high)

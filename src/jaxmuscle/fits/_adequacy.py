@@ -11,15 +11,22 @@ from scipy.linalg import block_diag
 from scipy.special import gammaincinv, ndtr
 
 from jaxmuscle._common.keys import fold_in
+from jaxmuscle._common.programs import kept
+from jaxmuscle.objective._arguments import base_of
 from jaxmuscle.objective._consequences import Consequences, Expansion, consequences
 from jaxmuscle.objective._covariance import parameter_covariance, residual_covariance
 from jaxmuscle.objective._problem import FitProblem
-from jaxmuscle.objective._residuals import PartResiduals, Residuals
+from jaxmuscle.objective._residuals import PartResiduals, Residuals, further_residuals
+from jaxmuscle.response._expected import Moments
 
 from ._checks import Stage, seen_best
+from ._half_power import HALF_POWER, half_power_intervals
+from ._intervals import Interval, intervals
+from ._part import met
 from ._refit import STRENGTHS, Refit, refit_of
 
 ADEQUATE = 0.01
+ALONE = 2.5  # standard deviations: a single bin beyond the run that is named
 REPLICATES = 999
 CHUNK = 200
 Rows = Float[np.ndarray, "replicates residuals"]
@@ -54,6 +61,7 @@ class Endpoint:
     problem: FitProblem
     objective: Residuals
     seen: Expansion
+    _ends: dict[str, Interval] = dataclasses.field(default_factory=dict, compare=False)
 
     @classmethod
     def of(cls, problem: FitProblem, stage: Stage) -> "Endpoint":
@@ -86,6 +94,48 @@ class Endpoint:
     def adequacy(self) -> Adequacy | None:
         """Whether the model describes the data; None where the spread is unknown."""
         return adequacy(self)
+
+    @functools.cached_property
+    def further(self) -> tuple[dict[str, float], ...]:
+        """Of every part the residuals of the measured mean and coefficient of variation, in standard deviations."""
+        return tuple(
+            further_of(part, moments) for part, moments in zip(self.objective.parts, self.seen.moments, strict=True)
+        )
+
+    @functools.cached_property
+    def met(self) -> frozenset[str]:
+        """The means and coefficients of variation that were measured and that the fit meets.
+
+        Their errors are those of the measurement: that the spectrum misses its data does not make them less certain.
+        """
+        several = len(self.problem.parts) > 1
+        return frozenset(
+            f"{name}@{part.name}" if several else name
+            for part, own in zip(self.problem.parts, self.further, strict=True)
+            for name in met(own)
+        )
+
+    def widening(self, name: str) -> float:
+        """By how much the errors of a quantity grow."""
+        return 1.0 if self.adequacy is None or name in self.met else self.adequacy.widening
+
+    def intervals(self, names: list[str]) -> dict[str, Interval]:
+        """95 % intervals of these quantities; computed once."""
+        new = {name: self.widening(name) for name in names if name not in self._ends}
+        bent = {name: new.pop(name) for name in list(new) if base_of(name) == HALF_POWER}
+        where = self.problem, self.objective, self.seen, self.covariance
+        self._ends.update(intervals(*where, new) | half_power_intervals(*where, bent))
+        return {n: self._ends[n] for n in names if n in self._ends}
+
+
+def further_of(part: PartResiduals, moments: Moments) -> dict[str, float]:
+    """Residuals of a target's coefficient of variation and mean by name."""
+    names = [name for name, given in (("coefficient_of_variation", part.data.variation), ("mean", part.data.mean))
+             if given is not None]  # fmt: skip
+    return dict(zip(names, map(float, np.asarray(_further(moments, part.data))), strict=False))
+
+
+_further = kept(further_residuals)
 
 
 def adequacy(ended: Endpoint) -> Adequacy | None:
@@ -203,5 +253,11 @@ def _misfit(problem: FitProblem, objective: Residuals, residuals: np.ndarray, co
             low, high = part.target.frequency[first[i]], part.target.frequency[last[i] - 1]
             place = f"at {low:.2g} Hz" if last[i] - first[i] == 1 else f"from {low:.2g} to {high:.2g} Hz"
             more = "more" if ratio[i] > 0 else "less"
-            worst = ratio[i], f"{whose[part.name]} {more} power than the model {place} ({abs(ratio[i]):.1f} standard errors)"
+            said = f"{whose[part.name]} {more} power than the model {place} ({abs(ratio[i]):.1f} standard errors)"
+            # What the eye finds first in the figure.
+            k = int(np.argmax(np.abs(residuals[rows])))
+            largest = float(residuals[rows][k])
+            if not first[i] <= k < last[i] and abs(largest) > ALONE:
+                said += f", and {'more' if largest > 0 else 'less'} at {part.target.frequency[k]:.2g} Hz"
+            worst = ratio[i], said
     return worst[1]

@@ -19,10 +19,9 @@ from jaxmuscle.simulation._trajectory import Trajectory
 from jaxmuscle.spectra._bin_law import BinStatistics, trial_samples
 from jaxmuscle.spectra._settings import WINDOW
 
-from ._part import Estimate, Start
+from ._part import Estimate, Start, met
 
 AMBIGUOUS, OTHER = 2.0, 3.0
-MISSED = 3.0
 NONLINEAR = 0.1
 LEFT = 1e-3
 RISEN = 1.5
@@ -190,7 +189,7 @@ def further_notices(further: Mapping[str, float]) -> tuple[str, ...]:
     words = {"coefficient_of_variation": "coefficient of variation", "mean": "mean"}
     return tuple(f"the fitted {words[name]} is {abs(off):.1f} standard deviations {'above' if off > 0 else 'below'} the "
                  "given one: the model cannot have both it and the spectrum" for name, off in further.items()
-                 if abs(off) > MISSED)  # fmt: skip
+                 if name not in met(further))  # fmt: skip
 
 
 def twitch_notices(found: Mapping[str, Estimate]) -> tuple[str, ...]:

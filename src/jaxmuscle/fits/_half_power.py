@@ -1,5 +1,6 @@
 """95 % interval of a half-power frequency: the frequencies at which the response may have half its power."""
 
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import jax
@@ -28,15 +29,15 @@ OPEN = Interval(None, None, log=True)
 
 
 def half_power_intervals(
-    problem: FitProblem, objective: Residuals, seen: Expansion, covariance: np.ndarray, names: list[str]
+    problem: FitProblem, objective: Residuals, seen: Expansion, covariance: np.ndarray, widening: Mapping[str, float]
 ) -> dict[str, Interval]:
     """The frequencies at which the response may have half its power, from the lowest to the highest; of each of the names.
 
     `L(f) = ln(2 |H(f)|² / |H(0)|²)` is zero at the true one, whatever the shape of the response. So f belongs to the
     interval if L(f) can be held at zero, all else fitted anew, and twice the cost rises by at most
-    `3.84 gᵀ C g / gᵀ G g`: g is the slope of L(f) with respect to θ, C the covariance of the estimates, G the inverse
-    curvature of the cost. Open at both ends, which means not determined, if it leaves the compared bins and points: no
-    data are there.
+    `3.84 w² gᵀ C g / gᵀ G g`: g is the slope of L(f) with respect to θ, C the covariance of the estimates, G the inverse
+    curvature of the cost, w by how much the errors of this quantity are widened (`widening`, of every name). Open at both
+    ends, which means not determined, if it leaves the compared bins and points: no data are there.
 
     Of fits in linear response with log residuals only (empty otherwise).
 
@@ -45,7 +46,7 @@ def half_power_intervals(
     if not objective.linear or problem.residual != "log":
         return {}
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # a row that runs away belongs to no interval
-        return {name: _interval(problem, objective, seen, covariance, name) for name in names}
+        return {name: _interval(problem, objective, seen, factor**2 * covariance, name) for name, factor in widening.items()}
 
 
 def _interval(problem: FitProblem, objective: Residuals, seen: Expansion, covariance: np.ndarray, name: str) -> Interval:

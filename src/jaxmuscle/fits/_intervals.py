@@ -1,5 +1,6 @@
 """95 % intervals of what a fit determined, from the profile of its cost."""
 
+import itertools
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple, Protocol, runtime_checkable
 
@@ -36,7 +37,7 @@ class Interval(NamedTuple):
 
 
 def intervals(
-    problem: FitProblem, objective: Residuals, seen: Expansion, covariance: np.ndarray, names: list[str]
+    problem: FitProblem, objective: Residuals, seen: Expansion, covariance: np.ndarray, widening: Mapping[str, float]
 ) -> dict[str, Interval]:
     """Where twice the cost, all else fitted anew, has risen by 3.84 times the factor that correlated bins ask for.
 
@@ -44,22 +45,25 @@ def intervals(
     of q. It moves in stages, two fifths of the way at first: where the ridge bends, the far end of the straight line costs a
     hundred times too much. In each stage it is held while damped Gauss-Newton steps lower the cost, until they gain little.
     The next stage begins on the line from the fit through where it stands, further out or in. The last is where the rise is
-    `3.84 gᵀ C g / gᵀ G g`, C the covariance of the estimates. Positive quantities move in their logarithm. All at once.
+    `3.84 w² gᵀ C g / gᵀ G g`, C the covariance of the estimates, w by how much the errors of this quantity are widened
+    (`widening`, of every name). Positive quantities move in their logarithm. All at once.
 
     Of fits in linear response with log residuals only (empty otherwise).
     """
-    if not objective.linear or problem.residual != "log" or not names:
+    if not objective.linear or problem.residual != "log":
         return {}
     found: dict[str, Interval] = {}
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # a row that runs away is an open end
-        for start in range(0, len(names), MOST_ROWS // 2):
-            found |= _some(problem, objective, seen, covariance, names[start : start + MOST_ROWS // 2])
+        for start in range(0, len(widening), MOST_ROWS // 2):
+            some = dict(itertools.islice(widening.items(), start, start + MOST_ROWS // 2))
+            found |= _some(problem, objective, seen, covariance, some)
     return found
 
 
 def _some(
-    problem: FitProblem, objective: Residuals, seen: Expansion, covariance: np.ndarray, names: list[str]
+    problem: FitProblem, objective: Residuals, seen: Expansion, covariance: np.ndarray, widening: Mapping[str, float]
 ) -> dict[str, Interval]:
+    names = list(widening)
     here = Point.of(problem, objective, jax.tree.map(lambda x: np.asarray(x)[None], seen))
     curvature = here.jacobian[0].T @ here.jacobian[0] + np.diag(problem.prior)
     gain = np.linalg.pinv(curvature, hermitian=True)
@@ -69,7 +73,7 @@ def _some(
     slope = np.where(log[:, None], slope / np.where(log, value, 1.0)[:, None], slope)
     start = np.where(log, np.log(np.where(log, value, 1.0)), value)
     ours = np.einsum("ri,ij,rj->r", slope, gain, slope)
-    stated = np.sqrt(np.einsum("ri,ij,rj->r", slope, covariance, slope))
+    stated = np.repeat(list(widening.values()), 2) * np.sqrt(np.einsum("ri,ij,rj->r", slope, covariance, slope))
     wanted = REACH * stated / np.sqrt(ours)  # root of the rise that is sought
     side = np.tile([-1.0, 1.0], len(names))
     way = np.full(len(start), FIRST)  # that each row is to go, of what the curvature says

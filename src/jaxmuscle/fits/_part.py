@@ -1,6 +1,7 @@
 """What a fit found of one target, and numbers with their errors: as objects and as tables."""
 
 import math
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
@@ -19,7 +20,13 @@ from ._fit_file import EstimateTable, PartTable, check_lengths
 if TYPE_CHECKING:
     import pandas
 
+MISSED = 3.0  # standard deviations
 SPECTRUM = ("fitted", "harmonic_share", "residual", "deviation")
+
+
+def met(further: Mapping[str, float]) -> tuple[str, ...]:
+    """Which of the measured mean and coefficient of variation a fit meets within three standard deviations."""
+    return tuple(name for name, off in further.items() if abs(off) <= MISSED)
 
 
 class Estimate(eqx.Module):

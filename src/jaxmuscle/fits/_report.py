@@ -9,7 +9,6 @@ import numpy as np
 from jaxmuscle._common.environment import versions
 from jaxmuscle._common.errors import SimulationError
 from jaxmuscle._common.keys import fold_in
-from jaxmuscle._common.programs import kept
 from jaxmuscle.ensembles._ensemble import runs_for_means
 from jaxmuscle.model._noises import with_active_noise
 from jaxmuscle.model._tasks import AbstractTask
@@ -18,7 +17,6 @@ from jaxmuscle.objective._consequences import jackknife, observed
 from jaxmuscle.objective._covariance import Identifiability, common_scales, known_products
 from jaxmuscle.objective._moment_models import Linear
 from jaxmuscle.objective._problem import FitProblem, Part
-from jaxmuscle.objective._residuals import PartResiduals, further_residuals
 from jaxmuscle.response._expected import Moments, check_power, expected_moments
 from jaxmuscle.response._linearised import settled
 from jaxmuscle.response._second_order import negative_coefficients, second_order
@@ -40,9 +38,7 @@ from ._checks import (
     twitch_notices,
     unsettled,
 )
-from ._half_power import HALF_POWER, half_power_intervals
 from ._harmonic_evidence import harmonic_test
-from ._intervals import intervals
 from ._ladder import Rung
 from ._part import FittedPart, Start
 from ._result import FitResult
@@ -80,7 +76,7 @@ def report_fit(
     Then the second order says whether the linear response holds, unless the result is `preliminary`. `ended` is that point,
     if it has been looked at already.
     """
-    problem, objective, final = plan.problem, stages[-1].objective, stages[-1].minima
+    problem, final = plan.problem, stages[-1].minima
     first = stages[0].minima
     ends = problem.coordinates.values_of(np.asarray(problem.coordinates.theta(np.asarray(first.s))))
     starts = tuple(
@@ -128,16 +124,12 @@ def report_fit(
         moved |= {n for n in parameters | derived if base_of(n).startswith("harmonic_")}
         other += (f"the harmonic may have another frequency, or be too faint to be seen: with a probability of "
                   f"{100 * share:.0f} % it is more than a bin from the frequency shown. So it has no errors",)  # fmt: skip
-    factor = 1.0 if judgement is None else judgement.widening
     moved |= too_curved(problem, derived, known)
-    parameters, derived = (widened(without_errors(moved, table), factor) for table in (parameters, derived))
-    stated = [n for n, p in (parameters | derived).items() if p.stderr and (n in derived or n in c.names)]
-    bent = [n for n in stated if base_of(n) == HALF_POWER]
-    ends = intervals(problem, objective, seen, factor**2 * covariance, [n for n in stated if n not in bent])
-    ends |= half_power_intervals(problem, objective, seen, factor**2 * covariance, bent)
+    parameters, derived = (widened(without_errors(moved, table), ended.widening) for table in (parameters, derived))
+    ends = ended.intervals([n for n, p in (parameters | derived).items() if p.stderr and (n in derived or n in c.names)])
     parameters, derived = (with_intervals(table, ends) for table in (parameters, derived))
     polish = polish_check(problem, stages, derived)
-    parts, notices = _parts(plan, stages, tasks, seen.moments, made, polish)
+    parts, notices = _parts(plan, stages, tasks, ended, made, polish)
     describes = judgement is None or judgement.adequate
     line_test = None if interrupted or not plan.check_seeds else harmonic_test(problem, final, judged=describes)
     simulated = bool(plan.check_seeds) or preliminary or not problem.control
@@ -209,13 +201,15 @@ def _parts(
     plan: Plan,
     stages: list[Stage],
     tasks: tuple[AbstractTask, ...],
-    seen: tuple[Moments, ...],
+    ended: Endpoint,
     made: list[_Made],
     polish: dict[str, float | int],
 ) -> tuple[dict[str, FittedPart], list[str]]:
     """Every target's spectrum, and what has to be said of it."""
     parts, notices, polished = {}, [], stages[-1].name == "polishing"
-    for i, (part, task, moments, simulated) in enumerate(zip(plan.problem.parts, tasks, seen, made, strict=True)):
+    for i, (part, task, moments, simulated) in enumerate(
+        zip(plan.problem.parts, tasks, ended.seen.moments, made, strict=True)
+    ):
         target, share = part.target, np.asarray(moments.line / moments.power)
         statistics, power = bin_statistics(target, share), np.mean(simulated.each.power, axis=0)
         fitted = np.asarray(power / power.sum())
@@ -225,7 +219,7 @@ def _parts(
             check = linear_check(np.asarray(simulated.each.power), simulated.expected, statistics)
         elif polished and len(residual) and isinstance(model := stages[-1].objective.parts[i].model, Linear):
             check = {"largest_deviation": float(np.max(np.abs(np.asarray(model.correction.power) - 1)))}
-        further = further_of(stages[-1].objective.parts[i], moments)
+        further = ended.further[i]
         own = [*notices_of(target, statistics, check, unsettled(plan.problem, moments)), *further_notices(further),
                *negative_coefficients(task)]  # fmt: skip
         notices += own if len(tasks) == 1 else [f"{part.name}: {notice}" for notice in own]
@@ -262,16 +256,6 @@ def _components(part: Part, task: AbstractTask) -> dict[str, np.ndarray]:
     floor = power - relaxation - np.sum(rhythms, axis=0)
     names = ("relaxation", "floor", "harmonic", "tremor", *(f"resonance_{i}" for i in range(2, len(rhythms))))
     return {name: own / power for name, own in zip(names, (relaxation, floor, *rhythms), strict=False)}
-
-
-def further_of(part: PartResiduals, moments: Moments) -> dict[str, float]:
-    """Residuals of a target's coefficient of variation and mean by name."""
-    names = [name for name, given in (("coefficient_of_variation", part.data.variation), ("mean", part.data.mean))
-             if given is not None]  # fmt: skip
-    return dict(zip(names, map(float, np.asarray(_further(moments, part.data))), strict=False))
-
-
-_further = kept(further_residuals)
 
 
 def of_several(parts: dict[str, FittedPart]) -> tuple[str, ...]:

@@ -27,7 +27,7 @@ from jaxmuscle.objective._consequences import derived_names
 from ._adequacy import Adequacy
 from ._fit_file import FORMAT, FORMATS, FitTable, PartTable, disagreement
 from ._ladder import Rung
-from ._part import Estimate, FittedPart, Start, estimates_to_table, part_to_table, read_estimates, read_part
+from ._part import Estimate, FittedPart, Start, estimates_to_table, met, part_to_table, read_estimates, read_part
 from ._result_text import card_of, in_use, once, per_newton
 
 if TYPE_CHECKING:
@@ -165,6 +165,9 @@ class FitResult(Result, eqx.Module):
         if self.adequacy is None or self.adequacy.adequate:
             return ()
         told = [f"standard errors are widened by a factor of {self.adequacy.widening:.2g}: the model misses the data"]
+        measured = {name.replace("_", " ") for part in self.parts.values() for name in met(part.further)}
+        if measured:
+            told[0] += f". Not that of the {' and of the '.join(sorted(measured))}, which you measured"
         if "harmonic_frequency" in self.free:
             told.append("no p-value of the harmonic: where the model misses the data, any harmonic improves the fit")
         return (*told, "what to do: do not interpret the parameters. Look at the residuals in the figure. Look for drift "

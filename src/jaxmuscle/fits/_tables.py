@@ -1,6 +1,6 @@
 """The tables of a fit's result: parameters and derived quantities with their errors, what the data determine of them."""
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -122,9 +122,10 @@ def without_errors(names: Collection[str], table: dict[str, Estimate]) -> dict[s
     return {n: Estimate(p.value, p.unit, None, p.free, False) if n in names and p.free else p for n, p in table.items()}
 
 
-def widened(table: dict[str, Estimate], factor: float) -> dict[str, Estimate]:
-    """The table with all standard errors multiplied."""
-    return {n: p if p.stderr is None else eqx.tree_at(lambda e: e.stderr, p, factor * p.stderr) for n, p in table.items()}
+def widened(table: dict[str, Estimate], factor: Callable[[str], float]) -> dict[str, Estimate]:
+    """The table with the standard error of every name multiplied."""
+    return {n: p if p.stderr is None else eqx.tree_at(lambda e: e.stderr, p, factor(n) * p.stderr)
+            for n, p in table.items()}  # fmt: skip
 
 
 def with_intervals(table: dict[str, Estimate], ends: Mapping[str, Interval]) -> dict[str, Estimate]:

@@ -187,8 +187,9 @@ class Expansion(NamedTuple):
 
 def part_of(objective: Residuals, seen: Expansion, i: int) -> Expansion:
     """What was seen of one part, with slopes with respect to its own coordinates."""
-    slopes = jax.tree.map(lambda slope: objective.own(slope, i), seen.slopes[i])
-    return Expansion(objective.own(seen.theta, i), seen.moments[i], slopes)
+    own = objective.own
+    slopes = jax.tree.map(lambda slope: own(slope, i), seen.slopes[i])
+    return Expansion(own(seen.theta, i), seen.moments[i], slopes)
 
 
 Tables = tuple[dict[str, np.ndarray], ...]
@@ -199,7 +200,8 @@ def quantities(objective: Residuals, seen: Expansion) -> tuple[Tables, Tables]:
     found = [
         jax.tree.map(np.asarray, _quantities(part, part_of(objective, seen, i))) for i, part in enumerate(objective.parts)
     ]
-    slopes = tuple({n: objective.spread(g, i) for n, g in slopes.items()} for i, (_, slopes) in enumerate(found))
+    spread = objective.spread  # asked for once: every time it makes an object
+    slopes = tuple({n: spread(g, i) for n, g in slopes.items()} for i, (_, slopes) in enumerate(found))
     return tuple(values for values, _ in found), slopes
 
 
@@ -235,11 +237,12 @@ def consequences_of_rows(objective: Residuals, seen: Expansion) -> Consequences:
     """The same at every point where it was seen, with a leading axis of points."""
     found = [jax.tree.map(np.asarray, _consequences(part, part_of(objective, seen, i)))
              for i, part in enumerate(objective.parts)]  # fmt: skip
+    spread = objective.spread  # asked for once: every time it makes an object
     return Consequences(
         np.concatenate([values[0] for values, _ in found], axis=1),
-        np.concatenate([objective.spread(slopes[0], i) for i, (_, slopes) in enumerate(found)], axis=1),
+        np.concatenate([spread(slopes[0], i) for i, (_, slopes) in enumerate(found)], axis=1),
         tuple(values[1] for values, _ in found),
-        tuple({n: objective.spread(g, i) for n, g in slopes[1].items()} for i, (_, slopes) in enumerate(found)),
+        tuple({n: spread(g, i) for n, g in slopes[1].items()} for i, (_, slopes) in enumerate(found)),
     )
 
 
@@ -301,7 +304,8 @@ def expand(objective: Any, theta: Float[np.ndarray, "points free"]) -> Expansion
     Part by part: each has the program of a fit alone. (One program of two kinds of task hangs under jaxlib 0.10.2.)
     """
     each = [_expanded(part, np.asarray(objective.own(theta, i))) for i, part in enumerate(objective.parts)]
-    slopes = tuple(jax.tree.map(lambda g, i=i: objective.spread(g, i), slopes) for i, (_, slopes) in enumerate(each))
+    spread = objective.spread  # asked for once: every time it makes an object
+    slopes = tuple(jax.tree.map(lambda g, i=i: spread(g, i), slopes) for i, (_, slopes) in enumerate(each))
     return Expansion(theta, tuple(moments for moments, _ in each), slopes)
 
 
