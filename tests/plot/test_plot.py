@@ -504,7 +504,10 @@ def steady(count, unit="N"):
     names = ("power_0_0.5", "power_above_12", *_plot_steadiness.VARIATIONS.values(), *_plot_steadiness.REGULARITY.values())
 
     def measures(i):
-        return {name: types.SimpleNamespace(value=0.1 * (k + 1) + 0.01 * i, stderr=0.02) for k, name in enumerate(names)}
+        return {
+            name: types.SimpleNamespace(value=0.1 * (k + 1) + 0.01 * i, interval=(0.05 * (k + 1), k + 1.0))
+            for k, name in enumerate(names)
+        }
 
     trials = {f"trial {i}": measures(i) for i in range(count)}
     return types.SimpleNamespace(unit=unit, trials=trials, measures=measures(1))
@@ -516,11 +519,17 @@ def test_steadiness_shows_every_trial_and_the_value_of_all(count, unit, label):
     figure.canvas.draw()
     power, variation, regularity = figure.axes
     assert power.get_ylabel() == label and power.get_yscale() == "log"
-    assert [tick.get_text() for tick in power.get_xticklabels()] == ["0 to\n0.5", "above\n12"]
+    assert [tick.get_text() for tick in power.get_xticklabels()] == ["0 to\n0.5", "12 to\n30"]
     dots = [line for ax in figure.axes for line in ax.lines if line.get_label() == "trials"]
     assert [line.get_ydata().size for line in dots] == ([6, 9, 9] if count > 1 else [])
     np.testing.assert_allclose(variation.containers[0].lines[0].get_ydata(), [31, 41, 51])
     np.testing.assert_allclose(regularity.containers[0].lines[0].get_ydata(), [0.61, 0.71, 0.81])
+    (bars,) = variation.containers[0].lines[2]  # the ends of the 95 % intervals, in percent of the mean
+    ends = np.array([bar[:, 1] for bar in bars.get_segments()])
+    np.testing.assert_allclose(ends, [[15, 300], [20, 400], [25, 500]])
+    if count > 1:  # the mean hides no trial
+        beside = dots[1].get_xdata()[:, None] - variation.containers[0].lines[0].get_xdata()
+        assert np.min(np.abs(beside)) > 0.1
     assert f"{count} trials" in figure.get_suptitle() or count == 1
 
 
@@ -716,6 +725,7 @@ def identified():
     return types.SimpleNamespace(
         target="vastus-lateralis-26mvc", designs=designs, present=outlook("now", 1.0), together=" and ", told=told,
         telling_pairs=[outlook(f"{names[0]} and {names[1]}", 1e9)], letter=lambda i: "ABC"[i], threshold=3.0,
+        doubt="The fit does not describe its data",
     )  # fmt: skip
 
 

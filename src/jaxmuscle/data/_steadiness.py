@@ -36,6 +36,7 @@ ALIKE = 1.2  # longest trial over shortest
 TREMOR, RISE, HALF = 6.0, 4.0, 3  # Hz; standard deviations of a bin; bins on either side
 RANGES = {name.removeprefix("band"): edges for name, edges in BANDS.items()} | {"_above_12": (12.0, math.inf)}
 FAST = 0.5  # Hz
+CUT_OFF = RECORDED.filter_cutoff or math.inf  # Hz, of the low-pass before everything
 SIGNED = ("mean", "dfa_exponent")  # all else is 0 or more
 VARIATION = "coefficient_of_variation"
 REGULARITY = ("approximate_entropy", "sample_entropy", "dfa_exponent")
@@ -123,7 +124,7 @@ def _plain(measures: dict[str, Measure]) -> dict[str, Any]:
 
 
 def _range(low: float, high: float) -> str:
-    return f"{low:g} to {high:g} Hz" if math.isfinite(high) else f"above {low:g} Hz"
+    return f"{low:g} to {min(high, CUT_OFF):g} Hz"
 
 
 def _line(words: str, name: str, m: Measure) -> str:
@@ -154,7 +155,7 @@ def steadiness(recordings: Recording | Iterable[Recording]) -> Steadiness:
     | `coefficient_of_variation` | σ / abs(μ), a fraction; NaN where σ exceeds abs(μ) |
     | `..._without_drift` | the same about the least-squares line, over abs(μ) |
     | `..._above_0.5` | the same without what is slower than 0.5 Hz: √(Σ of the powers above) / abs(μ) |
-    | `power_0_0.5` ... `power_8_12`, `power_above_12` | power in the bands of the fits' `band_...` [unit²] |
+    | `power_0_0.5` ... `power_8_12`, `power_above_12` | power in the bands of the fits' `band_...`, and from 12 to 30 Hz |
     | `share_0_0.5` ... | the same over σ², a fraction |
     | `approximate_entropy`, `sample_entropy` | of templates of 2 samples, within 0.2 σ |
     | `dfa_exponent` | slope of detrended fluctuations, windows from 0.04 s to a tenth of the recording, order 1 |

@@ -118,10 +118,20 @@ def _table(title: str, table: dict[str, Estimate], column: str = "") -> list[str
     wide = max([26, *(2 + len(name) for name in table)])
     lines = [f"  {title}:"] if not column else [f"  {title + ': ':<{wide + 24}}{column.strip()}"]
     for name, p in table.items():
-        unit = "" if p.unit == "1" else p.unit
-        interval = f"{p.interval_in_words():<19} " if column else ""
+        interval, unit = f"{p.interval_in_words():<19} " if column else "", _beside(name, table)
         lines.append(f"    {name:<{wide}}{p.in_words():<20}{interval}{unit}".rstrip())
     return lines if table else [*lines, "    nothing"]
+
+
+def _beside(name: str, table: Mapping[str, Estimate]) -> str:
+    """What stands behind a number: its unit; a variation in percent, too; from where on a share of the power counts."""
+    base, at, target = name.partition("@")
+    if base == "coefficient_of_variation":
+        return f"= {100 * table[name].value:.3g} %"
+    rhythm = table.get(f"tremor_frequency{at}{target}")
+    if base == "tremor_share" and rhythm is not None:
+        return f"above {0.5 * rhythm.value:.2g} Hz"
+    return "" if table[name].unit == "1" else table[name].unit
 
 
 def _by_band(table: dict[str, Estimate]) -> list[str]:

@@ -92,8 +92,7 @@ def search(plan: Plan, answer: Callable[[FitResult], None] | None = None, models
         ended = Endpoint.of(problem, stages[-1])
         if answer is not None:
             found = _unchecked(plan, stages, ladder, ended)
-            later = tuple(n for n in found.notices if n != UNCHECKED) if plan.check_seeds else found.notices
-            answer(dataclasses.replace(found, notices=later))
+            answer(_checked_later(found) if plan.check_seeds else found)
         problem.tell("checking with new simulations" if plan.check_seeds else "computing the errors", 0.8)
         result = report_fit(plan, stages, ladder, ended=ended)
         if models is not None and result.success:
@@ -103,6 +102,12 @@ def search(plan: Plan, answer: Callable[[FitResult], None] | None = None, models
         raise _stopped(plan, stages, ladder, ended) from None
     problem.tell("done", 1.0)
     return result
+
+
+def _checked_later(found: FitResult) -> FitResult:
+    """Without what the checks, which come, will say: two answers to one question puzzle."""
+    parts = {name: dataclasses.replace(part, check={}) for name, part in found.parts.items()}
+    return dataclasses.replace(found, parts=parts, notices=tuple(n for n in found.notices if n != UNCHECKED))
 
 
 def _stopped(plan: Plan, stages: list[Stage], *reached: Any, **how: Any) -> FitInterrupted:

@@ -23,20 +23,22 @@ def identifiability(report: Any, ax: Axes | None = None) -> Figure | SubFigure:
 
     Above, the singular values of the Jacobian, one for each direction of the parameters: filled where the data determine it,
     open where they do not. Values that are smaller than the axis are counted at its left end. Below, the standard errors
-    that data and prior leave. Letters are legible in a column of 85 mm, as far as ten measurements.
+    that data and prior leave; those of the shares by band are in the table alone. Letters are legible in a column of 85 mm,
+    as far as ten measurements.
     """
     letters = {d.name: report.letter(i) for i, d in enumerate(report.designs)}
     shown = [report.present, *(d for d in report.designs if d.failed is None), *report.telling_pairs[:PAIRS]]
     marks = ["now", *(" + ".join(letters[name] for name in o.name.split(report.together)) for o in shown[1:])]
     labels = [_label(mark, o.name) for mark, o in zip(marks, shown, strict=True)]
     lines = sum(label.count("\n") + 1 for label in labels)
-    heights = [0.7 + TEXT * lines + DOTS * len(shown), 1.1 + ROW * len(report.told)]
+    names = [name for name in report.told if not name.startswith("band_")]  # these are in the table
+    heights = [0.7 + TEXT * lines + DOTS * len(shown), 1.1 + ROW * len(names)]
     width = max(COLUMN, NAMES + CELL * len(shown))
     fig = canvas(ax, (width, sum(heights)))
     upper, lower = fig.subfigures(2, 1, squeeze=False, height_ratios=heights)[:, 0]
     _singular_values(upper.add_subplot(), shown, labels, report.threshold)
-    _matrix(lower.add_subplot(), shown, marks, report.told)
-    fitted_to(fig, sum(heights), heading(fig, report.target) + key(fig, 3), width)
+    _matrix(lower.add_subplot(), shown, marks, names)
+    fitted_to(fig, sum(heights), heading(fig, report.target, bad=report.doubt) + key(fig, 3), width)
     return fig
 
 
@@ -50,7 +52,6 @@ def _singular_values(ax: Axes, shown: list[Any], labels: list[str], threshold: f
     """Words and a row of dots for each design: filled where determined, counted at the edge where smaller than the axis."""
     top = EDGE, threshold, *(float(o.singular_values.max()) for o in shown)
     ax.axvspan(EDGE, threshold, color=shade(0.06), lw=0, zorder=0)
-    ax.axvline(threshold, color=GREY, lw=0.8, zorder=1)
     open_: dict[str, Any] = {"facecolor": "none", "edgecolor": VERMILLION, "zorder": 3}
     row = 0.0
     for outlook, label in zip(shown, labels, strict=True):
@@ -61,6 +62,7 @@ def _singular_values(ax: Axes, shown: list[Any], labels: list[str], threshold: f
         ax.text(0.0, row, label, va="top", **words)
         ax.text(1.0, row, f"{known.sum()} of {len(size)}", va="top", ha="right", **words)
         ax.axhline(at, color=shade(0.2), lw=0.5, zorder=0)
+        ax.vlines(threshold, at - 0.5 * DOTS, at + 0.5 * DOTS, color=GREY, lw=0.8, zorder=1)  # not through the words
         ax.scatter(size[known], np.full(known.sum(), at), s=18, color=BLUE, label="determined", zorder=3)
         some = ~known & ~tiny
         ax.scatter(size[some], np.full(some.sum(), at), s=18, label="not determined", **open_)

@@ -17,7 +17,7 @@ REGULARITY = {
     "sample\nentropy": "sample_entropy",
     "DFA\nexp. α": "dfa_exponent",
 }
-SPREAD = 0.28
+LEFT, RIGHT, MEAN = -0.32, 0.14, 0.3  # of the trials, and of their mean beside them
 HEIGHTS = 1.9, 1.8  # inches
 
 
@@ -25,7 +25,8 @@ HEIGHTS = 1.9, 1.8  # inches
 def steadiness(steadiness: Any, ax: Axes | None = None) -> Figure | SubFigure:
     """Draws the steadiness of trials: power by band, coefficients of variation, entropies and DFA exponent.
 
-    Dots are trials, large ones the value of all with its standard error. Letters are legible in a column of 85 mm.
+    Dots are trials. Beside them, large, stands the value of all trials with its 95 % interval. Letters are legible in a
+    column of 85 mm.
     """
     fig = canvas(ax, (COLUMN, sum(HEIGHTS)))
     grid = fig.add_gridspec(2, 2, height_ratios=HEIGHTS)
@@ -53,20 +54,21 @@ def steadiness(steadiness: Any, ax: Axes | None = None) -> Figure | SubFigure:
 
 def _range(name: str) -> str:
     low, high = name.split("_")[1:]
-    return f"above\n{high}" if low == "above" else f"{low} to\n{high}"
+    return f"{high} to\n30" if low == "above" else f"{low} to\n{high}"  # the low-pass of what is measured
 
 
 def _dots(ax: Axes, steadiness: Any, names: dict[str, str], scale: float = 1.0) -> None:
     trials = list(steadiness.trials.values())
-    beside = np.linspace(-SPREAD, SPREAD, len(trials)) if len(trials) > 1 else np.zeros(1)
+    beside = np.linspace(LEFT, RIGHT, len(trials)) if len(trials) > 1 else np.zeros(1)
     each = scale * np.array([[trial[name].value for trial in trials] for name in names.values()])
     at = np.arange(len(names))
     if len(trials) > 1:
         ax.plot((at[:, None] + beside).ravel(), each.ravel(), "o", ms=2.8, color=SKY, zorder=3, label="trials")
     found = [steadiness.measures[name] for name in names.values()]
     value = scale * np.array([m.value for m in found])
-    error = scale * np.array([np.nan if m.stderr is None else m.stderr for m in found])
-    label = "mean ± standard error" if len(trials) > 1 else "± standard error"
-    ax.errorbar(at, value, error, fmt="o", ms=4.5, capsize=3, lw=1.2, color=BLUE, label=label)
+    ends = scale * np.array([(np.nan, np.nan) if m.interval is None else m.interval for m in found]).T
+    error = np.maximum([value - ends[0], ends[1] - value], 0.0)
+    label, place = ("mean, 95 % interval", at + MEAN) if len(trials) > 1 else ("95 % interval", at)
+    ax.errorbar(place, value, error, fmt="o", ms=4, capsize=2.5, lw=1.2, color=BLUE, label=label)
     ax.set_xticks(at, list(names))
     ax.set_xlim(-0.6, len(names) - 0.4)

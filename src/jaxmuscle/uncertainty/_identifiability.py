@@ -20,7 +20,7 @@ from jaxmuscle.objective._covariance import Identifiability, common_scales, know
 from jaxmuscle.objective._problem import FitProblem
 
 from ._designs import Design, design_information, designs_for, information_of, seen_here, told_data, without_further
-from ._identifiability_report import TOGETHER, IdentifiabilityReport, Known, Outlook
+from ._identifiability_report import TOGETHER, UNDESCRIBED, IdentifiabilityReport, Known, Outlook
 
 LEAST_PRIOR = 1e-6
 
@@ -80,7 +80,7 @@ def missed(result: FitResult) -> tuple[str, ...]:
     found = result.adequacy
     if found is None or found.adequate:
         return ()
-    return (f"the fit does not describe its data (chi2 {found.chi2:.3g}, expected {found.expected:.3g}). What follows "
+    return (f"{UNDESCRIBED} (chi2 {found.chi2:.3g}, expected {found.expected:.3g}). What follows "
             "assumes that the model holds. The errors here are not widened; those of the fit are, by a factor of "
             f"{found.widening:.2g}. What to do: find a model that describes the data first",)  # fmt: skip
 

@@ -111,6 +111,9 @@ class Outlook(Printed, Result, eqx.Module):
         }  # fmt: skip
 
 
+UNDESCRIBED = "the fit does not describe its data"
+
+
 class IdentifiabilityReport(Printed, Result, eqx.Module):
     """What the data of a fit determine (`present`), and what they would with further `designs` or `pairs` of these.
 
@@ -141,6 +144,11 @@ class IdentifiabilityReport(Printed, Result, eqx.Module):
     def letter(number: int) -> str:
         """What tables and figures call the design of that number: A, B, …"""
         return letter(number)
+
+    @property
+    def doubt(self) -> str:
+        """What stands in red above the figure: nothing, or that the fit misses its data."""
+        return "The fit does not describe its data" if any(n.startswith(UNDESCRIBED) for n in self.notices) else ""
 
     @property
     def told(self) -> list[str]:
