@@ -98,9 +98,10 @@ def test_powers_add_up_to_the_variance(found):
         assert measures[f"{CV}_above_0.5"].value == pytest.approx(fast, rel=1e-9)
 
 
-def test_bands_are_those_of_a_fit():
+def test_bands_are_those_of_a_fit(found):
     of_fits = {name.removeprefix("band") for name in derived_names(jm.Isometric()) if name.startswith("band_")}
     assert set(RANGES) - {"_above_12"} == of_fits
+    assert _steadiness.CUT_OFF == 30.0 and "\n  12 to 30 Hz " in str(found)  # what is above was filtered out
 
 
 @functools.cache

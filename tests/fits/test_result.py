@@ -273,6 +273,21 @@ def test_the_text_and_the_report_say_what_a_richer_model_gains():
     assert not any("AIC" in words for words in (str(made_result(ladder=())), *made_result(ladder=()).summary().remarks))
 
 
+def test_numbers_that_are_read_in_two_ways_are_said_in_both():
+    """A variation also in percent; a share of the tremor with the frequency from which it counts."""
+    derived = {
+        "tremor_frequency": Estimate(9.28, "Hz", 0.11),
+        "tremor_share": Estimate(0.0133, "1", 0.0033),
+        "coefficient_of_variation": Estimate(0.02013, "1", 0.00078),
+    }
+    rows = {line.split()[0]: line for line in str(made_result(derived=derived)).splitlines() if "±" in line}
+    assert rows["tremor_share"].endswith("above 4.6 Hz")
+    assert rows["coefficient_of_variation"].endswith("= 2.01 %")
+    assert rows["tremor_frequency"].endswith(" Hz")
+    alone = {"tremor_share": Estimate(0.0133, "1", 0.0033)}  # the frequency is not determined
+    assert "above" not in str(made_result(derived=alone))
+
+
 def test_a_fit_that_misses_the_data_says_so_first():
     missed = Adequacy(145.0, 25.0, 0.001, "the data have more power than the model from 7 to 9 Hz (12.0 standard errors)")
     found = made_result(adequacy=missed, chi2_per_bin=5.0)
@@ -282,6 +297,7 @@ def test_a_fit_that_misses_the_data_says_so_first():
     words = " ".join(" ".join(rest).split())
     for part in (
         f"errors are widened by a factor of {np.sqrt(145 / 25):.2g}",
+        "Not that of the coefficient of variation, which you measured",
         "what to do: do not interpret",
         "would be determined if the model held (per newton of mean force):",
     ):
