@@ -34,22 +34,21 @@ def run(name: str, names: Mapping[str, Any] | None = None, smaller: Mapping[str,
 
     `smaller` replaces texts, numbers that only make a block slow, each of which must be there.
     """
-    namespace, page = dict(names or {}), ROOT / name
-    whole = blocks(page)
-    for old, new in (smaller or {}).items():
-        assert any(old in code for code in whole), f"{name} says no longer {old}"
-        whole = [code.replace(old, new) for code in whole]
-    for number, code in enumerate(whole, 1):
-        exec(compile(code, f"{name}, block {number}", "exec"), namespace)
-    return namespace
+    return _executed(name, blocks(ROOT / name), dict(names or {}), smaller or {})
 
 
-def run_cells(path: Path) -> dict[str, Any]:
-    """Runs the code cells of a notebook in order in one namespace, and returns that."""
-    namespace: dict[str, Any] = {"__name__": path.stem}
+def run_cells(path: Path, smaller: Mapping[str, str] | None = None) -> dict[str, Any]:
+    """Runs the code cells of a notebook as `run` does the blocks of a page."""
     cells = [cell.source for cell in nbformat.read(path, as_version=4).cells if cell.cell_type == "code"]
-    for number, code in enumerate(cells, 1):
-        exec(compile(code, f"{path.name}, cell {number}", "exec"), namespace)
+    return _executed(path.name, cells, {"__name__": path.stem}, smaller or {})
+
+
+def _executed(name: str, blocks: list[str], namespace: dict[str, Any], smaller: Mapping[str, str]) -> dict[str, Any]:
+    for old, new in smaller.items():
+        assert any(old in code for code in blocks), f"{name} says no longer {old}"
+        blocks = [code.replace(old, new) for code in blocks]
+    for number, code in enumerate(blocks, 1):
+        exec(compile(code, f"{name}, block {number}", "exec"), namespace)
     return namespace
 
 

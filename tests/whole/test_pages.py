@@ -33,6 +33,19 @@ RUN_HERE = {
 FEWER_SEEDS = {"seeds=100_000": "seeds=1_000"}
 # Data with a rhythm are also tried with a tremor: two more programs of each fit, which fits/test_rungs.py has.
 NO_LADDER = {'"trial3.csv"])  # the trials': '"trial3.csv"], rungs=0)  # the trials'}
+FEW = "rungs=0, starts=16, seeds=16, check_seeds=16"
+FULL = "starts=32, seeds=16, check_seeds=16"
+# What a notebook does as the README does is done as there. The ladder, tremor and all, is climbed in fits/test_rungs.py.
+IN_NOTEBOOKS = {
+    "04-from-recording-to-parameters": {"target, starts=40": f"target, {FEW}"},
+    "05-uncertainty-and-noise-colour": {
+        f"target, {FULL}": "target",
+        'task, target, noises=("band-limited", "ornstein-uhlenbeck"), groups=3': "jm.Isometric(), target",
+        f"jm.Isometric(), measured, {FULL}": f"person, measured, {FEW}",
+    },
+    "07-your-own-muscle": {"starts=16": FEW},
+    "08-perturb-and-measure": {"rungs=0, check_seeds=0": "rungs=0, check_seeds=0, starts=16"},
+}
 CALLED_OFTEN = ("fit", "ensemble", "profile", "posterior", "identifiability", "compare_noise", "goodness", "bootstrap")
 FEWER: dict[str, dict[str, Any]] = {
     "goodness": {"replicates": 199},
@@ -145,12 +158,14 @@ def test_uncertainty(readme):
 
 @pytest.mark.slow
 def test_tutorial_and_front_page():
-    names = pages.run("docs/tutorial.md")
+    # The target is the bundled one, written and read again.
+    names = pages.run("docs/tutorial.md", {}, {"jm.task_for(target), target)": f"jm.task_for(target), target, {FEW})"})
     assert "harmonic_frequency" in names["sharper"].free and jm.load_result("mine.json").success
     assert pages.run("docs/index.md")["result"].success
     reported = pages.run("docs/how-to/report-results.md")["determined"]
     assert {"corner_frequency", "coefficient_of_variation"} <= set(reported["quantity"]) and Path("table.csv").exists()
-    assert pages.run("docs/fitting.md")["in_newtons"].derived["mean"].value == pytest.approx(40.5, abs=3 * 0.8)
+    few = {"mean_force=(40.5, 0.8)": f"mean_force=(40.5, 0.8), {FEW}"}
+    assert pages.run("docs/fitting.md", {}, few)["in_newtons"].derived["mean"].value == pytest.approx(40.5, abs=3 * 0.8)
 
 
 @pytest.mark.slow
@@ -229,7 +244,7 @@ def test_notebooks_run(path, once):
     """Their cells one after another, here: what they have in common with the pages is not compiled and fitted again."""
     try:
         with plt.rc_context():
-            pages.run_cells(path)
+            pages.run_cells(path, IN_NOTEBOOKS.get(path.stem))
             assert len(plt.get_fignums()) >= 2
     finally:
         jax.config.update("jax_enable_x64", False)
@@ -285,7 +300,7 @@ def test_the_gallery_is_drawn_by_its_code_with_units_and_in_given_axes(readme, m
     for section in GALLERY.SECTIONS[:-2]:  # the paper's figures and a study, which fits/test_study.py does
         exec(section.setup, names)
         for figure in section.figures:
-            made = eval(figure.code, names)
+            made = eval(figure.code.replace(", minute)", f", minute, {FEW})"), names)
             whole = getattr(made[0] if isinstance(made, tuple) else made, "figure", made)
             assert not list(unlabelled(whole)), figure.file
             plt.close("all")

@@ -52,6 +52,16 @@ def as_arrays(tree: Any, dtype: Any = None) -> Any:
     return jax.tree.map(array, tree)
 
 
+def as_doubles(tree: Any) -> Any:
+    """`as_arrays` in double precision; of concrete numbers they are concrete even where a function is traced.
+
+    What is compiled of them belongs outside `ensure_compile_time_eval`: in it every operation on constants that is traced
+    would be compiled by itself.
+    """
+    with jax.ensure_compile_time_eval(), jax.enable_x64(True):
+        return as_arrays(tree)
+
+
 def as_numbers(tree: Any) -> Any:
     """The reverse of `as_arrays`: Python floats and NumPy arrays, exact in either precision."""
 

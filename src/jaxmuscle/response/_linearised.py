@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxmuscle._common.arrays import as_arrays, as_numbers, is_concrete
+from jaxmuscle._common.arrays import as_arrays, as_doubles, as_numbers, is_concrete
 from jaxmuscle._common.errors import OperatingPointError
 from jaxmuscle._common.programs import kept
 from jaxmuscle._common.types import Scalar
@@ -123,9 +123,11 @@ def check_equilibrium(task: Any, point: np.ndarray, A: np.ndarray) -> float:
     """The slowest decay rate [1/s]; refuses what has no linear response: no equilibrium, an unstable or undamped one."""
     name = type(task).__name__
     if not (np.all(np.isfinite(point)) and np.all(np.isfinite(A))):
+        with jax.ensure_compile_time_eval():
+            base = np.asarray(as_arrays(task).muscle.base())
         raise OperatingPointError(
-            f"{name} has no equilibrium at t = {HOLD} s under its inputs (K_w0, K_z0, C_w0, C_z0 = "
-            f"{np.asarray(as_arrays(task).muscle.base())}): a stiffness must balance them"
+            f"{name} has no equilibrium at t = {HOLD} s under its inputs (K_w0, K_z0, C_w0, C_z0 = {base}): "
+            "a stiffness must balance them"
         )
     eigenvalues = np.linalg.eigvals(A)
     margin = 1e3 * np.finfo(A.dtype).eps * np.abs(eigenvalues).max()
@@ -148,8 +150,8 @@ def check_inputs(task: AbstractTask, window: tuple[float, float] = WINDOW) -> No
     if all(isinstance(signal, Constant) for signal in _signals(task).values()):
         return
     times = np.append(np.linspace(*window, LOOKS), HOLD)
-    with jax.ensure_compile_time_eval(), jax.enable_x64(True):
-        seen = {name: np.asarray(values) for name, values in _inputs(as_arrays(task), times).items()}
+    with jax.enable_x64(True):
+        seen = {name: np.asarray(values) for name, values in _inputs(as_doubles(task), times).items()}
     for name, values in seen.items():
         off = np.abs(values[:-1] - values[-1])
         if np.max(off) > MOVING * np.max(np.abs(values)):

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxmuscle._common.arrays import all_concrete, as_numbers, is_concrete, require
+from jaxmuscle._common.arrays import all_concrete, as_doubles, as_numbers, is_concrete, require
 from jaxmuscle._common.types import Scalar
 from jaxmuscle.model._muscle import Muscle, QuadraticDamping, QuadraticStiffness
 from jaxmuscle.model._parameters import amplitude_names, names_of
@@ -231,8 +231,8 @@ def _moments(task: AbstractTask) -> Moments:
     """Expected moments of the output; its variation is to first order proportional to the amplitudes."""
     if not all_concrete(task):
         return expected_moments(task, task.settings, WINDOW)[0]
-    with jax.ensure_compile_time_eval(), jax.enable_x64(True):
-        moments, system = expected_moments(task, task.settings, WINDOW)
+    with jax.enable_x64(True):
+        moments, system = expected_moments(as_doubles(task), task.settings, WINDOW)
         check_equilibrium(task, np.asarray(system.point), np.asarray(system.A))
         check_inputs(task)
         warn_beyond(task)

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 from scipy.linalg import expm, solve_continuous_lyapunov
 from scipy.special import ndtr
 
-from jaxmuscle._common.arrays import as_arrays
+from jaxmuscle._common.arrays import as_doubles
 from jaxmuscle._common.errors import FirstOrderWarning
 from jaxmuscle._common.programs import kept
 from jaxmuscle.model._activation import ACTIVE
@@ -138,8 +138,8 @@ def _inputs_of(parts: _Parts, sources: tuple[_Source, ...], states: int) -> tupl
 
 def negative_coefficients(task: AbstractTask) -> tuple[str, ...]:
     """Sentences about coefficients that noise and harmonic make negative for more than 1 % of the time."""
-    with jax.ensure_compile_time_eval(), jax.enable_x64(True):
-        parts = jax.tree.map(np.asarray, _parts(as_arrays(task)))
+    with jax.enable_x64(True):
+        parts = jax.tree.map(np.asarray, _parts(as_doubles(task)))
     matrix, white, inputs = _inputs_of(parts, parts.noises, 0)
     rows = inputs[: len(CHANNELS)]
     covariance = solve_continuous_lyapunov(matrix, -white)
@@ -166,9 +166,10 @@ def second_order(task: AbstractTask, settings: SpectrumSettings | None = None) -
     **Returns:** a `SecondOrder`. **Raises:** as `expected_spectrum` does.
     """
     settings = task.settings if settings is None else settings
-    with jax.ensure_compile_time_eval(), jax.enable_x64(True):
-        arrays, system = as_arrays(task), linearised(task).system
-        moments, _ = expected_moments(task, settings, WINDOW)
+    arrays = as_doubles(task)
+    with jax.enable_x64(True):
+        system = linearised(arrays).system
+        moments, _ = expected_moments(arrays, settings, WINDOW)
         hessians, parts, system = jax.tree.map(np.asarray, (_hessians(arrays, system), _parts(arrays), system))
     n = len(system.A)
     matrix, white, inputs = _inputs_of(parts, (*parts.noises, parts.harmonic), n)
@@ -192,7 +193,7 @@ def _added(
     forms: np.ndarray, matrix: np.ndarray, stationary: np.ndarray, system: Any, settings: SpectrumSettings
 ) -> tuple[np.ndarray, float]:
     """Welch power and mean of z₂."""
-    with jax.ensure_compile_time_eval(), jax.enable_x64(True):
+    with jax.enable_x64(True):
         operator = np.asarray(_operator(settings))
     count, interval = max(SAMPLES, 1 << int(np.ceil(np.log2(2 * operator.shape[1])))), 1 / settings.rate
     step = expm(matrix * interval)
