@@ -11,11 +11,11 @@ import hypothesis
 import jax
 import jaxlib
 import pytest
+import shapes
 import timing
 from jaxlib import xla_client
-from jaxtyping import install_import_hook
 
-install_import_hook("jaxmuscle", "beartype.beartype")  # before the first test module imports the package
+shapes.check("jaxmuscle")  # before the first test module imports the package
 
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 
@@ -116,6 +116,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 
 def pytest_runtest_setup(item: pytest.Item) -> None:
+    shapes.begin_anew()
     # A command that ran here before keeps only what took long to compile: single operations would be compiled ever again.
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     if item.get_closest_marker("gpu") and jax.default_backend() != "gpu":

@@ -27,7 +27,7 @@ from jaxmuscle.spectra._bin_law import welch_law
 
 FREE = ("c_w", "noise_K_z")
 SURE = 1e-3  # two-sided probability outside the bounds of every statistical test
-CASES = 30
+CASES = 20
 
 
 def task():
@@ -120,13 +120,14 @@ def test_p_values_are_uniform_where_the_model_is_true():
     for name in ("chi2_per_bin", "largest", "all"):
         values = [g.p_values[name] for g in found]
         # p-values are whole fortieths, the largest of those that lie within 1/40 above a uniform number: the deviation
-        # that 30 uniform numbers exceed with probability `SURE`, 0.35, and 1/40.
+        # that 20 uniform numbers exceed with probability `SURE`, 0.42, and 1/40.
         most = scipy.stats.kstwo.ppf(1 - SURE, CASES) + 1 / (replicates + 1)
         assert scipy.stats.kstest(values, "uniform").statistic < most, name
     few = sum(g.p_values["runs"] <= 0.05 for g in found)
     assert few <= scipy.stats.binom.ppf(1 - SURE, CASES, 0.05)
     reference = np.mean([g.reference["chi2_per_bin"].mean() for g in found])
-    # Replicates of standard deviation 0.28, and 0.02 for what is not linear in θ and in the log powers.
+    # Replicates of standard deviation 0.28, and 0.02 for what is not linear in θ and in the log powers: 0.06 together. What
+    # two parameters take up is 0.14.
     assert abs(reference - linear_chi2(perfect())) < 4 * 0.28 / np.sqrt(replicates * CASES) + 0.02
 
 
@@ -172,13 +173,13 @@ def test_refits_reach_the_minima_of_a_full_search(x64):
     free = (*FREE, "harmonic_amplitude", "harmonic_frequency")
     power = np.asarray(jm.expected_spectrum(base).power)
     problem = reopened(fits([power / power.sum()], free=free, base=base)[0])
-    (moments,), (part,) = repeated(problem, (base,), 20), problem.parts
+    (moments,), (part,) = repeated(problem, (base,), 12), problem.parts
     drawn = drawn_spectra(Likelihood.of(problem).bins[0], part.target, moments, jax.random.key(3))
     found = refitted(problem, problem.theta_of((base,)), Drawn((drawn,), (power / power.sum(),), *((None,),) * 3))
     full = fits(list(drawn), free=free, base=base)
     mine = numbers_of(residuals_of(drawn, found.expected[0], part.target, found.share[0]))["chi2_per_bin"]
     theirs = np.array([result.chi2_per_bin for result in full])
-    assert np.sum(np.abs(mine - theirs) < 0.02 * theirs + 1e-3) >= 18
+    assert np.sum(np.abs(mine - theirs) < 0.02 * theirs + 1e-3) >= 11
     assert abs(mine.mean() - theirs.mean()) < 0.03
 
 
@@ -284,7 +285,7 @@ def test_bootstrap_is_told_saved_and_drawn(tmp_path):
 @pytest.mark.slow
 def test_bootstrap_of_a_sigma_draws_from_the_gaussian_law():
     result = fits([expected()], segments=None, sigma=0.2 * expected())[0]
-    found = jm.bootstrap(result, replicates=30, key=1)
+    found = jm.bootstrap(result, replicates=20, key=1)
     assert "not simulated" in str(found).replace("\n  ", " ")
     for q in found.quantities.values():
         low, high, least = bounds(q)

@@ -1,0 +1,50 @@
+"""Shapes and types of what the package's functions take and return are checked while tests run: of every function its first
+calls in each test, and some of the others.
+
+A check takes longer than most small functions, and a fit calls these by the hundred thousand: checked at every call they
+took more than half of its time. A function that gets or gives a wrong shape does so at its first calls, too.
+"""
+
+import functools
+import inspect
+from typing import Any
+
+import jaxtyping
+from jaxtyping import _decorator, install_import_hook
+
+FIRST, EVERY = 32, 32  # calls of a function that are checked in a test: so many, then one of so many
+_calls: dict[int, int] = {}
+_jaxtyped = _decorator.jaxtyped
+
+
+def check(package: str) -> None:
+    """From its import on."""
+    _decorator.jaxtyped = jaxtyping.jaxtyped = _sparingly
+    install_import_hook(package, "beartype.beartype")
+
+
+def begin_anew() -> None:
+    """Another test."""
+    _calls.clear()
+
+
+def _sparingly(function: Any = _decorator._sentinel, *, typechecker: Any = _decorator._sentinel) -> Any:
+    """As jaxtyping's decorator. What is no function itself (a class, a property) has it decorate its functions with this."""
+    if not inspect.isfunction(function):
+        return _jaxtyped(function, typechecker=typechecker)
+    if hasattr(function, "sparingly"):  # inherited
+        return function
+    code, checked = id(function.__code__), None  # of a function within one the same at each of its calls
+
+    @functools.wraps(function)
+    def wrapper(*args: Any, **kwargs: Any) -> Any:
+        nonlocal checked
+        _calls[code] = count = _calls.get(code, 0) + 1
+        if count > FIRST and count % EVERY:
+            return function(*args, **kwargs)
+        if checked is None:
+            checked = _jaxtyped(function, typechecker=typechecker)
+        return checked(*args, **kwargs)
+
+    wrapper.sparingly = True  # pyright: ignore[reportAttributeAccessIssue]
+    return wrapper
