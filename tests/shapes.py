@@ -10,16 +10,22 @@ import inspect
 from typing import Any
 
 import jaxtyping
-from jaxtyping import _decorator, install_import_hook
+from jaxtyping import install_import_hook
+
+try:
+    from jaxtyping import _decorator
+    from jaxtyping._decorator import _sentinel, jaxtyped
+except ImportError:  # no public part of it
+    _decorator = _sentinel = jaxtyped = None
 
 FIRST, EVERY = 32, 32  # calls of a function that are checked in a test: so many, then one of so many
 _calls: dict[int, int] = {}
-_jaxtyped = _decorator.jaxtyped
 
 
 def check(package: str) -> None:
-    """From its import on."""
-    _decorator.jaxtyped = jaxtyping.jaxtyped = _sparingly
+    """From its import on; at every call where another version of jaxtyping is made otherwise."""
+    if _decorator is not None:
+        _decorator.jaxtyped = jaxtyping.jaxtyped = _sparingly
     install_import_hook(package, "beartype.beartype")
 
 
@@ -28,10 +34,10 @@ def begin_anew() -> None:
     _calls.clear()
 
 
-def _sparingly(function: Any = _decorator._sentinel, *, typechecker: Any = _decorator._sentinel) -> Any:
+def _sparingly(function: Any = _sentinel, *, typechecker: Any = _sentinel) -> Any:
     """As jaxtyping's decorator. What is no function itself (a class, a property) has it decorate its functions with this."""
     if not inspect.isfunction(function):
-        return _jaxtyped(function, typechecker=typechecker)
+        return jaxtyped(function, typechecker=typechecker)
     if hasattr(function, "sparingly"):  # inherited
         return function
     code, checked = id(function.__code__), None  # of a function within one the same at each of its calls
@@ -43,7 +49,7 @@ def _sparingly(function: Any = _decorator._sentinel, *, typechecker: Any = _deco
         if count > FIRST and count % EVERY:
             return function(*args, **kwargs)
         if checked is None:
-            checked = _jaxtyped(function, typechecker=typechecker)
+            checked = jaxtyped(function, typechecker=typechecker)
         return checked(*args, **kwargs)
 
     wrapper.sparingly = True  # pyright: ignore[reportAttributeAccessIssue]
