@@ -199,7 +199,7 @@ def _is_array(leaf: Any) -> bool:
 
 
 def _kind(array: Any) -> tuple[Any, ...]:
-    return np.shape(array), str(array.dtype), getattr(array, "weak_type", False)
+    return np.shape(array), array.dtype, getattr(array, "weak_type", False)
 
 
 def _config() -> tuple[Any, ...]:

@@ -22,7 +22,8 @@ from ._intervals import HELD, MOST, REACH, Interval, Point, chosen_rows, held_st
 HALF_POWER = "half_power_frequency"
 EACH = 16  # frequencies on either side
 NEAREST = 0.5  # standard deviations from the value to the first of them
-TURNS, QUIET = 16, 2  # it ends early after so many turns in a row that gain little
+TURNS, QUIET = 16, 2  # a frequency rests after so many turns in a row that gain it little
+STIFF = 1e3  # damping at which a step is too short to gain
 GAIN, NEAR = 0.02, 2.0  # of the cost; of the rise at the end of the interval
 LOOSE = 0.05  # of the level, at most: 5 % of the power
 OPEN = Interval(None, None, log=True)
@@ -52,23 +53,25 @@ def half_power_intervals(
 def _interval(problem: FitProblem, objective: Residuals, seen: Expansion, covariance: np.ndarray, name: str) -> Interval:
     """Damped Gauss-Newton steps from the ridge `θ - G g L / (gᵀ G g)`, all frequencies at once.
 
-    After each step a frequency goes on from where it stands best, be it another's place.
+    After each step a frequency goes on from where it stands best, be it another's place. One that rests is left out until
+    another's place suits it better.
     """
     found = _Search.of(problem, objective, seen, covariance, name)
     if found is None:
         return OPEN
     search, theta = found
     here = search.look(theta).shared(search)
-    damping, merit, quiet = np.full(len(theta), 1e-2), here.merit(search), 0
+    damping, merit, quiet = np.full(len(theta), 1e-2), here.merit(search), np.zeros(len(theta), dtype=int)
     for _ in range(TURNS):
-        tried = search.look(here.theta + here.step(search, damping))
+        moving = quiet < QUIET
+        tried = here.moved(moving, search.look((here.theta + here.step(search, damping))[moving]))
         better = tried.merit(search) < merit
-        damping = np.where(better, 0.2 * damping, 10 * damping)
+        damping = np.where(moving, np.where(better, 0.2 * damping, 10 * damping), damping)
         here, before = here.where(better, tried).shared(search), merit
         merit = here.merit(search)
-        gain = (before - merit)[search.rise(merit) < NEAR]
-        quiet = quiet + 1 if np.max(gain, initial=0.0) < GAIN else 0
-        if quiet == QUIET or search.reaches_an_edge(merit):
+        gain = before - merit
+        quiet = np.where(gain >= GAIN, 0, quiet + (better | (damping > STIFF)))  # a shorter step may do better
+        if np.all(quiet[search.rise(merit) < NEAR] >= QUIET) or search.reaches_an_edge(merit):
             break
     return search.ends(merit)
 
@@ -114,8 +117,11 @@ class _Search(NamedTuple):
         """What the fit sees at each row."""
         theta = np.clip(theta, -MOST, MOST)
         point = Point.of(self.problem, self.objective, expand(self.objective, theta))
-        levels, slopes = _levels_of(self.objective, self.part, theta, np.tile(self.log_f, (len(theta), 1)))
-        return _Rows(theta, levels, slopes, point.residual, point.jacobian, point.cost)
+        # One size, so that one program serves all.
+        every = np.minimum(np.arange(len(self.log_f)), len(theta) - 1)
+        levels, slopes = _levels_of(self.objective, self.part, theta[every], np.tile(self.log_f, (len(every), 1)))
+        count = len(theta)
+        return _Rows(theta, levels[:count], slopes[:count], point.residual, point.jacobian, point.cost)
 
     def rise(self, merit: Float[np.ndarray, " rows"]) -> Float[np.ndarray, " rows"]:
         """Root of twice the rise of the cost, over that at the end of the interval."""
@@ -162,6 +168,13 @@ class _Rows(NamedTuple):
         """For every frequency the row that suits it best."""
         pick = np.argmin(self.merits(search), axis=0)
         return _Rows(*(x[pick] for x in self))
+
+    def moved(self, which: np.ndarray, there: "_Rows") -> "_Rows":
+        """Some rows somewhere else, the others as they are."""
+        found = _Rows(*(x.copy() for x in self))
+        for all_rows, new in zip(found, there, strict=True):
+            all_rows[which] = new
+        return found
 
     def where(self, better: np.ndarray, other: "_Rows") -> "_Rows":
         """The other where it is better."""

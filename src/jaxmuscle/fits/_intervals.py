@@ -13,7 +13,7 @@ from jaxmuscle.objective._problem import FitProblem
 from jaxmuscle.objective._residuals import Residuals
 
 REACH = 1.96
-TURNS = 40  # at most
+TURNS = 50  # at most, of steps and of moves to the next stage
 FIRST, FASTER, SLOWER = 0.4, 2.5, 0.4  # of the way that the curvature says; how much further or nearer a row aims next
 GAIN = 0.01  # of the rise: what a turn gains less, it need not go on for
 NEAR = 0.05  # of the rise at the end
@@ -81,26 +81,26 @@ def _some(
     aim = start + side * way * REACH * stated
     theta = here.theta[0] + (slope @ gain) * ((aim - start) / ours)[:, None]
     best = _look(problem, objective, theta, np.arange(len(theta)), names, log)
-    damping, done = np.full(len(aim), 1e-2), np.zeros(len(aim), dtype=bool)
+    damping = np.full(len(aim), 1e-2)
+    done, moving, further = np.zeros(len(aim), dtype=bool), np.zeros(len(aim), dtype=bool), best.theta
     for _ in range(TURNS):
-        tried = best.moved(objective, best.theta + best.step(aim, tight, damping), ~done, names, log)
+        trial = np.where(moving[:, None], further, best.theta + best.step(aim, tight, damping))
+        tried = best.moved(objective, trial, ~done, names, log)
         gain_of_all = best.merit(aim, tight) - tried.merit(aim, tight)
-        better = gain_of_all > 0
+        better = moving | (gain_of_all > 0)
         best = best.where(better, tried)
-        damping = np.where(better, 0.2 * damping, 10 * damping)
+        damping = np.where(moving, 1e-2, np.where(better, 0.2 * damping, 10 * damping))
         rise = best.rise(here)
-        settled = np.abs(gain_of_all) < GAIN * np.maximum(rise, NEAR * wanted) ** 2
+        settled = ~moving & (np.abs(gain_of_all) < GAIN * np.maximum(rise, NEAR * wanted) ** 2)
         done |= settled & ((np.abs(rise - wanted) < NEAR * wanted) | ((way == FURTHEST) & (rise < wanted)))
         if np.all(done):
             break
-        moving = settled & ~done
-        if np.any(moving):
-            stretch = np.where(moving, np.clip(wanted / np.maximum(rise, 1e-6), SLOWER, FASTER), 1.0)
-            stretch = np.minimum(stretch, FURTHEST / way)
-            way, damping = np.where(moving, way * stretch, way), np.where(moving, 1e-2, damping)
-            aim = start + side * way * REACH * stated
-            further = here.theta[0] + (best.theta - here.theta[0]) * stretch[:, None]
-            best = best.moved(objective, further, moving, names, log)
+        moving = settled & ~done  # to the next stage
+        stretch = np.where(moving, np.clip(wanted / np.maximum(rise, 1e-6), SLOWER, FASTER), 1.0)
+        stretch = np.minimum(stretch, FURTHEST / way)
+        way = way * stretch
+        aim = start + side * way * REACH * stated
+        further = here.theta[0] + (best.theta - here.theta[0]) * stretch[:, None]
     moved, rise = side * (best.at - start), best.rise(here)
     end = moved * wanted / rise
     good = np.isfinite(end) & (moved > 0) & (rise > 0.5 * wanted)
