@@ -134,7 +134,7 @@ def test_that_of_a_half_power_frequency_ends_where_its_profile_does(task, x64):
 
 @pytest.mark.slow
 def test_about_a_shelf_there_is_no_interval(x64):
-    """The region reaches over the bins. A search that moves along the slope of the frequency ends on the near side."""
+    """The region reaches over the bins."""
     problem, objective, seen = fitted(SHELF, drawn(SHELF, 45, 3))
     value, gain = consequences(objective, seen).values[0][NAME], inverse_curvature(objective, seen)
     assert value < 0.2 * LAST
@@ -142,7 +142,6 @@ def test_about_a_shelf_there_is_no_interval(x64):
     rises = rise(objective, seen, theta)
     assert max(lowest(level(SHELF, theta, f), rises) for f in np.geomspace(value, 2 * LAST, 8)[1:]) < 1.96
     assert half_power_intervals(problem, objective, seen, gain, {NAME: 1.0})[NAME].about(value) == (None, None)
-    assert intervals(problem, objective, seen, gain, {NAME: 1.0})[NAME].about(value)[1] < LAST
 
 
 @pytest.mark.slow
