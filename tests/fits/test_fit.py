@@ -113,10 +113,7 @@ def test_welch_operator_refuses_a_window_shorter_than_a_segment():
 )
 @pytest.mark.slow
 def test_moments_are_those_of_a_plain_ensemble(x64, task):
-    """But for the cross term of line and noise, whose expectation is zero.
-
-    Normal numbers are made in single precision, and two programs may round them differently: by 6e-8 of one number.
-    """
+    """But for the cross term of line and noise, whose expectation is zero."""
     key, seeds, dt = jax.random.key(3), 16, 2.5e-3
     runs = jm.ensemble(task, key, seeds=seeds, dt=dt)
     still = {name: 0.0 for name in task.parameter_names if name.startswith(("noise_K", "noise_C", "resonance_amplitude"))}
@@ -133,11 +130,11 @@ def test_moments_are_those_of_a_plain_ensemble(x64, task):
     line, random = powers(quiet), powers(output - quiet)
     # Rounding relative to the largest power: a bin far from the line holds 3e-10 of it.
     np.testing.assert_allclose(moments.line, line, rtol=1e-9, atol=1e-13 * line.max())
-    np.testing.assert_allclose(moments.power, line + random.mean(axis=0), rtol=1e-7)
-    np.testing.assert_allclose(moments.mean, output[:, 500:1500].mean(), rtol=1e-9)
+    np.testing.assert_allclose(moments.power, line + random.mean(axis=0), rtol=1e-9)
+    np.testing.assert_allclose(moments.mean, output[:, 500:1500].mean(), rtol=1e-12)
     passed, still = (scipy.signal.sosfilt(task.settings.sections, x)[..., 500:1500] for x in (output - quiet, quiet))
     variance = still.var() + passed.var(axis=1).mean()
-    np.testing.assert_allclose(moments.variance, variance, rtol=1e-7)
+    np.testing.assert_allclose(moments.variance, variance, rtol=1e-9)
     cross = powers(output) - line - random
     references.assert_standard_normal(cross.mean(axis=0) / (cross.std(axis=0, ddof=1) / np.sqrt(seeds)))
     assert np.isclose(float(moments.variation), np.sqrt(variance) / abs(output[:, 500:1500].mean()))

@@ -17,7 +17,7 @@ from jaxmuscle.objective._residuals import PartResiduals, Residuals
 from jaxmuscle.response._linearised import linearise
 from jaxmuscle.response._transfer import half_power_level
 
-from ._intervals import HELD, MOST, REACH, Interval, Point, chosen_rows, held_step
+from ._intervals import HELD, MOST, REACH, Interval, Point, chosen_rows, held_step, renewed
 
 HALF_POWER = "half_power_frequency"
 EACH = 16  # frequencies on either side
@@ -171,10 +171,7 @@ class _Rows(NamedTuple):
 
     def moved(self, which: np.ndarray, there: "_Rows") -> "_Rows":
         """Some rows somewhere else, the others as they are."""
-        found = _Rows(*(x.copy() for x in self))
-        for all_rows, new in zip(found, there, strict=True):
-            all_rows[which] = new
-        return found
+        return _Rows(*renewed(which, there, self))
 
     def where(self, better: np.ndarray, other: "_Rows") -> "_Rows":
         """The other where it is better."""

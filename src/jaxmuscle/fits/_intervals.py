@@ -124,10 +124,9 @@ class _Look(NamedTuple):
     ) -> "_Look":
         """Some rows at another θ, the others as they are."""
         rows = np.flatnonzero(which)
-        there, found = _look(self.problem, objective, theta[rows], rows, names, log), [x.copy() for x in self[1:]]
-        for all_rows, new in zip(found, there[1:], strict=True):
-            all_rows[rows] = new
-        return _Look(self.problem, *found)
+        return _Look(
+            self.problem, *renewed(rows, _look(self.problem, objective, theta[rows], rows, names, log)[1:], self[1:])
+        )
 
     def where(self, chosen: np.ndarray, other: "_Look") -> "_Look":
         """The other's rows where they are chosen."""
@@ -177,6 +176,14 @@ def held_step(
     step = np.zeros_like(seen.theta)
     step[fine] = -np.linalg.solve(curvature[fine], gradient[fine][..., None])[..., 0]
     return step * np.minimum(1.0, 1.0 / np.maximum(np.max(np.abs(step), axis=1, keepdims=True), 1e-300))
+
+
+def renewed(which: np.ndarray, new: Sequence[np.ndarray], old: Sequence[np.ndarray]) -> list[np.ndarray]:
+    """Arrays with a leading axis of rows, in some of which the new ones stand: these have no others."""
+    found = [own.copy() for own in old]
+    for own, other in zip(found, new, strict=True):
+        own[which] = other
+    return found
 
 
 def chosen_rows(chosen: np.ndarray, new: Sequence[np.ndarray], old: Sequence[np.ndarray]) -> list[np.ndarray]:

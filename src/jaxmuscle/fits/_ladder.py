@@ -74,8 +74,7 @@ def gains(ladder: tuple[Rung, ...], *, describes: bool | None) -> tuple[str, ...
     if not said:
         return ()
     meaning = ("the AIC weighs the fit against the number of parameters; the lower, the better. A difference of "
-               f"{ALIKE:g} or less says nothing, and jaxmuscle compare calls a model better from 6 on. It is no "
-               "p-value")  # fmt: skip
+               f"{ALIKE:g} or less says nothing; jaxmuscle compare asks for at least 6. It is no p-value")  # fmt: skip
     if describes is False:
         meaning += (". No model that was tried describes the data: then a lower AIC says that a model misses less, not that "
                     "the muscle has this part")  # fmt: skip
