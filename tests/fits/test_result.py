@@ -297,7 +297,7 @@ def test_a_fit_that_misses_the_data_says_so_first():
     words = " ".join(" ".join(rest).split())
     for part in (
         f"errors are widened by a factor of {np.sqrt(145 / 25):.2g}",
-        "Not widened, since you measured it: coefficient of variation",
+        "Measured, and so not widened: coefficient of variation",
         "what to do: do not interpret",
         "would be determined if the model held (per newton of mean force):",
     ):

@@ -254,10 +254,12 @@ def _misfit(problem: FitProblem, objective: Residuals, residuals: np.ndarray, co
             place = f"at {low:.2g} Hz" if last[i] - first[i] == 1 else f"from {low:.2g} to {high:.2g} Hz"
             more = "more" if ratio[i] > 0 else "less"
             said = f"{whose[part.name]} {more} power than the model {place} ({abs(ratio[i]):.1f} standard errors)"
-            # What the eye finds first in the figure.
-            k = int(np.argmax(np.abs(residuals[rows])))
-            largest = float(residuals[rows][k])
-            if not first[i] <= k < last[i] and abs(largest) > ALONE:
+            # What else the eye finds in the figure.
+            apart = residuals[rows].copy()
+            apart[first[i] : last[i]] = 0.0
+            k = int(np.argmax(np.abs(apart)))
+            largest = float(apart[k])
+            if abs(largest) > ALONE:
                 said += f", and {'more' if largest > 0 else 'less'} at {part.target.frequency[k]:.2g} Hz"
             worst = ratio[i], said
     return worst[1]

@@ -167,7 +167,7 @@ class FitResult(Result, eqx.Module):
         told = [f"standard errors are widened by a factor of {self.adequacy.widening:.2g}: the model misses the data"]
         measured = {name.replace("_", " ") for part in self.parts.values() for name in met(part.further)}
         if measured:
-            told[0] += f". Not widened, since you measured it: {', '.join(sorted(measured))}"
+            told[0] += f". Measured, and so not widened: {', '.join(sorted(measured))}"
         if "harmonic_frequency" in self.free:
             told.append("no p-value of the harmonic: where the model misses the data, any harmonic improves the fit")
         return (*told, "what to do: do not interpret the parameters. Look at the residuals in the figure. Look for drift "
