@@ -744,7 +744,9 @@ def test_the_answer_comes_before_the_checks_and_an_interruption_in_them_keeps_it
     # The checks change no estimate, but for the spectrum's own numbers, which they simulate.
     whole, quick = jm.fit(jm.Isometric(), simple_target(), **given), found
     assert whole.parameters == quick.parameters and "seeds" in whole.check
-    assert jm.fit(jm.Isometric(), simple_target(), **(given | {"check_seeds": 0})).parameters == quick.parameters
+    answers = []
+    unchecked = jm.fit(jm.Isometric(), simple_target(), answer=answers.append, **(given | {"check_seeds": 0}))
+    assert unchecked.parameters == quick.parameters and [a.notices for a in answers] == [unchecked.notices]
 
 
 def test_an_interruption_between_the_search_and_the_answer_keeps_what_the_search_found(monkeypatch):

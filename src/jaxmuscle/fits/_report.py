@@ -232,7 +232,7 @@ def _parts(
             harmonic_share=share,
             residual=residual,
             deviation=statistics.sd if statistics.known else None,
-            components=_components(part, task) if plan.problem.control else {},
+            components=_components(part, settled(task)) if plan.problem.control else {},
             stretch=simulated.stretch,
             check=check | polish,
             further=further,
@@ -242,7 +242,7 @@ def _parts(
 
 
 def _components(part: Part, task: AbstractTask) -> dict[str, np.ndarray]:
-    """Share of each bin's power that every part of the model has in linear response."""
+    """Share of each bin's power that every part of the model has in linear response, of a settled task."""
     settings, samples = part.target.settings, trial_samples(part.target)
 
     def powers(task: AbstractTask) -> tuple[np.ndarray, list[np.ndarray]]:

@@ -90,11 +90,12 @@ def search(plan: Plan, answer: Callable[[FitResult], None] | None = None, models
     problem, ended = plan.problem, None
     try:
         ended = Endpoint.of(problem, stages[-1])
-        if answer is not None:
-            found = _unchecked(plan, stages, ladder, ended)
-            answer(_checked_later(found) if plan.check_seeds else found)
+        if answer is not None and plan.check_seeds:
+            answer(_checked_later(_unchecked(plan, stages, ladder, ended)))
         problem.tell("checking with new simulations" if plan.check_seeds else "computing the errors", 0.8)
         result = report_fit(plan, stages, ladder, ended=ended)
+        if answer is not None and not plan.check_seeds:
+            answer(result)
         if models is not None and result.success:
             said = line_or_resonance(plan, result.task, ladder, models, _descended)
             result = dataclasses.replace(result, notices=(*result.notices, *said))

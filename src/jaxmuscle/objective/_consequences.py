@@ -6,7 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from jaxmuscle._common.programs import kept
 from jaxmuscle.model._parameters import PARAMETERS, USUALLY_FREE
@@ -164,6 +164,7 @@ def unit_of(name: str, output: str = "") -> str:
 
 BATCH = 32
 POINTS, EACH = 128, 8
+LATEST = 4
 
 
 class Expansion(NamedTuple):
@@ -318,14 +319,27 @@ def _expanded(part: Any, theta: Float[np.ndarray, "points own"]) -> tuple[Any, A
     """
     if not isinstance(part.model, Linear):
         return jax.tree.map(np.asarray, _moments_and_slopes(part, theta))
-    count, wide = len(theta), _with_the_usual(part.coordinates, part.task)
-    own = np.array([wide.names.index(name) for name in part.coordinates.names], dtype=int)
-    padded = np.zeros((-(-count // POINTS) * POINTS, len(wide.names)))
+    count, (response, own) = len(theta), _response_of(part)
+    padded = np.zeros((-(-count // POINTS) * POINTS, len(response.coordinates.names)))
     padded[:, own] = np.concatenate([theta, np.broadcast_to(theta[-1], (len(padded) - count, len(own)))])
-    response = _Response(part.model, part.task, wide)
     parts = [_of_rows(response, padded[i : i + POINTS], np.asarray(min(count - i, POINTS))) for i in range(0, count, POINTS)]
     moments, slopes = jax.tree.map(lambda *x: np.concatenate(x)[:count], *parts)
     return moments, jax.tree.map(lambda slope: slope[..., own], slopes)
+
+
+_LATEST: list[tuple[Any, tuple[_Response, np.ndarray]]] = []
+
+
+def _response_of(part: PartResiduals) -> tuple[_Response, Int[np.ndarray, " own"]]:
+    """What is expanded of a part, and where its own coordinates stand in that; of the latest parts made only once."""
+    for known, found in _LATEST:
+        if known is part:
+            return found
+    wide = _with_the_usual(part.coordinates, part.task)
+    own = np.array([wide.names.index(name) for name in part.coordinates.names], dtype=int)
+    found = _Response(part.model, part.task, wide), own
+    _LATEST[:] = [(part, found), *_LATEST[: LATEST - 1]]
+    return found
 
 
 def _with_the_usual(coordinates: Coordinates, task: AbstractTask) -> Coordinates:
