@@ -10,7 +10,7 @@ import scipy.stats
 
 import jaxmuscle as jm
 from jaxmuscle._common.arrays import as_arrays
-from jaxmuscle.fits._adequacy import Endpoint, elsewhere
+from jaxmuscle.fits._adequacy import Endpoint, _misfit, elsewhere
 from jaxmuscle.fits._intervals import intervals
 from jaxmuscle.fits._refit import without_fitted
 from jaxmuscle.model._parameters import DEFAULT_FREE
@@ -129,6 +129,24 @@ def test_a_band_of_tremor_is_found_and_named():
     assert words[:4] == ["the", "data", "have", "more"] and "from" in words
     low, high = float(words[words.index("from") + 1]), float(words[words.index("to") + 1])
     assert 6 < low < 9.5 and 8.5 < high < 12
+
+
+def test_a_single_bin_beside_the_run_is_named_with_its_own_sign(x64):
+    """Five bins each three standard deviations above, one below: whether that one is said depends on its size alone."""
+    frequency, plan = SETTINGS.frequency, planned(TASK, drawn(60, 3), FitOptions())
+    objective, run = plan.problem.linear(), slice(18, 23)
+
+    def words(alone: float) -> str:
+        residuals = np.zeros(len(frequency) + objective.parts[0].data.further)
+        residuals[run], residuals[5] = 3.0, alone
+        return _misfit(plan.problem, objective, residuals, np.eye(len(residuals)))
+
+    said = (
+        f"the data have more power than the model from {frequency[18]:.2g} to {frequency[22]:.2g} Hz (6.7 standard errors)"
+    )
+    assert words(-4.0) == f"{said}, and less at {frequency[5]:.2g} Hz"
+    assert words(4.0) == f"{said}, and more at {frequency[5]:.2g} Hz"
+    assert words(-2.0) == said
 
 
 @pytest.mark.slow

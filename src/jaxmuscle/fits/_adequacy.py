@@ -28,7 +28,6 @@ from ._refit import STRENGTHS, Refit, refit_of
 ADEQUATE = 0.01
 ALONE = 2.5  # standard deviations: a single bin beyond the run that is named
 REPLICATES = 999
-CHUNK = 200
 Rows = Float[np.ndarray, "replicates residuals"]
 
 
@@ -151,11 +150,9 @@ def adequacy(ended: Endpoint) -> Adequacy | None:
         return None
     generator = generator_of(problem, 5)
     count, rows = len(found.residuals), len(refit.prior)
-    chi2 = np.empty(0)
     drawn = np.concatenate([_drawn(objective, scatter, generator), generator.normal(size=(REPLICATES, rows))], axis=1)
-    for some in np.split(drawn, np.arange(CHUNK, REPLICATES, CHUNK)):
-        rest = refit.left(some, np.argmin(refit.cost(some), axis=1))
-        chi2 = np.append(chi2, np.sum(rest[:, :count] ** 2, axis=1))
+    rest = refit.left(drawn, np.argmin(refit.cost(drawn), axis=1))
+    chi2 = np.sum(rest[:, :count] ** 2, axis=1)
     here = float(np.sum(found.residuals**2))
     p = (1 + np.sum(chi2 >= here)) / (1 + REPLICATES)
     misfit = ""

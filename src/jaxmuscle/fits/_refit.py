@@ -17,6 +17,7 @@ from jaxmuscle.objective._residuals import Residuals
 from jaxmuscle.response._harmonic_line import line_levels
 
 LINES = 128
+CHUNK = 100  # residuals whose costs are found at a time: what lies in the directions of all lines is large
 STRENGTHS = np.geomspace(0.005, 20.0, 20)
 
 
@@ -40,13 +41,16 @@ class Refit(NamedTuple):
 
     def cost(self, residuals: Float[np.ndarray, "rows all"]) -> Float[np.ndarray, "rows lines"]:
         """`|(1 - U Uᵀ) (r - change)|²` with the penalty, less `|r|²`."""
-        residuals = residuals @ self.narrow
-        lines, size, fitted = self.taken.shape
+        own, (_, size, fitted) = residuals @ self.narrow, self.taken.shape
         held = np.einsum("la,lak->lk", self.change, self.taken)
         away = self.change - np.einsum("lak,lk->la", self.taken, held)
-        inside = (residuals @ np.moveaxis(self.taken, 1, 0).reshape(size, -1)).reshape(len(residuals), lines, fitted)
-        level = np.sum(self.change**2, axis=1) + self.penalty - np.sum(held**2, axis=1)
-        return level - 2 * residuals @ away.T - np.einsum("rlk,rlk->rl", inside, inside)
+        columns = np.transpose(self.taken, (1, 2, 0)).reshape(size, -1)
+        cost = np.sum(self.change**2, axis=1) + self.penalty - np.sum(held**2, axis=1) - 2 * own @ away.T
+        for i in range(0, len(own), CHUNK):
+            inside = own[i : i + CHUNK] @ columns
+            np.square(inside, out=inside)
+            cost[i : i + CHUNK] -= inside.reshape(len(inside), fitted, -1).sum(axis=1)
+        return cost
 
     def left(self, residuals: Float[np.ndarray, "rows all"], line: np.ndarray | int = -1) -> Float[np.ndarray, "rows all"]:
         """What is left of every row with its line."""

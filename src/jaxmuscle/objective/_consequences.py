@@ -319,7 +319,7 @@ def _expanded(part: Any, theta: Float[np.ndarray, "points own"]) -> tuple[Any, A
     """
     if not isinstance(part.model, Linear):
         return jax.tree.map(np.asarray, _moments_and_slopes(part, theta))
-    count, (response, own) = len(theta), _response_of(part)
+    count, (response, own) = len(theta), _response_of(part, part.model)
     padded = np.zeros((-(-count // POINTS) * POINTS, len(response.coordinates.names)))
     padded[:, own] = np.concatenate([theta, np.broadcast_to(theta[-1], (len(padded) - count, len(own)))])
     parts = [_of_rows(response, padded[i : i + POINTS], np.asarray(min(count - i, POINTS))) for i in range(0, count, POINTS)]
@@ -330,14 +330,14 @@ def _expanded(part: Any, theta: Float[np.ndarray, "points own"]) -> tuple[Any, A
 _LATEST: list[tuple[Any, tuple[_Response, np.ndarray]]] = []
 
 
-def _response_of(part: PartResiduals) -> tuple[_Response, Int[np.ndarray, " own"]]:
+def _response_of(part: PartResiduals, model: Linear) -> tuple[_Response, Int[np.ndarray, " own"]]:
     """What is expanded of a part, and where its own coordinates stand in that; of the latest parts made only once."""
     for known, found in _LATEST:
         if known is part:
             return found
     wide = _with_the_usual(part.coordinates, part.task)
     own = np.array([wide.names.index(name) for name in part.coordinates.names], dtype=int)
-    found = _Response(part.model, part.task, wide), own
+    found = _Response(model, part.task, wide), own
     _LATEST[:] = [(part, found), *_LATEST[: LATEST - 1]]
     return found
 
