@@ -48,10 +48,14 @@ class Gaussian(eqx.Module):
         return jax.nn.logsumexp(jnp.stack(heights))
 
 
+def silent(text, share):
+    pass
+
+
 def chains_of(apart, key=0):
     with jax.enable_x64(True):
         density = Gaussian(np.zeros(3), np.eye(3), apart)
-        return sample(density, jax.random.key(key), 4, 500, 400, lambda text, share: None)[0]  # pyright: ignore
+        return next(sample(density, jax.random.key(key), 4, (500,), 400, silent))[0]
 
 
 @pytest.mark.slow
@@ -71,6 +75,20 @@ def test_chains_that_do_not_mix_are_found_out():
     assert len(set(np.sign(found.s[:, -1, 0]))) == 2  # with other keys all starts may lie on one side
     success, message = verdict(found, {"x": diagnosed(found.s[:, :, 0])}, ("x",))
     assert not success and "did not mix" in message and "longer chains" in message
+
+
+@pytest.mark.slow
+def test_chains_go_on_where_they_ended():
+    with jax.enable_x64(True):
+        density = Gaussian(np.zeros(3), np.eye(3), 0.0)
+        told = []
+        short, longer = (
+            found for found, _ in sample(density, jax.random.key(0), 4, (500, 600), 400, lambda *x: told.append(x))
+        )
+    whole = chains_of(0.0)
+    assert np.array_equal(short.s, whole.s) and np.array_equal(longer.s[:, :500], whole.s)
+    assert longer.s.shape[1] == 600 and len(np.unique(longer.s[:, :, 0])) > 4 * 500
+    assert told[-1] == ("the chains have not mixed yet, drawing, block 12 of 12", 1.0)
 
 
 def test_divergences_are_a_failure():
@@ -107,7 +125,10 @@ def well_known():
 
 @functools.cache
 def drawn():
-    return jm.posterior(well_known()[1], key=3, draws=500, warmup=300)
+    """A hundred draws of a chain are too few, so it goes on to five hundred."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("jaxmuscle.uncertainty._posterior.DRAWS", (100, 500, 900))
+        return jm.posterior(well_known()[1], key=3, warmup=300)
 
 
 @pytest.mark.slow

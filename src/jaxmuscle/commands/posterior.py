@@ -48,7 +48,12 @@ def posterior(
     segments: Segments = None,
     quantity: Quantity = None,
     chains: Annotated[int, typer.Option(min=2, max=10**6, help="How many chains are run.")] = 4,
-    draws: Annotated[int, typer.Option(min=100, max=10**9, help="How many draws each chain makes.")] = 750,
+    draws: Annotated[
+        int | None,
+        typer.Option(
+            min=100, max=10**9, help="How many draws each chain makes; if left out, 750, and up to 3000 until they mix."
+        ),
+    ] = None,
     warmup: Annotated[int, typer.Option(min=1, max=10**9, help="How many steps each chain makes before its draws.")] = 400,
     seed: Seed = 0,
     output: Output = Path("out"),

@@ -1,6 +1,6 @@
 """Hamiltonian chains of a whitened density, in one program; step size and metric adapted on all of them together."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -119,51 +119,61 @@ def _moved(old: Density, new: Density, white: Array) -> np.ndarray:
 
 
 def sample(
-    density: Density, key: Array, chains: int, draws: int, warmup: int, tell: Callable[[str, float], None]
-) -> tuple[Chains, Density]:
-    """Chains from dispersed starts, and the density whitened as they were drawn.
+    density: Density, key: Array, chains: int, draws: Sequence[int], warmup: int, tell: Callable[[str, float], None]
+) -> Iterator[tuple[Chains, Density]]:
+    """Chains from dispersed starts, and the density whitened as they were drawn: at each of these rising numbers of draws.
 
-    `warmup` is rounded up to blocks. Needs double precision. Raises `ValueError` if no start has a finite density.
+    The longer chains go on where the shorter ones ended. `warmup` is rounded up to blocks. Needs double precision. Raises
+    `ValueError` if no start has a finite density.
     """
-    with jax.numpy_dtype_promotion("standard"):
-        return _sample(density, key, chains, draws, warmup, tell)
+    lengths = _sample(density, key, chains, draws, warmup, tell)
+    for _ in draws:
+        with jax.numpy_dtype_promotion("standard"):
+            found = next(lengths)
+        yield found
 
 
 def _sample(
-    density: Density, key: Array, chains: int, draws: int, warmup: int, tell: Callable[[str, float], None]
-) -> tuple[Chains, Density]:
+    density: Density, key: Array, chains: int, draws: Sequence[int], warmup: int, tell: Callable[[str, float], None]
+) -> Iterator[tuple[Chains, Density]]:
     tell("compiling the sampler", 0.0)
     blocks = max(len(ADAPTATIONS), -(-warmup // BLOCK))
     shares = np.cumsum(ADAPTATIONS) / sum(ADAPTATIONS)
     renewals = {max(1, round(blocks * share)) for share in shares[:-1]}
-    total = blocks + -(-draws // BLOCK)
     state = _first(density, _dispersed(density, fold_in(key, 0), chains))
     longest = LONGEST
     recent: list[np.ndarray] = []
     kept: list[Any] = []
-    for number in range(total):
-        adapting = number < blocks
-        its, told = fold_in(key, number + 1), (np.asarray(adapting), np.asarray(longest))
-        state, made = _block(density, its, state, *told)
-        white = np.asarray(made[0])
-        if not adapting:
-            both = np.asarray(density.centre) + white @ np.asarray(density.scale).T
-            kept.append((both, *map(np.asarray, made[1:])))
-        elif number + 1 in renewals:
-            recent.append(white)
-            seen = np.concatenate(recent[-2:])
-            if number + 1 == max(renewals) and _alike(density, seen) > ALIKE:
-                longest *= 2
-            new = _learnt(density, seen.reshape(-1, white.shape[-1]))
-            state = _first(new, _moved(density, new, state.chains[0]))
-            density, recent = new, []
-        else:
-            recent.append(white)
-        text = "warming up the chains" if adapting else f"drawing, block {number + 1 - blocks} of {total - blocks}"
-        tell(text, (number + 1) / total)
-    parts = [np.concatenate([part[i] for part in kept])[:draws] for i in range(6)]
-    s, height, acceptance, steps, diverging = (np.swapaxes(part, 0, 1) for part in parts[:5])
-    return Chains(s, height, acceptance, steps, diverging, float(parts[5][-1])), density
+    done = 0
+    for count in draws:
+        total = blocks + -(-count // BLOCK)
+        for number in range(done, total):
+            adapting = number < blocks
+            its, told = fold_in(key, number + 1), (np.asarray(adapting), np.asarray(longest))
+            state, made = _block(density, its, state, *told)
+            white = np.asarray(made[0])
+            if not adapting:
+                both = np.asarray(density.centre) + white @ np.asarray(density.scale).T
+                kept.append((both, *map(np.asarray, made[1:])))
+            elif number + 1 in renewals:
+                recent.append(white)
+                seen = np.concatenate(recent[-2:])
+                if number + 1 == max(renewals) and _alike(density, seen) > ALIKE:
+                    longest *= 2
+                new = _learnt(density, seen.reshape(-1, white.shape[-1]))
+                state = _first(new, _moved(density, new, state.chains[0]))
+                density, recent = new, []
+            else:
+                recent.append(white)
+            further = "" if count == draws[0] else "the chains have not mixed yet, "
+            text = (
+                "warming up the chains" if adapting else f"{further}drawing, block {number + 1 - blocks} of {total - blocks}"
+            )
+            tell(text, (number + 1) / total)
+        done = total
+        parts = [np.concatenate([part[i] for part in kept])[:count] for i in range(6)]
+        s, height, acceptance, steps, diverging = (np.swapaxes(part, 0, 1) for part in parts[:5])
+        yield Chains(s, height, acceptance, steps, diverging, float(parts[5][-1])), density
 
 
 def _dispersed(density: Density, key: Array, chains: int) -> np.ndarray:

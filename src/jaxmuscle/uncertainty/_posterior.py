@@ -25,11 +25,12 @@ from jaxmuscle.objective._residuals import PartResiduals, Residuals
 
 from ._chains import Chains, sample
 from ._frequency_grid import edges_of
-from ._posterior_checks import diagnosed, modes_of, replicates, verdict
+from ._posterior_checks import diagnosed, diverges, modes_of, replicates, verdict
 from ._posterior_density import PosteriorDensity, density_about
 from ._posterior_result import Posterior, PosteriorPart
 
 ROWS = 256
+DRAWS = 750, 1500, 3000  # of a chain, unless a number is asked for: the next one as long as the chains have not mixed
 
 
 def posterior(
@@ -38,7 +39,7 @@ def posterior(
     *,
     key: Key = 0,
     chains: int = 4,
-    draws: int = 750,
+    draws: int | None = None,
     warmup: int = 400,
     free: Iterable[str] | None = None,
     priors: Mapping[str, float | tuple[float, float | None] | None] | None = None,
@@ -58,7 +59,8 @@ def posterior(
     chains that do not cross.
 
     **Arguments:** `result` of `fit` (prior, bounds and free parameters are the fit's unless given) and its `target`;
-    `key`, a `jax.random` key or a seed number; `chains`, `draws` of each, `warmup` steps before; `free`, names;
+    `key`, a `jax.random` key or a seed number; `chains`, `draws` of each (by default 750, and as long as the chains have
+    not mixed up to 3000), `warmup` steps before; `free`, names;
     `priors` {name: sd, or (centre, sd)}; `bounds` {name: (low, high)}; `progress`, True or a function of (text, share).
 
     **Returns:** a `Posterior`; check `success` or call `summary()`.
@@ -69,7 +71,8 @@ def posterior(
     **Source:** Neal 2011, arXiv:1206.1901 (Hamiltonian Monte Carlo, trajectories of random length); Vehtari et al. 2021,
     doi:10.1214/20-BA1221 (R-hat, effective sample size).
     """
-    for name, count, least in (("chains", chains, 2), ("draws", draws, 100), ("warmup", warmup, 1)):
+    lengths = DRAWS if draws is None else (draws,)
+    for name, count, least in (("chains", chains, 2), ("draws", lengths[0], 100), ("warmup", warmup, 1)):
         if count < least:
             raise ValueError(f"{name} = {count} must be at least {least}")
     with told(progress, f"posterior of {result.title}") as tell, fitting():
@@ -77,8 +80,14 @@ def posterior(
         likelihood = Likelihood.of(problem)
         tell("searching the most probable parameters", 0.0)
         density, _, _ = density_about(problem, likelihood, problem.theta_of(tuple(result.tasks.values())))
-        found, density = sample(density, fold_in(problem.key, 5), chains, draws, warmup, tell)
-        return _reported(problem, density, found, result, key, warmup)
+        attempts = (
+            _reported(problem, whitened, found, result, key, warmup)
+            for found, whitened in sample(density, fold_in(problem.key, 5), chains, lengths, warmup, tell)
+        )
+        drawn = next(attempts)
+        while not (drawn.success or diverges(drawn.chains)) and (longer := next(attempts, None)) is not None:
+            drawn = longer
+        return drawn
 
 
 def _reported(

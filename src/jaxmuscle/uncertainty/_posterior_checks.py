@@ -85,14 +85,18 @@ def verdict(found: Chains, diagnostics: dict, determined: tuple[str, ...]) -> tu
     least = min(diagnostics, key=lambda n: min(diagnostics[n][1:]))
     size = min(diagnostics[least][1:])
     r_hat = max(d[0] for d in diagnostics.values())
-    share = float(found.diverging.mean())
     if not size >= EFFECTIVE * count:
         return False, (f"the chains did not mix: {least} has an effective sample size of {size:.0f}, below "
                        f"{EFFECTIVE * count}; {advice}")  # fmt: skip
-    if share > DIVERGING:
+    if diverges(found):
         return False, (f"{int(found.diverging.sum())} of {found.diverging.size} draws diverged, so parts of the posterior "
                        "were not reached: give tighter priors or bounds")  # fmt: skip
     return True, f"the chains mixed: R-hat at most {r_hat:.3f}, effective sample size at least {size:.0f}"
+
+
+def diverges(found: Chains) -> bool:
+    """Whether more than two draws in a thousand diverged: longer chains do not mend that."""
+    return float(found.diverging.mean()) > DIVERGING
 
 
 def modes_of(frequency: np.ndarray) -> tuple[tuple[float, float, float, float], ...]:
