@@ -43,18 +43,18 @@ hide: [navigation]
 
 # Gallery
 
-Use this page to find a figure by its looks. It shows every figure that jaxmuscle draws, with the code below it. Each section
-begins with a block of code. Run the blocks one after another: the lines below the figures use what their block defines.
-Click on a figure to see it whole.
+Use this page to find a figure by its looks. It shows every figure that jaxmuscle draws. Below each figure stands the line of
+code that draws it. Each section begins with a block of code. Run the blocks one after another: the lines below the figures
+use what these blocks define. Click on a figure to see it whole.
 
-Every figure is a function of [`jm.plot`](reference/figures.md), and can also be drawn into your own Matplotlib axes.
+The functions of [`jm.plot`](reference/figures.md) draw the figures. They can also draw into your own Matplotlib axes.
 `docs/gallery.py` makes this page and its figures.
 """
 TAIL = """
 ## A Hill-type muscle
 
-You can use a [muscle of your own](own-muscle.md). `python docs/hill_muscle.py` draws one, and its spectrum with two colours
-of noise.
+You can use a [muscle of your own](own-muscle.md). As an example, `python docs/hill_muscle.py` draws a Hill-type
+muscle, and its spectrum with two colours of noise.
 
 [![Force-length, force-velocity and tendon curves; isometric force spectrum](hill.png){ .wide }](hill.png)
 """

@@ -34,17 +34,19 @@ A parameter has the name of this table wherever you write it:
 
 - The letter at the end says which tissue is meant: `_w` the active one, `_z` the passive one. A small letter is a factor
   (`k_w`, `c_w`), a capital the stiffness or damping itself (`K_w0`). `noise_K_w` is the noise on the stiffness K_w.
-- Three parameters have a second name, as motor control calls them. Both names work everywhere: `tremor_frequency` is
+- Three parameters have a second name, the one that motor control uses. Both names work everywhere: `tremor_frequency` is
   `resonance_frequency`, `tremor_width` is `resonance_width`, `contraction_time` is `activation_time`.
-- `K_w0`, `K_z0`, `C_w0` and `C_z0`, stiffness and damping at rest, follow from parameters. You can read them
+- `K_w0`, `K_z0`, `C_w0` and `C_z0` are stiffness and damping at rest. They follow from the parameters. You can read them
   (`task["K_w0"]`, `result["K_w0"]`), but not set or fit them.
-- `P_w`, `F_ext` and `x_z` are inputs over time. `task["P_w"]` is the level that is held, `task.P_w` the whole signal.
-- In a joint fit `c_w@high` is the `c_w` of the target "high" alone.
+- `P_w`, `F_ext` and `x_z` are inputs over time. `task["P_w"]` is the level that is held, and
+  `task.P_w` is the whole signal.
+- In a [joint fit](../identifiability.md#a-joint-fit) `c_w@high` is the `c_w` of the target "high" alone.
 - A wrong name is an error that says which one you may have meant.
 
 ## Values
 
-*Bounds* are what is physically possible; a name with a dot (●) is free in a default fit.
+*Bounds* say which values are physically possible. A name with a dot (●) is free in a default fit: the fit looks for its
+value.
 
 | name | symbol | unit | default | bounds | meaning |
 |---|---|---|---|---|---|
@@ -52,10 +54,10 @@ A parameter has the name of this table wherever you write it:
 FIT = """
 ## In a fit
 
-A fit has a prior for every free parameter. It is centred on the value that the parameter has in the task which you pass in.
-*prior sd* is its standard deviation. A positive parameter is fitted in *log space*: there *prior sd* is that of the
-logarithm. For the others it is in the parameter's own unit. *Reached by a fit* are the bounds of the search. *The paper*
-is the one that [the model](../model.md) is from.
+A fit has a [prior](../glossary.md#the-fit) for every free parameter. The prior is centred on the value that the parameter
+has in the task which you pass in. *Prior sd* is the standard deviation of the prior. A positive parameter is fitted in *log
+space*: its *prior sd* is that of the logarithm. For the other parameters it is in their own unit. *Reached by a fit* are the
+bounds of the search. *The paper* is the one from which [the model](../model.md) comes.
 
 | name | log space | prior sd | reached by a fit | source of the default |
 |---|---|---|---|---|
@@ -65,7 +67,7 @@ TAIL = """
 
 All units are SI: masses in kg, lengths in m, forces in N, times in s, frequencies in Hz, angles in rad. `k` [N/m³] times a
 squared length is a stiffness [N/m]. `c` [N s³/m³] times a squared velocity is a damping coefficient [N s/m]. The unit 1
-means a ratio: amplitudes of noise and harmonic are fractions of the coefficient at rest.
+means a ratio: amplitudes of noise and harmonic are fractions of the stiffness or damping at rest, or of P_w.
 
 ::: jaxmuscle.PARAMETERS
 
@@ -76,26 +78,27 @@ The table by name, a dictionary of `Parameter`.
 FILES = Path(__file__).parent / "reference" / "files.md"
 FILES_HEAD = """# Files, key by key
 
-Look here if you write one of these files by hand, or read one with a program of yours. For each kind of file there is
+Look here if you write one of these files by hand, or read one with your own program. For each kind of file there is
 a table of all its keys. *Since* is the first version of the format that has the key. A later version of jaxmuscle
 reads earlier formats.
 
-Files are checked when they are read. A key that is unknown, missing, there twice, of a wrong type or out of range is
-an error that names the file and the key. A required key that is missing is never replaced by a default. Numbers must
+Files are checked when they are read. If a key is unknown, missing, there twice, of a wrong type or out of range,
+an error names the file and the key. A required key that is missing is never replaced by a default. Numbers must
 be finite. `true` is not 1, and `1.0` is not a whole number. `docs/generate.py` writes this page from the code that
 checks the files.
 
-In the column *type and range*, *table* is what Python calls a dict: an object in JSON, a `[table]` in TOML. A *table by
-name* has keys that are free, such as the names of parameters. *2 times* is a list of two.
+In the column *type and range*, *table* is what Python calls a dict: an object in JSON, a `[table]` in TOML. The keys
+of a *table by name* are not fixed: they are, for example, the names of parameters. *2 times* is a list of two.
 """
 FIT_FILE = """JSON, format 4. `FitResult.save` writes it and `load_result` reads it. `load_preset` reads its
 `task_table` alone. A fit of one target has the keys of the first two tables side by side. In a fit of several targets
-the keys of the second table stand under `parts`, by the name of the target. Keys must agree: the value of a parameter
-with its `task_table`, the spectrum with its `target_table`. Format 3 does not say where
-starts ended (`values`). Format 2 may also leave out keys of `task_table` and `target_table` that do not apply."""
+the keys of the second table stand under `parts`, by the name of the target. What the file says twice must agree: the
+value of a parameter with the `task_table`, the spectrum with the `target_table`. In format 3 the starts do not have
+`values`, which say where each ended. Format 2 may also leave out keys of `task_table` and `target_table` that do not
+apply."""
 PRESET = """TOML, format 2. `save_preset` writes it and `load_preset` reads it. The `task_table` has every field of
 the task and of its parts. `type` is the class of a part. What a task does not have (`activation`, `initial`, a
-low-pass) is `"none"`. Format 1 has no key `format`, and may leave out what a task does not have."""
+low-pass) is written as `"none"`. Format 1 has no key `format`, and may leave out what a task does not have."""
 TARGET = """TOML, format 1. `Target.save` writes it and `load_target` reads it. The `target_table` of a fit.json has
 the same keys without `format`, and `null` for what is not stated."""
 STUDY = """TOML. `run_study` reads it. The second table has the columns of a study.csv."""

@@ -40,14 +40,14 @@ class Refit(NamedTuple):
     narrow: Float[np.ndarray, "rows all"]
 
     def cost(self, residuals: Float[np.ndarray, "rows all"]) -> Float[np.ndarray, "rows lines"]:
-        """`|(1 - U Uᵀ) (r - change)|²` with the penalty, less `|r|²`."""
+        """`|(1 - U Uᵀ) (r - change)|²` with the penalty, less `|r|²`; the largest of its terms in single precision."""
         own, (_, size, fitted) = residuals @ self.narrow, self.taken.shape
         held = np.einsum("la,lak->lk", self.change, self.taken)
         away = self.change - np.einsum("lak,lk->la", self.taken, held)
-        columns = np.transpose(self.taken, (1, 2, 0)).reshape(size, -1)
+        columns = np.transpose(self.taken.astype(np.float32), (1, 2, 0)).reshape(size, -1)
         cost = np.sum(self.change**2, axis=1) + self.penalty - np.sum(held**2, axis=1) - 2 * own @ away.T
         for i in range(0, len(own), CHUNK):
-            inside = own[i : i + CHUNK] @ columns
+            inside = own[i : i + CHUNK].astype(np.float32) @ columns
             np.square(inside, out=inside)
             cost[i : i + CHUNK] -= inside.reshape(len(inside), fitted, -1).sum(axis=1)
         return cost

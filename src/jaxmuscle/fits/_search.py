@@ -23,7 +23,7 @@ from jaxmuscle.response._expected import Moments
 from jaxmuscle.response._linearised import settled
 
 from ._adequacy import Endpoint
-from ._checks import Stage, controlled_moments, seen_best
+from ._checks import AMBIGUOUS, Stage, controlled_moments, seen_best
 from ._ladder import Climbed, Models, Rung, climb, line_or_resonance, rung_of
 from ._report import UNCHECKED, report_fit
 from ._result import FitResult
@@ -200,7 +200,8 @@ def _descended(plan: Plan, points: np.ndarray, stages: list[Stage]) -> Known | N
     problem, max_steps = plan.problem, plan.max_steps
     objective = problem.linear()
     show = _stage(problem, stages, objective, "trying starts", (0.05, 0.5), max_steps)
-    first = _with_recombined(plan, objective, least_squares(objective, points, max_steps, report=show))
+    first = least_squares(objective, points, max_steps, margin=AMBIGUOUS, report=show)
+    first = _with_recombined(plan, objective, first)
     stages[:] = [Stage("trying starts", objective, first)]
     if not np.isfinite(first.cost[first.best]):
         return None
@@ -273,7 +274,7 @@ def _montecarlo(plan: Plan, points: np.ndarray, stages: list[Stage]) -> None:
     if problem.control:
         objective = problem.linear()
         show = _stage(problem, stages, objective, "trying starts", (0.05, 0.4), max_steps)
-        first = least_squares(objective, points, max_steps, report=show)
+        first = least_squares(objective, points, max_steps, margin=AMBIGUOUS, report=show)
     else:
         objective = problem.montecarlo(max(8, problem.seeds // 3))
         show = _stage(problem, stages, objective, "trying starts", (0.05, 0.4), FIRST_STEPS)

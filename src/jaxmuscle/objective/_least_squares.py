@@ -15,6 +15,7 @@ from ._consequences import Expansion, expand
 SMALL = 1e-3
 STILL = 1e-4
 REFUSALS = 10
+HOPELESS = 0.02  # of the way to where it would count, gained by a step: a start that needs fifty more such steps
 ROWS = 128
 
 
@@ -101,17 +102,24 @@ class _Standing(NamedTuple):
     accepted: np.ndarray
     small: np.ndarray
     still: np.ndarray
+    behind: np.ndarray
     refused: np.ndarray
     steps: np.ndarray
     active: np.ndarray
 
-    def advanced(self, s: np.ndarray, ahead: np.ndarray, cost: np.ndarray, accepted: np.ndarray) -> "_Standing":
+    def advanced(
+        self, s: np.ndarray, ahead: np.ndarray, cost: np.ndarray, accepted: np.ndarray, margin: float
+    ) -> "_Standing":
         """After a step of the active rows; the others stay as they are."""
         moved = self.active & (accepted > self.accepted)
         with np.errstate(invalid="ignore"):
             gain = np.where(np.isfinite(self.cost), (self.cost - cost) / self.cost, np.inf)
         small = np.where(moved, np.where(gain < SMALL, self.small + 1, 0), self.small)
         still = np.where(moved, np.where(gain < STILL, self.still + 1, 0), self.still)
+        away = cost - (np.min(cost, initial=np.inf, where=np.isfinite(cost)) + margin)
+        with np.errstate(invalid="ignore"):
+            slow = (away > 0) & (self.cost - cost < HOPELESS * away)
+        behind = np.where(moved, np.where(slow, self.behind + 1, 0), self.behind)
         refused = np.where(moved, 0, self.refused + self.active)
         keep = self.active[:, None]
         return _Standing(
@@ -121,9 +129,10 @@ class _Standing(NamedTuple):
             np.where(self.active, accepted, self.accepted),
             small,
             still,
+            behind,
             refused,
             self.steps + self.active,
-            self.active & (still < 2) & (refused < REFUSALS) & np.isfinite(cost),
+            self.active & (still < 2) & (behind < 2) & (refused < REFUSALS) & np.isfinite(cost),
         )
 
     def minima(self, count: int) -> Minima:
@@ -137,6 +146,7 @@ def least_squares(
     max_steps: int,
     *,
     data: Any = None,
+    margin: float = np.inf,
     prepare: Callable[[Any, np.ndarray], Any] = lambda objective, points: objective,
     report: Callable[[Minima], None] = lambda minima: None,
 ) -> Minima:
@@ -144,7 +154,9 @@ def least_squares(
 
     `data` has a leading axis of starts: each may have data of its own; without it all have the objective's.
     Steps to where r is not finite are rejected. A start ends when two accepted steps in a row lower its cost by less than
-    `STILL` of it, after `REFUSALS` rejected steps in a row, or if it is not finite; what has ended costs nothing more.
+    `STILL` of it, after `REFUSALS` rejected steps in a row, or if it is not finite; what has ended costs nothing more. It
+    also ends when two accepted steps in a row gain less than `HOPELESS` of what its cost is above the best by more than
+    `margin`.
     `prepare(objective, points)` may exchange the objective before each step (sub-steps); `report` sees every step's outcome.
     """
     count, free = starts.shape
@@ -152,7 +164,7 @@ def least_squares(
     fill = -count % ROWS if batched else 0
     s = np.concatenate([starts, np.broadcast_to(starts[-1], (fill, free))])
     none, nothing = np.zeros(len(s), dtype=int), np.full(len(s), np.inf)
-    now = _Standing(s, s, nothing, none, none, none, none, none, np.arange(len(s)) < count)
+    now = _Standing(s, s, nothing, none, none, none, none, none, none, np.arange(len(s)) < count)
     last = np.minimum(np.arange(count + fill), count - 1)
     data = jax.tree.map(lambda x: np.asarray(x)[last], _for_all(objective.data, count) if data is None else data)
     seen = state = None
@@ -166,7 +178,8 @@ def least_squares(
         else:
             seen = jax.tree.map(lambda old, x, rows=rows: _put(old, rows, x), seen, new)
         s, state, ahead, cost, accepted = _step(objective, data, now.s, state, seen)
-        now = now.advanced(*map(np.asarray, (s, ahead, cost, accepted)))
+        s, ahead, cost, accepted = map(np.asarray, (s, ahead, cost, accepted))
+        now = now.advanced(s, ahead, cost, accepted, margin)
         report(now.minima(count))
         if not np.any(now.active):
             break
