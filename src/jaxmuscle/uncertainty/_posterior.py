@@ -30,13 +30,8 @@ from ._posterior_density import PosteriorDensity, density_about
 from ._posterior_result import Posterior, PosteriorPart
 
 ROWS = 256
-DRAWS = (
-    750,
-    1000,
-    1500,
-    2250,
-    3000,
-)  # of a chain, unless a number is asked for: the next one as long as the chains have not mixed
+# Of a chain, unless a number is asked for: the next one as long as the chains have not mixed.
+DRAWS = 750, 1000, 1500, 2250, 3000
 
 
 def posterior(
