@@ -18,7 +18,7 @@ STATE = 4  # the column of a fit's card that says whether the data determine a n
 PARAMETERS = ("name", "value", "95 % interval", "unit", "what it is")
 FIGURES = {
     "fit": "Points: target, with the range of one standard deviation. Blue line: fit. Bars: residuals, up where the target "
-    "lies above the fit; the grey bands are one and two standard deviations. Red bars are beyond them.",
+    "lies above the fit; the grey bands are one and two standard deviations. Orange-red bars are beyond them.",
     "stiffness": "Points: measured dynamic stiffness with two standard errors either way. Blue line: fit.",
     "cohort": "What the data of at least half of the targets determine, with standard errors. Spectra: every target (thin), "
     "the geometric mean of each group with its standard error (thick).",
@@ -61,7 +61,7 @@ def _tried(result: "FitResult") -> list[Html]:
     """The models that were tried, where there were several."""
     if len(result.ladder) < 2:
         return []
-    rows = [(str(rung.number), rung.model, f"{rung.chi2_per_bin:.2f}", f"{rung.p:.2g}", f"{rung.aic:.1f}",
+    rows = [(str(rung.number), rung.model, f"{rung.chi2_per_bin:.2f}", rung.p_in_words, f"{rung.aic:.1f}",
              "the result" if rung.chosen else "") for rung in result.ladder]  # fmt: skip
     return [
         pages.heading("Models tried"),
@@ -206,7 +206,7 @@ def _after_a_fit(result: "FitResult", path: Path) -> list[str]:
     place, other = shlex.quote(str(path)), shlex.quote(str(path.parent / "compare"))
     if not result.adequate:
         return [
-            "Look at the residuals: red bars are where the model misses the data.",
+            "Look at the residuals: orange-red bars are where the model misses the data.",
             *([f"Try other noises: `jaxmuscle compare {place} --out {other}`."] if result.only.fitted.size else []),
             "Look for drift and tremor in the recording: `jaxmuscle analyse RECORDING`.",
             "Report that the model does not describe the data, and no number of the model.",

@@ -115,8 +115,9 @@ def _of_errors(count: int) -> str:
     if count < ENOUGH:
         return ("± is the standard error, from within the recording: of entropies and DFA from its four parts, of the peak "
                 "from its Welch segments, of all else from its spectrum.")  # fmt: skip
-    return (f"± is the standard error, from the scatter between the {count} trials. A fit's errors may be larger: it takes "
-            "the trials to scatter at least as much as chance makes them.")  # fmt: skip
+    return (f"± is the standard error, from the scatter between the {count} trials. Only the peak is that of their average "
+            "spectrum. A fit's errors may be larger: it takes the trials to scatter at least as much as chance makes "
+            "them.")  # fmt: skip
 
 
 def _plain(measures: dict[str, Measure]) -> dict[str, Any]:

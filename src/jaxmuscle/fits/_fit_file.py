@@ -56,7 +56,7 @@ class RungTable(Table, kw_only=True):
     model: Annotated[str, _told("The model in words")]
     aic: Annotated[float, _told("-2 ln L + 2 parameters")]
     parameters: Annotated[float, _told("Effective number of parameters")]
-    chi2_per_bin: Annotated[float, _told("Chi² over bins")]
+    chi2_per_bin: Annotated[float, _told("Chi² of the verdict on this model over bins less one")]
     p: Annotated[Share, _told("p-value of the verdict on this model")]
     chosen: Annotated[bool, _told("Whether this model was chosen")]
 

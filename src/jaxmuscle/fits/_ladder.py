@@ -47,10 +47,14 @@ class Rung(NamedTuple):
     p: float
     chosen: bool = False
 
+    @property
+    def p_in_words(self) -> str:
+        """As it stands in a table: "<= 0.001" for the least that replicates can show."""
+        return probability(self.p).removeprefix("p ").removeprefix("= ")
+
     def __str__(self) -> str:
-        p = probability(self.p).removeprefix("p ").removeprefix("= ")
-        return (f"{'->' if self.chosen else '  '} {self.number} {self.model:<42}{self.chi2_per_bin:>9.2f}{p:>9}"
-                f"{self.aic:>9.1f}")  # fmt: skip
+        numbers = f"{self.chi2_per_bin:>9.2f}{self.p_in_words:>9}{self.aic:>9.1f}"
+        return f"{'->' if self.chosen else '  '} {self.number} {self.model:<42}{numbers}"
 
 
 class Climbed(NamedTuple):

@@ -10,7 +10,7 @@ from jaxmuscle._common.text import folded
 from jaxmuscle.data._target import Target
 from jaxmuscle.model._parameters import PARAMETERS
 from jaxmuscle.objective._arguments import base_of
-from jaxmuscle.objective._consequences import BANDS, MEANINGS
+from jaxmuscle.objective._consequences import BANDS, MEANINGS, in_bands
 from jaxmuscle.objective._covariance import spelt
 
 from ._ladder import HEAD, gains
@@ -73,7 +73,7 @@ def text_of(result: "FitResult") -> str:
     rows = {name: p for name, p in shown.items() if name not in in_bands}
     title = "determined by the data" if result.adequate is not False else "would be determined if the model held"
     lines += _table(title + _per_newton(result, rows), rows, " 95 % interval    " * intervals)
-    lines += [f"  {sentence}" for sentence in _by_band(in_bands)]
+    lines += [f"  {sentence}" for sentence in _by_band(result, in_bands)]
     fixed = [name for name in result.products if name not in result.parameters]
     lines += [f"  products and ratios known roughly: {', '.join(map(spelt, fixed))}"] if fixed else []
     loose = {name: p for name, p in every.items() if name not in shown and p.free}
@@ -131,17 +131,21 @@ def _beside(name: str, table: Mapping[str, Estimate]) -> str:
     rhythm = table.get(f"tremor_frequency{at}{target}")
     if base == "tremor_share" and rhythm is not None:
         return f"above {0.5 * rhythm.value:.2g} Hz"
-    return "" if table[name].unit == "1" else table[name].unit
+    # A parameter of an own muscle has a unit that only its author knows: it is never divided by a force.
+    return {"1": "", "": "in its own unit"}.get(table[name].unit, table[name].unit)
 
 
-def _by_band(table: dict[str, Estimate]) -> list[str]:
-    """The shares of power in bands, a sentence for each target."""
+def _by_band(result: "FitResult", table: dict[str, Estimate]) -> list[str]:
+    """The shares of power in bands, of fit and data, a sentence for each target."""
     said: dict[str, list[str]] = {}
     for name, p in table.items():
         band, _, whose = name.partition("@")
-        low, high = BANDS[band]
-        said.setdefault(f" of {whose}" if whose else "", []).append(f"{low:g}-{high:g} Hz {100 * p.value:.2g} %")
-    return [f"power by band{whose}: {', '.join(each)}" for whose, each in said.items()]
+        target = (result.parts[whose] if whose else result.only).target
+        shares = in_bands(target.frequency, target.settings.resolution) @ target.proportional_power
+        measured = dict(zip(BANDS, shares, strict=True))[band]
+        shown = f"{BANDS[band][0]:g}-{BANDS[band][1]:g} Hz {100 * p.value:.2g} % ({100 * measured:.2g} %)"
+        said.setdefault(f" of {whose}" if whose else "", []).append(shown)
+    return [f"power by band{whose}, fitted (measured): {', '.join(each)}" for whose, each in said.items()]
 
 
 def _head(result: "FitResult") -> str:

@@ -103,7 +103,7 @@ class AbstractTask(Shown, eqx.Module):
 
             task = jm.Isometric().with_parts(noise=jm.PinkNoise())
 
-        Raises `TypeError` for what is no field of the task.
+        Raises `ValueError` for what is neither a field nor a parameter of the task.
         """
         fields = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
         return type(self)(**(fields | parts))

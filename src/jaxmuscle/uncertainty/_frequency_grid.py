@@ -22,12 +22,14 @@ MODES, FADED = 4, 8.0
 # Standard deviations about a maximum, out to where a wide cell holds next to nothing.
 AROUND = np.array([-5.5, -4.0, -3.0, -2.25, -1.5, -0.75, 0.0, 0.75, 1.5, 2.25, 3.0, 4.0, 5.5])
 FILLED = 16
+UNSEEN = 3e-5  # 1/Hz in any bin of a line of mean square 1: white noise of that mean square has 0.02
 
 
 class Band(eqx.Module):
     """A harmonic frequency that is summed over: its grid f_j, weights w_j (prior density times the width of the cell).
 
-    `parts` are those that it acts on, each with the `tables` of its lines.
+    `parts` are those that it acts on, each with the `tables` of its lines. Their levels end with the last frequency whose
+    line shows in the bins.
     """
 
     frequency: Float[Array | np.ndarray, " grid"]
@@ -58,6 +60,8 @@ def band_about(problem: FitProblem, peak: Maximum, name: str) -> Band:
         # A third of the time in single precision; 1e-5 in a log density moves no draw.
         precision = np.float64 if part.target.segments is None else np.float32
         level = np.asarray(table.level[:, part.chosen], precision)
+        seen = np.flatnonzero(2 * level[0].max(axis=0) > UNSEEN * np.asarray(table.passed))
+        level = level[..., : FILLED * (1 + int(seen[-1]) // FILLED)]
         tables.append(jax.tree.map(np.asarray, table)._replace(level=level))
     return Band(frequency, _log_weight(problem, frequency, name), tuple(tables), name, tuple(acting))
 

@@ -49,12 +49,14 @@ class Features(NamedTuple):
     def moments(self, frequency: Float[Array, " grid"], table: LineTable) -> Moments:
         """Moments with the harmonic at each frequency, the last axis of the powers and the only one of the variance.
 
-        Powers are in units of the noise's, in the precision of the table.
+        Powers are in units of the noise's, in the precision of the table. They end with the last frequency whose line shows
+        in the bins, and with no line at all.
         """
         s = jax.lax.complex(jnp.zeros_like(frequency), 2 * jnp.pi * frequency)
         reply = jax.lax.complex(*self.size) * polynomial(self.numerator, s) / polynomial(self.denominator, s)
         scale = jax.lax.stop_gradient(jnp.sum(self.power))
-        line = table.power(reply * jax.lax.rsqrt(scale).astype(reply.dtype))
+        line = table.power(reply[: table.level.shape[-1]] * jax.lax.rsqrt(scale).astype(reply.dtype))
+        line = jnp.pad(line, ((0, 0), (0, 1)))
         power = (self.power / scale).astype(line.dtype)
         unknown = jnp.full((), jnp.nan)
         return Moments(power[:, None] + line, line, self.mean, self.variance + table.variance(reply), unknown, unknown,
@@ -176,13 +178,15 @@ class PosteriorDensity(eqx.Module):
         for part, table in zip(band.parts, band.tables, strict=True):
             features, bins = self.features(s, part, systems), self.likelihood.bins[part]
             moments = features.moments(jnp.asarray(band.frequency), table)
+            which = np.minimum(np.arange(len(band.frequency)), table.level.shape[-1])
+            spread = moments._replace(power=moments.power[:, which], line=moments.line[:, which])
             if bins is None:
                 own = partial(self.likelihood.of_part, part, offset=offsets[part], bins=None)
-                found += jax.vmap(lambda m, own=own: own(m), in_axes=(GRID,))(moments)
+                found += jax.vmap(lambda m, own=own: own(m), in_axes=(GRID,))(spread)
             else:
                 law, offset = as_arrays((bins, offsets[part]), moments.power.dtype)
-                found += log_density(law, moments.power, moments.line, offset).astype(found.dtype)
-                found += jax.vmap(lambda m, i=part: self.likelihood.further(i, m), in_axes=(GRID,))(moments)
+                found += log_density(law, moments.power, moments.line, offset)[which].astype(found.dtype)
+                found += jax.vmap(lambda m, i=part: self.likelihood.further(i, m), in_axes=(GRID,))(spread)
         return found
 
     def log_prior(self, s: Float[Array, " free"]) -> Scalar:
