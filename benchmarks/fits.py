@@ -64,7 +64,7 @@ def starts(repetitions: int) -> list[Row]:
 
 
 def posterior() -> list[Row]:
-    """Four chains of as many draws as by default for the first target, the second of two calls; determined quantities' worst R-hat."""
+    """Four chains for the first target, the second of two calls; the worst R-hat of what is determined."""
     target = jm.load_target("vastus-lateralis-26mvc")
     result = jm.fit(jm.task_for(target), target)
     for key in (1, 2):

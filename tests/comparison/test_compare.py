@@ -318,7 +318,7 @@ def test_six_and_the_same_sign_are_needed():
     assert decided(("a", "b"), Evidence(np.nan, up), Evidence(6.0, down)).winner is None
     open_ = decided(("a", "b"), Evidence(0.0, up), Evidence(60.0, down, settled=False))
     assert open_.winner is None and str(open_) == (
-        "a and b cannot be told apart: the search of b did not come to its end")  # fmt: skip
+        "a and b are not compared: the search of b did not come to its end")  # fmt: skip
 
 
 def test_verdict_in_words():

@@ -216,7 +216,7 @@ def _after_a_fit(result: "FitResult", path: Path) -> list[str]:
         f"How sure is each number? `jaxmuscle posterior {place}` draws from the posterior.",
         f"Move the parameters yourself: `jaxmuscle explore {place}`.",
         f"What should you measure to know the rest? `jaxmuscle identifiability {place}`.",
-        'In a paper, give the numbers under "What the data determine" with their intervals.',
+        'In a paper, give the numbers under "What the data determine" with their intervals, unless a note says not to.',
         "Name those that the data do not determine.",
     ]
 

@@ -80,7 +80,8 @@ class Decision(Printed, Result, eqx.Module):
             return f"{better} rather than {worse}: {numbers}"
         open_ = f"{better} and {worse} cannot be told apart"
         if self.unsettled:
-            return f"{open_}: the search of {' and of '.join(self.unsettled)} did not come to its end"
+            whose = " and of ".join(self.unsettled)
+            return f"{better} and {worse} are not compared: the search of {whose} did not come to its end"
         if abs(self.aic_gain) >= self.needed:
             return f"{open_}: the two measures disagree, {numbers}"
         return f"{open_}: {numbers}; {self.needed:.3g} in AIC is needed"
@@ -214,8 +215,12 @@ class Comparison(Printed, Result, eqx.Module):
     def verdict(self) -> tuple[str, ...]:
         """Sentences: the best noise against each other one, and whether there is a harmonic."""
         first, *others = self.noises
-        decisions = [self.between(first, other) for other in others] + ([] if self.harmonic is None else [self.harmonic])
-        said = [str(decision) for decision in decisions]
+        said = [str(self.between(first, other)) for other in others]
+        if self.harmonic is not None:
+            instead = (
+                "" if any(row.harmonic for row in self.rows if row.noise == first) else "among the models without tremor, "
+            )
+            said.append(f"{instead}{self.harmonic}")
         if self.best.scores is None:
             said.append("the target states no segments: nothing was held out, the AIC decides alone")
         return tuple(said)
