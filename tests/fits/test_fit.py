@@ -26,7 +26,7 @@ from jaxmuscle.objective._arguments import DT, RESIDUALS, FitOptions, free_names
 from jaxmuscle.objective._consequences import BATCH, _of_rows, consequences, derived, expand
 from jaxmuscle.objective._coordinates import Coordinates
 from jaxmuscle.objective._covariance import common_scales, identifiability
-from jaxmuscle.objective._least_squares import Minima, _residuals, least_squares
+from jaxmuscle.objective._least_squares import Minima, _residuals, _Standing, least_squares
 from jaxmuscle.objective._moment_models import MonteCarlo, welch_operator
 from jaxmuscle.objective._problem import FitProblem, Part, target_variation
 from jaxmuscle.objective._residuals import residual_sigma
@@ -930,3 +930,19 @@ def test_mean_force_and_no_spread():
     assert result.chi2_per_bin is None and result.deviation is None
     assert result.rms_log_error is not None
     assert any("neither segments nor sigma" in notice for notice in result.notices)
+
+
+def test_a_start_that_is_left_behind_ends_sooner():
+    """Of four starts that gain evenly: the best; one near it; one far above and slow; one far above that comes nearer."""
+    gains = np.array([0.02, 0.02, 0.02, 0.2])
+
+    def active(margin, steps):
+        none, cost = np.zeros(4, dtype=int), np.array([10.0, 11.5, 30.0, 30.0])
+        now = _Standing(*[np.zeros((4, 1))] * 2, cost, none, none, none, none, none, none, np.ones(4, dtype=bool))
+        for _ in range(steps):
+            now = now.advanced(now.s, now.ahead, now.cost - gains, now.accepted + 1, margin)
+        return now.active.tolist()
+
+    assert active(2.0, 1) == [True] * 4  # it takes two small gains in a row
+    assert active(2.0, 2) == [True, True, False, True]
+    assert active(np.inf, 2) == [True] * 4

@@ -30,6 +30,7 @@ from ._result import FitResult
 
 FIRST_STEPS = 12
 MOST_RIVALS = 3
+MANY = 64  # starts, of which those that are left behind end sooner; of fewer every end is of interest
 RIVAL_MARGIN = 6.0
 POLISHES = 4
 STILL = 2e-3
@@ -200,7 +201,8 @@ def _descended(plan: Plan, points: np.ndarray, stages: list[Stage]) -> Known | N
     problem, max_steps = plan.problem, plan.max_steps
     objective = problem.linear()
     show = _stage(problem, stages, objective, "trying starts", (0.05, 0.5), max_steps)
-    first = least_squares(objective, points, max_steps, margin=AMBIGUOUS, report=show)
+    margin = AMBIGUOUS if len(points) >= MANY else np.inf
+    first = least_squares(objective, points, max_steps, margin=margin, report=show)
     first = _with_recombined(plan, objective, first)
     stages[:] = [Stage("trying starts", objective, first)]
     if not np.isfinite(first.cost[first.best]):
@@ -274,7 +276,7 @@ def _montecarlo(plan: Plan, points: np.ndarray, stages: list[Stage]) -> None:
     if problem.control:
         objective = problem.linear()
         show = _stage(problem, stages, objective, "trying starts", (0.05, 0.4), max_steps)
-        first = least_squares(objective, points, max_steps, margin=AMBIGUOUS, report=show)
+        first = least_squares(objective, points, max_steps, report=show)
     else:
         objective = problem.montecarlo(max(8, problem.seeds // 3))
         show = _stage(problem, stages, objective, "trying starts", (0.05, 0.4), FIRST_STEPS)

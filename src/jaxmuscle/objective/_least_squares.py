@@ -15,7 +15,7 @@ from ._consequences import Expansion, expand
 SMALL = 1e-3
 STILL = 1e-4
 REFUSALS = 10
-HOPELESS = 0.02  # of the way to where it would count, gained by a step: a start that needs fifty more such steps
+HOPELESS = 0.005  # of the way to where it would count, gained by a step: a start that needs two hundred more such steps
 ROWS = 128
 
 
