@@ -31,7 +31,7 @@ from ._posterior_result import Posterior, PosteriorPart
 
 ROWS = 256
 # Of a chain, unless a number is asked for: the next one as long as the chains have not mixed.
-DRAWS = 750, 1000, 1500, 2250, 3000
+DRAWS = 600, 800, 1100, 1600, 2300, 3000
 
 
 def posterior(
@@ -60,7 +60,7 @@ def posterior(
     chains that do not cross.
 
     **Arguments:** `result` of `fit` (prior, bounds and free parameters are the fit's unless given) and its `target`;
-    `key`, a `jax.random` key or a seed number; `chains`, `draws` of each (by default 750, and as long as the chains have
+    `key`, a `jax.random` key or a seed number; `chains`, `draws` of each (by default 600, and as long as the chains have
     not mixed up to 3000), `warmup` steps before; `free`, names;
     `priors` {name: sd, or (centre, sd)}; `bounds` {name: (low, high)}; `progress`, True or a function of (text, share).
 
