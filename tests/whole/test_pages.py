@@ -208,7 +208,7 @@ def test_own_data():
 def test_coming_from_elsewhere():
     pages.run("docs/coming-from-matlab.md")
     names = pages.run("docs/coming-from-diffrax.md")
-    assert names["many"].shape == (8, 101) and np.all(np.isfinite(names["solution"].ys))
+    assert names["many"].shape == (8, 1501) and np.all(np.isfinite(names["solution"].ys))
     assert set(names["slopes"]) == {"c_w", "noise_K_z"}
     assert names["better"]["c_w"] == pytest.approx(191.9, rel=0.01)  # Levenberg-Marquardt stops within 1e-2 of a coordinate
 
