@@ -1,6 +1,7 @@
 """Which noise: the right one wins where colours differ, none where they do not, and every number against another way."""
 
 import csv
+import dataclasses
 import functools
 import itertools
 import json
@@ -322,7 +323,8 @@ def test_six_and_the_same_sign_are_needed():
 
 
 def test_verdict_in_words():
-    said = made().verdict
+    found = made()
+    said = found.verdict
     assert said[0].startswith(
         "pink and ornstein-uhlenbeck cannot be told apart: AIC lower by 3.0, held-out score higher by 3.0"
     )
@@ -330,6 +332,9 @@ def test_verdict_in_words():
     assert said[2].startswith("a harmonic and no harmonic cannot be told apart") and said[2].endswith(
         "12.8 in AIC is needed"
     )
+    tremor = dataclasses.replace(found.best, noise="tremor", aic=-1e3, harmonic=False)
+    richer = dataclasses.replace(found, rows=(*found.rows, tremor)).verdict
+    assert richer[-1] == f"among the models without tremor, {said[2]}"
     assert "the two measures disagree, AIC lower by 8.0, held-out score lower by 8.0" in made(disagree=True).verdict[1]
     alone = made(sigma=True)
     assert alone.verdict[-1] == "the target states no segments: nothing was held out, the AIC decides alone"

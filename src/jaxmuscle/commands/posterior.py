@@ -51,7 +51,9 @@ def posterior(
     draws: Annotated[
         int | None,
         typer.Option(
-            min=100, max=10**9, help="How many draws each chain makes; if left out, 600, and up to 3000 until they mix."
+            min=100,
+            max=10**9,
+            help="How many draws each chain makes. If you leave it out: 600, or more (up to 3000) until they mix.",
         ),
     ] = None,
     warmup: Annotated[int, typer.Option(min=1, max=10**9, help="How many steps each chain makes before its draws.")] = 400,

@@ -48,7 +48,7 @@ class Decision(Printed, Result, eqx.Module):
 
     How much lower the AIC of `a` is (`aic_gain`), how much higher its held-out score (`score_gain`, `score_stderr`; None
     if nothing was held out). The two are told apart if the AIC differs by at least `needed` and the held-out score, if there
-    is one, says the same. `unsettled` names those whose search did not come to its end: they cannot be told apart.
+    is one, says the same. `unsettled` names those whose search did not come to its end: they are not compared.
     """
 
     a: str
@@ -217,10 +217,8 @@ class Comparison(Printed, Result, eqx.Module):
         first, *others = self.noises
         said = [str(self.between(first, other)) for other in others]
         if self.harmonic is not None:
-            instead = (
-                "" if any(row.harmonic for row in self.rows if row.noise == first) else "among the models without tremor, "
-            )
-            said.append(f"{instead}{self.harmonic}")
+            asked = any(row.harmonic for row in self.rows if row.noise == first)
+            said.append(str(self.harmonic) if asked else f"among the models without tremor, {self.harmonic}")
         if self.best.scores is None:
             said.append("the target states no segments: nothing was held out, the AIC decides alone")
         return tuple(said)

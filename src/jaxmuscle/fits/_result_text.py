@@ -10,8 +10,9 @@ from jaxmuscle._common.text import folded
 from jaxmuscle.data._target import Target
 from jaxmuscle.model._parameters import PARAMETERS
 from jaxmuscle.objective._arguments import base_of
-from jaxmuscle.objective._consequences import BANDS, MEANINGS, in_bands
+from jaxmuscle.objective._consequences import MEANINGS
 from jaxmuscle.objective._covariance import spelt
+from jaxmuscle.spectra._fluctuations import BANDS, in_bands
 
 from ._ladder import HEAD, gains
 from ._part import Estimate, FittedPart
@@ -69,11 +70,11 @@ def text_of(result: "FitResult") -> str:
     lines += [f"  {sentence}" for sentence in result.remarks]
     every, shown = result.as_shown(result.found), result.as_shown(result.determined)
     intervals = any(p.interval is not None for p in shown.values())
-    in_bands = {name: p for name, p in shown.items() if base_of(name) in BANDS}
-    rows = {name: p for name, p in shown.items() if name not in in_bands}
+    bands = {name: p for name, p in shown.items() if base_of(name) in BANDS}
+    rows = {name: p for name, p in shown.items() if name not in bands}
     title = "determined by the data" if result.adequate is not False else "would be determined if the model held"
     lines += _table(title + _per_newton(result, rows), rows, " 95 % interval    " * intervals)
-    lines += [f"  {sentence}" for sentence in _by_band(result, in_bands)]
+    lines += [f"  {sentence}" for sentence in _by_band(result, bands)]
     fixed = [name for name in result.products if name not in result.parameters]
     lines += [f"  products and ratios known roughly: {', '.join(map(spelt, fixed))}"] if fixed else []
     loose = {name: p for name, p in every.items() if name not in shown and p.free}
@@ -137,15 +138,14 @@ def _beside(name: str, table: Mapping[str, Estimate]) -> str:
 
 def _by_band(result: "FitResult", table: dict[str, Estimate]) -> list[str]:
     """The shares of power in bands, of fit and data, a sentence for each target."""
-    said: dict[str, list[str]] = {}
-    for name, p in table.items():
-        band, _, whose = name.partition("@")
-        target = (result.parts[whose] if whose else result.only).target
-        shares = in_bands(target.frequency, target.settings.resolution) @ target.proportional_power
-        measured = dict(zip(BANDS, shares, strict=True))[band]
-        shown = f"{BANDS[band][0]:g}-{BANDS[band][1]:g} Hz {100 * p.value:.2g} % ({100 * measured:.2g} %)"
-        said.setdefault(f" of {whose}" if whose else "", []).append(shown)
-    return [f"power by band{whose}, fitted (measured): {', '.join(each)}" for whose, each in said.items()]
+    sentences = []
+    for name, part in result.parts.items():
+        at, of = ("", "") if len(result.parts) == 1 else (f"@{name}", f" of {name}")
+        shares = in_bands(part.target.frequency, part.target.settings.resolution) @ part.target.proportional_power
+        each = [f"{low:g}-{high:g} Hz {100 * table[band + at].value:.2g} % ({100 * share:.2g} %)"
+                for (band, (low, high)), share in zip(BANDS.items(), shares, strict=True) if band + at in table]  # fmt: skip
+        sentences += [f"power by band{of}, fitted (measured): {', '.join(each)}"] * bool(each)
+    return sentences
 
 
 def _head(result: "FitResult") -> str:

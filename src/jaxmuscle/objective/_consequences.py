@@ -13,7 +13,7 @@ from jaxmuscle.model._parameters import PARAMETERS, USUALLY_FREE
 from jaxmuscle.model._resonant_noise import ResonantNoise
 from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.response._expected import Moments
-from jaxmuscle.spectra._fluctuations import BANDS, EDGES
+from jaxmuscle.spectra._fluctuations import BANDS, EDGES, in_bands
 
 from ._coordinates import Coordinates, task_at
 from ._moment_models import Linear
@@ -72,14 +72,6 @@ def derived_names(task: Any, spectrum: bool = True) -> tuple[str, ...]:
     # About a mean of zero, and where the response begins with f².
     missing |= {"coefficient_of_variation", "mean", "half_power_frequency"} if task.quantity == "acceleration" else set()
     return tuple(name for name in DERIVED if name not in missing)
-
-
-def in_bands(frequency: Any, resolution: float) -> Any:
-    """How much of each bin lies in each band, from 0 to 1: a bin holds what is up to half the resolution away from it."""
-    kind = np if isinstance(frequency, np.ndarray) else jnp
-    edges = np.array(EDGES, frequency.dtype)[:, None]
-    below = kind.clip((edges - frequency) / resolution + 0.5, 0.0, 1.0)
-    return below[1:] - below[:-1]
 
 
 def derived(task: Any, moments: Moments, frequency: Float[Array | np.ndarray, " bins"] | None = None) -> dict[str, Any]:

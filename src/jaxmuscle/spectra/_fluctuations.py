@@ -1,7 +1,9 @@
 """The fluctuations of a record: their variance by frequency, in bands, and how they grow with the length of a window."""
 
 import itertools
+from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 import scipy
 from jaxtyping import Array, Float, Real
@@ -11,6 +13,14 @@ from ._settings import require
 EDGES = (0.0, 0.5, 1.0, 2.0, 4.0, 8.0, 12.0)  # Hz
 BANDS = {f"band_{low:g}_{high:g}": (low, high) for low, high in itertools.pairwise(EDGES)}
 GROWTH, WINDOWS = 1.2, 10  # of one window over the last; how many of the largest
+
+
+def in_bands(frequency: Any, resolution: float) -> Any:
+    """How much of each bin lies in each band, from 0 to 1: a bin holds what is up to half the resolution away from it."""
+    kind = np if isinstance(frequency, np.ndarray) else jnp
+    edges = np.array(EDGES, frequency.dtype)[:, None]
+    below = kind.clip((edges - frequency) / resolution + 0.5, 0.0, 1.0)
+    return below[1:] - below[:-1]
 
 
 def one_record(signal: Real[Array | np.ndarray, "..."], fewest: int, words: str = "") -> Float[np.ndarray, " times"]:

@@ -165,11 +165,9 @@ def _sample(
                 density, recent = new, []
             else:
                 recent.append(white)
-            further = "" if count == draws[0] else "the chains have not mixed yet, "
-            text = (
-                "warming up the chains" if adapting else f"{further}drawing, block {number + 1 - blocks} of {total - blocks}"
-            )
-            tell(text, (number + 1) / total)
+            doing = "drawing" if count == draws[0] else "the chains have not mixed yet, drawing"
+            drawing = f"{doing}, block {number + 1 - blocks} of {total - blocks}"
+            tell("warming up the chains" if adapting else drawing, (number + 1) / total)
         done = total
         parts = [np.concatenate([part[i] for part in kept])[:count] for i in range(6)]
         s, height, acceptance, steps, diverging = (np.swapaxes(part, 0, 1) for part in parts[:5])

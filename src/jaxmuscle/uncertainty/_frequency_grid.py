@@ -60,8 +60,8 @@ def band_about(problem: FitProblem, peak: Maximum, name: str) -> Band:
         # A third of the time in single precision; 1e-5 in a log density moves no draw.
         precision = np.float64 if part.target.segments is None else np.float32
         level = np.asarray(table.level[:, part.chosen], precision)
-        seen = np.flatnonzero(2 * level[0].max(axis=0) > UNSEEN * np.asarray(table.passed))
-        level = level[..., : FILLED * (1 + int(seen[-1]) // FILLED)]
+        seen = 2 * level[0].max(axis=0, initial=0.0) > UNSEEN * np.asarray(table.passed)  # nowhere in a part without bins
+        level = level[..., : FILLED * (1 + int(np.max(np.flatnonzero(seen), initial=0)) // FILLED)]
         tables.append(jax.tree.map(np.asarray, table)._replace(level=level))
     return Band(frequency, _log_weight(problem, frequency, name), tuple(tables), name, tuple(acting))
 
