@@ -34,7 +34,7 @@ def run(store: str, reduce: bool, key: int, given: dict[str, Any]) -> None:
     """One process; its tally is kept after every chunk."""
     _run.KEEP_EVERY = _run.KEEP_SHARE = 0
     try:
-        jm.ensemble(jm.Isometric(), jax.random.key(key), store=store, reduce=reduce, **OPTIONS, **given)
+        jm.ensemble(jm.Isometric(), jax.random.key(key), store=store, reduce=reduce, **given)
     except jm.errors.StoreError as error:
         told = str(error)
         sys.exit(REFUSED if " is writing it" in told or "exists already" in told or "other settings" in told else told)
@@ -51,7 +51,7 @@ def begun(store: Path, reduce: bool, key: int = 5, **given: Any) -> Any:
     """The process that makes a store, or adds to it."""
     context: Any = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(["diffrax", "jaxmuscle.ensembles._ensemble"])  # so a process is a fork, without a device
-    process = context.Process(target=run, args=(str(store), reduce, key, given))
+    process = context.Process(target=run, args=(str(store), reduce, key, OPTIONS | given))
     process.start()
     return process
 

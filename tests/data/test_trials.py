@@ -336,7 +336,7 @@ def people(task, seeds, key):
 def strong():
     task = jm.at_force(jm.Isometric(), 40.5)
     found = people(task, 5, 11)
-    return found, jm.fit(jm.Isometric(), found, seeds=0, check_seeds=0, starts=16)
+    return found, jm.fit(jm.Isometric(), found, rungs=0, seeds=0, check_seeds=0, starts=16)
 
 
 @pytest.mark.slow
@@ -351,7 +351,7 @@ def test_a_fit_has_the_measured_mean(strong):
     target = jm.Trials(found).target()
     assert result.settings["carried"] == pytest.approx(result.task["m_w"] / jm.Isometric()["m_w"])
     assert "the muscle has the measured mean force" in " ".join(str(result).split())
-    without = jm.fit(jm.Isometric(), target, seeds=0, check_seeds=0, starts=16, mean_force=False)
+    without = jm.fit(jm.Isometric(), target, rungs=0, seeds=0, check_seeds=0, starts=16, mean_force=False)
     assert without.per_newton and "P_w" not in without.free
     # Another scale of force is the same spectrum: P_w is one more freedom, which a mean takes away again.
     assert result.chi2_per_bin == pytest.approx(without.chi2_per_bin, rel=0.05)

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from compiled import once
 
 import jaxmuscle as jm
 
@@ -44,12 +45,10 @@ def test_every_parameter_forward_reverse_and_by_differences(x64, name):
         return jnp.log(run.spectrum(window=(1.0, 4.0)).power)
 
     one = jnp.ones_like(scale)
-    forward = np.asarray(jax.jit(jax.jacfwd(log_power))(one))
-    reverse = np.asarray(jax.jit(jax.jacrev(log_power))(one))
+    forward = np.asarray(once(jax.jacfwd(log_power))(one))
+    reverse = np.asarray(once(jax.jacrev(log_power))(one))
     h = 1e-5  # truncation h² f''' / 6 and rounding 1e-15 / h
-    ahead, behind = jnp.split(
-        jax.jit(jax.vmap(log_power))(one + h * jnp.concatenate([np.eye(one.size), -np.eye(one.size)])), 2
-    )
+    ahead, behind = jnp.split(once(jax.vmap(log_power))(one + h * jnp.concatenate([np.eye(one.size), -np.eye(one.size)])), 2)
     differences = np.asarray(ahead - behind).T / (2 * h)
 
     assert forward.shape == (12, len(names)) and np.all(np.isfinite(forward))
