@@ -14,11 +14,12 @@ def quick(monkeypatch):
     monkeypatch.setattr(progress, "EVERY", 0.02)
 
 
-def test_a_function_is_called_as_it_is():
+def test_a_function_is_called_and_its_share_never_falls():
     seen = []
     with told(lambda *said: seen.append(said), "title") as tell:
         tell("text", 0.5)
-    assert seen == [("text", 0.5)]
+        tell("more than was expected", 0.25)
+    assert seen == [("text", 0.5), ("more than was expected", 0.5)]
     with told(False, "title") as tell:
         assert tell is nothing
 

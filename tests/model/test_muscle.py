@@ -27,6 +27,53 @@ class Tendon(jm.model.AbstractLaw):
         return self.stiff * jnp.exp(self.toe * q)
 
 
+class Own(jm.AbstractMuscle):
+    """A linear muscle without the method that only `PrescribedMotion` needs."""
+
+    m_w: Scalar = 0.5
+    m_z: Scalar = 0.4
+
+    def base(self):
+        return jnp.array([150.0, 150.0, 20.0, 10.0])
+
+    def active_force(self, x_w, v_w, u):
+        return (150.0 + u[0]) * x_w + (20.0 + u[2]) * v_w
+
+    def passive_force(self, x_w, v_w, x_z, v_z, u):
+        return (150.0 + u[1]) * (x_z - x_w) + (10.0 + u[3]) * (v_z - v_w)
+
+
+@pytest.mark.parametrize(
+    "method, wrong, message",
+    [
+        ("active_force", lambda self, x, v, u: jnp.stack([x, v]), r"force\(x_w, v_w, u\) returns float32 of shape \(2,\)"),
+        ("active_force", lambda self, x, v, u: None, "returns a NoneType; it must return one floating-point number"),
+        ("active_force", lambda self, x, v, u: x if x > 0 else v, r"decides .* by values.*jnp\.where"),
+        ("active_force", lambda self, x, v, u: np.sin(x), "with `if`, float\\(\\) or numpy"),
+        ("active_force", lambda self, x, v: x, r"cannot be computed: TypeError: .*calls it with one number for each"),
+        ("passive_force", lambda self, x, v, z, w, u: self.stifness * x, "AttributeError: 'Wrong' object has no .*stifness"),
+        ("base", lambda self: [150.0, 150.0, 20.0, 10.0], r"base\(\) returns a list; it must return an array of four"),
+        ("base", lambda self: jnp.ones(3), r"base\(\) returns float32 of shape \(3,\)"),
+        ("contraction_velocity", lambda self, x, z, w, F, u: w + (F - 150.0 * (z - x)) / 10.0, "is not the inverse of"),
+    ],
+)  # fmt: skip
+def test_a_muscle_of_ones_own_is_looked_at(method, wrong, message):
+    """And once found good it is taken; a class without the fourth method by every task but one."""
+    with pytest.raises(ValueError, match=message):
+        jm.Isometric(muscle=type("Wrong", (Own,), {method: wrong})())
+    assert jm.Isometric(muscle=Own()).muscle == Own() and jm.PrescribedForce(muscle=Own())["m_z"] == 0.4
+    with pytest.raises(ValueError, match="Own has no method contraction_velocity, which PrescribedMotion needs"):
+        jm.PrescribedMotion(muscle=Own())
+    assert jax.jit(lambda m: jm.Isometric(muscle=Own(m))["m_w"])(0.3) == pytest.approx(0.3)
+
+
+@pytest.mark.parametrize("name", ["P_w", "noise", "noise_K_w", "harmonic_frequency", "activation_time"])
+def test_a_field_of_an_own_muscle_hides_nothing(name):
+    named = type("Named", (Own,), {"__annotations__": {name: float}, name: 1.0})
+    with pytest.raises(ValueError, match=rf"Named\.{name}: a task has something of this name itself"):
+        jm.Isometric(muscle=named())
+
+
 def random_states(count=20):
     rng = np.random.default_rng(1)
     states = rng.normal(size=(count, 4)) * [0.03, 0.5, 0.03, 0.5]

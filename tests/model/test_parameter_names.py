@@ -136,3 +136,34 @@ def test_a_notebook_shows_a_table_and_escapes_what_files_said():
         html = shown._repr_html_()
         assert "<script" not in html and "&lt;script&gt;alert(1)&lt;/script&gt; &amp; co" in html and "<table>" in html
         assert repr(shown) == str(shown) and wild in str(shown)
+
+
+@pytest.mark.parametrize("several", [np.array([1e5, 2e5]), jnp.ones((1,))])
+def test_a_parameter_is_one_number(several):
+    with pytest.raises(ValueError, match=r"k_w has the shape \(.*,\): a parameter is one number.*Sweep\.grid\(task, k_w="):
+        jm.Isometric().replace(k_w=several)
+
+
+def test_spectra_sweeps_and_sensitivities_say_what_they_are():
+    """As text where they are printed; taken apart, or while JAX traces them, as their trees."""
+    spectrum = jm.expected_spectrum(jm.Isometric())
+    k = int(np.argmax(spectrum.power))
+    assert f"bin at {spectrum.frequency[k]:.3g} Hz, {100 * spectrum.proportional[k]:.3g} % of the power" in repr(spectrum)
+    assert "density [N^2/Hz]" in str(spectrum) and "30, 0.391 to 11.7 Hz" in str(spectrum)
+    assert "[(m/s^2)^2/Hz]" in str(jm.expected_spectrum(jm.PrescribedForce(observe="acceleration")))
+    several = jm.spectra.spectrum_of(np.random.default_rng(0).normal(size=(3, 1500)), jm.SpectrumSettings())
+    assert "spectra   3; below, their mean" in str(several) and "<table>" in several._repr_html_()
+    sweep = jm.Sweep.grid(jm.Isometric(), k_w=[4e5, 5e5], noise_K_w=[0.1, 0.2, 0.3])
+    assert str(sweep).splitlines()[0] == "sweep of Isometric: 6 points" and "0.1 to 0.3, 3 values" in str(sweep)
+    assert "k_w        4e+05 to 5e+05 N/m^3, 2 values" in str(sweep)
+    table = jm.sensitivity(jm.Isometric(), ("c_w", "harmonic_phase", "harmonic_frequency"))
+    lines, slopes = str(table).splitlines(), np.abs(table.proportional)
+    assert [line.split()[0] for line in lines[2:]] == [
+        "harmonic_frequency",
+        "c_w",
+        "harmonic_phase",
+    ]  # by size; no relative last
+    assert f"{slopes[0].max():.3g} % for 1 % more" in lines[3] and " % per rad, " in lines[4]
+    for shown in (spectrum, sweep):
+        assert repr(jax.tree.map(lambda _: None, shown)) and repr(eqx.partition(shown, eqx.is_array)[1])
+    assert "f32[2,30]" in repr(jax.vmap(lambda k: jm.expected_spectrum(jm.Isometric(k_w=k)))(jnp.array([4e5, 5e5])))

@@ -79,7 +79,8 @@ class Result(Shown):
 
 def facts(heading: str, rows: Sequence[tuple[str, str]]) -> Card:
     """A card of a heading and named facts, a line for each."""
-    return Card(folded([heading, *(f"  {name:<8}  {value}" for name, value in rows)]), heading, ("", ""), tuple(rows))
+    width = max([8, *(len(name) for name, _ in rows)])
+    return Card(folded([heading, *(f"  {name:<{width}}  {value}" for name, value in rows)]), heading, ("", ""), tuple(rows))
 
 
 def in_columns(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:

@@ -24,10 +24,11 @@ def nothing(text: str, share: float) -> None:
 def told(progress: bool | Tell, title: str) -> Iterator[Tell]:
     """What a function calls with (text, share): the one that was given, nothing for False, for True what shows it.
 
-    The bar of rich on a terminal and in a notebook; otherwise lines, also while nothing is told (a program compiles).
+    The bar of rich on a terminal and in a notebook; otherwise lines, also while nothing is told (a program compiles). The
+    share never falls: work that turns out to be more than expected makes it wait.
     """
     if callable(progress):
-        yield progress
+        yield _rising(progress)
     elif not progress or _quiet():
         yield nothing
     else:
@@ -35,7 +36,18 @@ def told(progress: bool | Tell, title: str) -> Iterator[Tell]:
 
         screen = Console(stderr=True)
         with (_bar if screen.is_terminal or screen.is_jupyter else _lines)(title, screen) as tell:
-            yield tell
+            yield _rising(tell)
+
+
+def _rising(tell: Tell) -> Tell:
+    most = 0.0
+
+    def rising(text: str, share: float) -> None:
+        nonlocal most
+        most = max(most, share)
+        tell(text, most)
+
+    return rising
 
 
 @contextlib.contextmanager

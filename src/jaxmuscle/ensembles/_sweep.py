@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxmuscle._common.arrays import as_arrays, as_numbers, checked
+from jaxmuscle._common.cards import Card, Shown, facts
 from jaxmuscle.model._parameters import PARAMETERS, proper_values
 from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.simulation._trajectory import Trajectory
@@ -18,7 +19,7 @@ if TYPE_CHECKING:
     import xarray
 
 
-class Sweep(eqx.Module):
+class Sweep(Shown, eqx.Module):
     """Tasks of one kind with different numbers, as an axis `point` of an ensemble.
 
     `Sweep.grid(task, k_w=[...], c_w=[...])` is every combination, the last name fastest; `Sweep.design(task, {name:
@@ -31,6 +32,13 @@ class Sweep(eqx.Module):
 
     task: AbstractTask
     labels: dict[str, Float[np.ndarray, " points"] | np.ndarray]
+
+    def _card(self) -> Card:
+        leaves = jax.tree.leaves(self.task)
+        if not leaves or not all(isinstance(leaf, np.ndarray) for leaf in leaves):
+            return Card(eqx.tree_pformat(self))  # a tree that JAX or Equinox took apart
+        count = f"{len(self)} point{'' if len(self) == 1 else 's'}"
+        return facts(f"sweep of {type(self.task).__name__}: {count}", _differing(self.labels))
 
     @staticmethod
     def of(tasks: Sequence[AbstractTask], names: Sequence[str] | None = None) -> "Sweep":
@@ -97,6 +105,17 @@ class Sweep(eqx.Module):
         return (self[i] for i in range(len(self)))
 
 
+def _differing(labels: Mapping[str, np.ndarray]) -> list[tuple[str, str]]:
+    """What differs between the points: how many values, from the smallest to the largest."""
+    rows = []
+    for name, values in labels.items():
+        known, unit = np.unique(values), PARAMETERS[name].unit if name in PARAMETERS else ""
+        first, last = (f"{end:.4g}" if values.dtype.kind == "f" else str(end) for end in (known[0], known[-1]))
+        ends = f"{first} to {last} {unit}" if len(known) > 1 else f"{first} {unit}"
+        rows.append((name, ends.removesuffix(" 1").strip() + (f", {len(known)} values" if len(known) > 1 else "")))
+    return rows
+
+
 def _shape(task: AbstractTask) -> Any:
     return jax.tree.structure(task), [np.shape(leaf) for leaf in jax.tree.leaves(task)]
 
@@ -105,11 +124,20 @@ def _parts(task: AbstractTask) -> str:
     return ", ".join(type(part).__name__ for part in (task, task.muscle, task.noise))
 
 
-class Population(eqx.Module):
+class Population(Shown, eqx.Module):
     """Ensembles of every point of `sweep`: `population[i]`, which is `members[i]`, is the `Trajectory` of point i."""
 
     sweep: Sweep
     members: tuple[Trajectory, ...]
+
+    def _card(self) -> Card:
+        if not isinstance(self.sweep, Sweep) or not all(isinstance(member, Trajectory) for member in self.members):
+            return Card(eqx.tree_pformat(self))
+        first = self.members[0]
+        known = [("task", type(first.task).__name__), ("time", f"0 to {first.time[-1]:g} s at {first.rate:g} Hz"),
+                 ("seeds", f"{np.size(first.seeds)} at every point"), *_differing(self.sweep.labels)]  # fmt: skip
+        return facts(f"{len(self)} ensembles of {first.task.output_name} [{first.task.output_unit}]: [i] is that of point i",
+                     known)  # fmt: skip
 
     def __len__(self) -> int:
         return len(self.members)

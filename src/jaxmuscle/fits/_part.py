@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Complex, Float
 
 from jaxmuscle._common.arrays import from_nulls, with_nulls
+from jaxmuscle._common.cards import Card, Shown
 from jaxmuscle._common.tables import frame
 from jaxmuscle._common.text import rounded
 from jaxmuscle.data._target import Target
@@ -29,7 +30,7 @@ def met(further: Mapping[str, float]) -> tuple[str, ...]:
     return tuple(name for name, off in further.items() if abs(off) <= MISSED)
 
 
-class Estimate(eqx.Module):
+class Estimate(Shown, eqx.Module):
     """A number, its `value` in `unit`, with its standard error; `stderr` is None where the data do not determine it.
 
     `free`, whether it was fitted; `identifiable`, whether the data determine it, None for what was fixed; `interval`,
@@ -42,6 +43,12 @@ class Estimate(eqx.Module):
     free: bool = True
     identifiable: bool | None = True
     interval: tuple[float | None, float | None] | None = None
+
+    def _card(self) -> Card:
+        unit = self.unit if self.unit != "1" else ""
+        known = [self.error_in_words()] if self.stderr is None else []
+        known += [f"95 % interval {self.interval_in_words()} {unit}".strip()] if self.interval_in_words() else []
+        return Card(f"{self.in_words()} {unit}".strip() + (f" ({'; '.join(known)})" if known else ""))
 
     def row(self) -> dict[str, Any]:
         """As columns of a table."""

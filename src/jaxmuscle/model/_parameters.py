@@ -118,7 +118,8 @@ PARAMETERS: dict[str, Parameter] = {
 }  # fmt: skip
 
 
-def _muscle_paths(muscle: Any) -> dict[str, tuple]:
+def muscle_paths(muscle: Any) -> dict[str, tuple]:
+    """Name of every number of a muscle, and where it stands in the task."""
     paths: dict[str, tuple] = {}
     for field, value in _dynamic_fields(muscle):
         if _is_scalar(value) and np.ndim(value) == 0:
@@ -138,7 +139,7 @@ def _dynamic_fields(module: Any) -> list[tuple[str, Any]]:
 
 def paths_of(task: Any) -> dict[str, tuple]:
     """Name and path of every parameter of a task: the muscle's, the noise's, the harmonic's and the input levels."""
-    paths = _muscle_paths(task.muscle)
+    paths = muscle_paths(task.muscle)
     paths |= _noise_paths(task.noise)
     if task.activation is not None:
         paths["activation_time"] = ("activation", "time")
@@ -260,6 +261,9 @@ def _with_values(task: Any, values: dict[str, Any]) -> Any:
         row = PARAMETERS.get(name)
         if isinstance(value, bool | str | None):
             raise ValueError(f"{name} = {value!r}: give a number")
+        if np.ndim(value) > 0:
+            raise ValueError(f"{name} has the shape {np.shape(value)}: a parameter is one number. For several tasks use "
+                             f"jaxmuscle.Sweep.grid(task, {name}=[...]), or jax.vmap")  # fmt: skip
         if row is not None:
             message = f"{name} = {value} {row.unit} is outside [{row.lower}, {row.upper}]: {row.meaning}"
             finite = np.isfinite(value) if is_concrete(value) else jax.numpy.isfinite(value)

@@ -17,7 +17,7 @@ from jaxmuscle._common.types import Scalar
 from jaxmuscle.spectra._settings import SpectrumSettings
 
 from ._activation import ACTIVE, Activation
-from ._muscle import AbstractMuscle, Muscle, Perturbation
+from ._muscle import AbstractMuscle, Muscle, Perturbation, check_own
 from ._noise import AbstractNoise, NoiseSum
 from ._noise_names import named_noise
 from ._parameters import (
@@ -239,6 +239,7 @@ def require_task(task: Any, example: str) -> None:
 def check_task(task: AbstractTask) -> None:
     if task.initial is not None and len(task.initial) != len(task.state_names):
         raise ValueError(f"initial has {len(task.initial)} entries, {type(task).__name__} needs {task.state_names}")
+    check_own(task.muscle)
     _check_noise(task)
 
 

@@ -67,6 +67,9 @@ class PrescribedMotion(AbstractTask):
         check_smooth(self, "x_z", 3)
         check_smooth(self, "F_ext", 1)
         check_smooth_envelope(self)
+        require(type(self.muscle).contraction_velocity is not AbstractMuscle.contraction_velocity,
+                f"{type(self.muscle).__name__} has no method contraction_velocity, which PrescribedMotion needs: write it "
+                "(see docs/own-muscle.md), or use another task")  # fmt: skip
         require(self.muscle.base()[3] > 0, "C_z0 = c_z v_ref_z^2 = 0: in PrescribedMotion x_w' divides by C_z, which "
                 "would vanish whenever the insertion rests; give c_z > 0 and v_ref_z > 0")  # fmt: skip
 

@@ -11,6 +11,7 @@ from jaxtyping import Float
 
 from jaxmuscle import plot
 from jaxmuscle._common.arrays import as_arrays
+from jaxmuscle._common.cards import Card, Shown, in_columns
 from jaxmuscle._common.programs import kept
 from jaxmuscle.model._parameters import PARAMETERS, proper_names, set_parameters, unknown_parameter
 from jaxmuscle.model._tasks import AbstractTask
@@ -23,7 +24,7 @@ if TYPE_CHECKING:
     import xarray
 
 
-class Sensitivity(eqx.Module):
+class Sensitivity(Shown, eqx.Module):
     """`d ln p_k / d ln v_j` of proportional power p_k with respect to parameters v_j, shape (parameters, bins).
 
     Where a parameter is zero, or may be negative and so has no logarithm, it is `d ln p_k / d v_j`: see `relative`.
@@ -37,6 +38,17 @@ class Sensitivity(eqx.Module):
     frequency: Float[np.ndarray, " bins"]
     proportional: Float[np.ndarray, "parameters bins"]
     power: Float[np.ndarray, "parameters bins"]
+
+    def _card(self) -> Card:
+        """Of every parameter the bin that changes most, those with a relative change first."""
+        columns, rows, slopes = ("parameter", "value", "largest change of a bin's share of the power"), [], self.proportional
+        for i in np.lexsort((-np.abs(slopes).max(axis=1), ~np.asarray(self.relative))):
+            k, unit = int(np.argmax(np.abs(slopes[i]))), "" if self.units[i] == "1" else self.units[i]
+            change = f"{slopes[i, k]:+.3g} % for 1 % more" if self.relative[i] else f"{100 * slopes[i, k]:+.3g} % per {unit}"
+            found = f"{change}, at {self.frequency[k]:.3g} Hz" if np.abs(slopes[i, k]) > 1e-9 else "none"
+            rows.append((self.names[i], f"{self.values[i]:.4g} {unit}".strip(), found))
+        heading = "sensitivity of the expected spectrum, the most influential parameter first"
+        return Card("\n".join([heading, *in_columns(columns, rows)]), heading, columns, tuple(rows))
 
     def to_xarray(self) -> "xarray.Dataset":
         """The table with its labels: dimensions parameter, frequency."""

@@ -10,12 +10,14 @@ import scipy
 from jaxtyping import Array, Float, Real
 
 from jaxmuscle import plot
+from jaxmuscle._common.arrays import is_concrete
+from jaxmuscle._common.cards import Card, Shown, facts
 from jaxmuscle._common.programs import kept
 
 from ._settings import SpectrumSettings, require, tapers_of
 
 
-class Spectrum(eqx.Module):
+class Spectrum(Shown, eqx.Module):
     """A one-sided power spectral density on bins.
 
     `frequency` [Hz] has one value per bin; `power` [`unit`²/Hz] may have leading axes (seeds, trials). The
@@ -26,6 +28,22 @@ class Spectrum(eqx.Module):
     power: Float[Array | np.ndarray, "*batch bins"]
     settings: SpectrumSettings = eqx.field(static=True)
     unit: str = eqx.field(static=True, default="N")
+
+    def _card(self) -> Card:
+        known = (isinstance(x, jax.Array | np.ndarray) and is_concrete(x) for x in (self.frequency, self.power))
+        if not all(known) or self.frequency.ndim != 1:
+            return Card(eqx.tree_pformat(self))  # a tree that JAX or Equinox took apart
+        frequency, power, apart = np.asarray(self.frequency), np.asarray(self.power, float), self.settings.resolution
+        rows = [("bins", f"{frequency.size}, {frequency[0]:.3g} to {frequency[-1]:.3g} Hz, {apart:.3g} Hz apart")]
+        if power.ndim > 1:
+            rows.append(("spectra", f"{' x '.join(map(str, power.shape[:-1]))}; below, their mean"))
+            power = power.mean(axis=tuple(range(power.ndim - 1)))
+        largest, square = int(np.argmax(power)), f"({self.unit})^2" if "/" in self.unit else f"{self.unit}^2"
+        rows.append(("variance", f"{power.sum() * apart:.4g} {square} in these bins"))
+        rows.append(
+            ("largest", f"bin at {frequency[largest]:.3g} Hz, {100 * power[largest] / power.sum():.3g} % of the power")
+        )
+        return facts(f"power spectral density [{square}/Hz]", rows)
 
     @property
     def proportional(self) -> Float[Array, "*batch bins"]:
