@@ -96,6 +96,7 @@ def test_seeds_that_are_right(given):
     np.testing.assert_array_equal(list(seeds_of(given)), [0, 1, 2])
 
 
+@pytest.mark.slow
 def test_the_last_seed_is_one_of_its_own():
     np.testing.assert_array_equal(seeds_of([LAST, 0]), [LAST, 0])
     task = jm.Isometric(P_w=jm.model.Constant(5.0))

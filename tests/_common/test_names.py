@@ -52,6 +52,7 @@ def is_reserved(name):
     return PureWindowsPath(name).is_reserved() if found is None else found(name)
 
 
+@pytest.mark.slow
 @given(st.text(st.characters(exclude_categories=()), max_size=300))
 def test_any_name_stays_in_its_folder(name):
     made = file_name(name)

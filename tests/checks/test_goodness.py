@@ -212,6 +212,7 @@ def test_key_decides_and_figures_are_drawn():
     plt.close(figure)
 
 
+@pytest.mark.slow
 def test_goodness_refuses():
     result = perfect()
     with pytest.raises(ValueError, match="at least 19"):

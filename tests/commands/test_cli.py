@@ -346,6 +346,7 @@ def test_a_fit_writes_result_table_and_figure(fitted):
     assert (folder / "fit.png").read_bytes().startswith(b"\x89PNG")
 
 
+@pytest.mark.slow
 def test_a_fit_prints_what_it_found(fitted):
     outcome, folder = fitted
     for part in ("c_w", "noise_K_w", "corner_frequency", "chi2 per bin", "converged: ", f"{folder}/fit.json"):
@@ -477,6 +478,7 @@ def test_several_targets_have_a_folder_each(tmp_path, monkeypatch):
     assert not jm.load_result(tmp_path / "out" / "b" / "fit.json").success
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("result", "code", "word"),
     [
@@ -497,6 +499,7 @@ def test_the_exit_code_says_whether_it_converged(result, code, word, tmp_path, m
     assert len(read_columns(tmp_path / "spectrum.csv")["fitted"]) == 30
 
 
+@pytest.mark.slow
 def test_options_reach_the_fit(tmp_path, monkeypatch):
     seen = {}
 
@@ -554,6 +557,7 @@ def strict(text):
     return json.loads(text, parse_constant=lambda word: pytest.fail(f"{word} is not JSON"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", ENDS)
 def test_exit_codes_and_json(case, tmp_path, monkeypatch):
     fake, code, there = ENDS[case]
@@ -591,6 +595,7 @@ def test_listings_as_json():
 GROUPS = {"a": "old", "b": "young"}
 
 
+@pytest.mark.slow
 def test_a_cohort_as_json(tmp_path, monkeypatch):
     results = {"a": made_result(), "b": failed_result()}
     monkeypatch.setattr(jm, "fit_cohort", lambda *_, **__: jm.fits.CohortResult(results, GROUPS, {"c": "no file"}))
@@ -707,6 +712,7 @@ def test_the_spectrum_of_a_fit_is_compared(success, tmp_path, monkeypatch):
     assert refused.exit_code == 2 and "--segments: the spectrum of a fit states this already" in refused.stderr
 
 
+@pytest.mark.slow
 def test_a_fit_is_replaced(tmp_path, monkeypatch):
     for seed, force in ((1, ()), (2, ("--force",))):
         monkeypatch.setattr(jm, "fit", lambda *_, seed=seed, **__: made_result(seed=seed))
@@ -821,6 +827,7 @@ def test_the_console_script_is_the_command():
     assert wrong.returncode == 2 and "tragets" in wrong.stderr
 
 
+@pytest.mark.slow
 def test_steadiness_of_trials(tmp_path):
     """The last one is too short."""
     rng, files = np.random.default_rng(0), []

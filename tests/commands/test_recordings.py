@@ -48,6 +48,7 @@ def paths(folder, count=5):
     return [folder / f"trial{number}.csv" for number in range(count)]
 
 
+@pytest.mark.slow
 def test_trials_are_analysed_together(folder, tmp_path):
     found = run("analyse", *paths(folder), "--out", tmp_path, "--save-target", tmp_path / "anna.toml", "--mvc", 300)
     assert found.exit_code == 0, found.output
@@ -62,6 +63,7 @@ def test_trials_are_analysed_together(folder, tmp_path):
     assert "differ" in found.output and "times as much as their segments explain" in " ".join(found.output.split())
 
 
+@pytest.mark.slow
 def test_a_column_for_each_trial(folder, tmp_path):
     found = run("analyse", folder / "all.csv", "--column", "all", "--out", tmp_path, "--json")
     assert found.exit_code == 0, found.output

@@ -164,6 +164,7 @@ def test_in_the_middle_of_an_ensemble(tmp_path):
     assert attributes is not None and not attributes["complete"]
 
 
+@pytest.mark.slow
 def test_an_interrupted_reduction_keeps_every_chunk(tmp_path):
     """And not what the last copy on disk had, ten seconds before."""
     chunks = []

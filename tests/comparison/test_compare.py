@@ -209,6 +209,7 @@ def test_a_bin_that_was_left_out_against_a_fit_by_scipy(x64):
     assert score == pytest.approx(marginal(more, power) - marginal(bins, power), abs=0.05)
 
 
+@pytest.mark.slow
 def test_every_bin_is_left_out_once_and_put_back_alone():
     target = target_of(true_task("pink"))
     folds = Folds.of([target, target], GROUPS)
@@ -454,6 +455,7 @@ def keep_cache():
     jax.config.update("jax_compilation_cache_dir", before)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("success", [True, False])
 def test_the_command_writes_its_files(success, tmp_path, monkeypatch, keep_cache):
     asked = {}

@@ -371,6 +371,7 @@ BAD_PROJECTS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", BAD_PROJECTS)
 def test_bad_projects(case, linear, tmp_path):
     make, options, message = BAD_PROJECTS[case]

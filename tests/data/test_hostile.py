@@ -37,6 +37,7 @@ def one_sentence(path, error):
 # --- any change
 
 
+@pytest.mark.slow
 @POSIX
 @pytest.mark.parametrize("name", hostile_files.WRITERS)
 def test_mutants_are_read_or_refused_in_one_sentence(name, tmp_path):
@@ -54,6 +55,7 @@ def test_mutants_are_read_or_refused_in_one_sentence(name, tmp_path):
         assert not words or one_sentence(path, words)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", hostile_files.TEXTS)
 def test_mutants_of_texts_are_read_or_refused_in_one_sentence(name, tmp_path):
     data, path, rng = hostile_files.TEXTS[name], tmp_path / "trial.txt", random.Random(4)
@@ -81,6 +83,7 @@ DOES = {
 }  # fmt: skip
 
 
+@pytest.mark.slow
 @POSIX
 @pytest.mark.parametrize("case", DOES)
 def test_what_a_library_does_is_one_sentence(case, tmp_path, monkeypatch):
@@ -206,6 +209,7 @@ BOMBS = {
 }
 
 
+@pytest.mark.slow
 @POSIX
 @pytest.mark.parametrize("name", BOMBS)
 def test_bombs(name, tmp_path, monkeypatch):

@@ -131,6 +131,7 @@ def test_no_plateau_is_said(case):
         Recording(NO_PLATEAU[case], 100, name=case).steady()
 
 
+@pytest.mark.slow
 def test_summary_against_its_sources():
     import antropy  # takes 7 s: not in every worker
 
@@ -224,6 +225,7 @@ def test_own_settings():
     assert recording.target(settings=settings).settings == settings
 
 
+@pytest.mark.slow
 def test_spectra_by_name():
     recording = Recording(noisy(rate=200), 200)
     for name in ("standard", "slow", "multitaper"):

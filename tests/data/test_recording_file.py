@@ -157,6 +157,7 @@ ARRAYS = [("npz", name) for name in ("force", "Data:0", "Data:-4")]
 ARRAYS += [("mat", name) for name in ("force", "Data:0", "Cell:0", "trial.force")]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("kind", "column"), ARRAYS)
 def test_arrays(kind, column, tmp_path):
     recording = load_recording(arrays(tmp_path, kind), column=column)
@@ -178,6 +179,7 @@ def test_npy(shape, tmp_path):
     np.testing.assert_array_equal(load_recording(tmp_path / "b.npy", axis="z", rate=100, units="m").whole, XYZ[:, 2])
 
 
+@pytest.mark.slow
 def test_mat_in_version_73(tmp_path):
     path = tmp_path / "trial.mat"
     with h5py.File(path, "w", userblock_size=512) as file:

@@ -297,6 +297,7 @@ def test_bad_tables(frame, message):
     assert message in str(caught.value)
 
 
+@pytest.mark.slow
 def test_xlsx(tmp_path):
     pytest.importorskip("openpyxl")
     frame = pandas.DataFrame({"Zeit": ["s", *TIME], "Kraft": ["N", *X]})

@@ -157,6 +157,7 @@ def test_three_trials_scatter_and_two_do_not(found):
         assert two[name].error_from == two.trials["trial 0"][name].error_from
 
 
+@pytest.mark.slow
 def test_the_interval_is_that_of_student(found):
     """With t the interval holds the expected value in 95 % of a thousand people with five trials, with 1.96 in 88 %."""
     low, high = found["mean"].interval

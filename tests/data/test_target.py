@@ -472,6 +472,7 @@ def test_valid_csv_loads_whatever_the_order(points, data, tmp_path_factory):
     assert load_target(path.with_suffix(".toml")) == target
 
 
+@pytest.mark.slow
 @given(points=POINTS)
 def test_sorted_csv_with_header_stays_between_its_points(points, tmp_path_factory):
     frequency, power = np.array(sorted(dict(points).items())).T

@@ -50,6 +50,7 @@ def test_absolute_spectra_are_averaged_with_their_segments():
     assert target.mean == pytest.approx([np.mean(r.filtered()) for r in both]) and target.unit == "N"
 
 
+@pytest.mark.slow
 def test_what_several_trials_say_is_said_once():
     """The steady parts in one notice; else with the names of those that say it, unless all do."""
     rng, rise = np.random.default_rng(7), LEVEL * np.linspace(0, 1, RATE)
@@ -122,6 +123,7 @@ def test_saved_and_read_back_equal(tmp_path):
     assert "5 trials" in str(again) or "10 + 10 + 10 + 10 + 10" in str(again)
 
 
+@pytest.mark.slow
 def test_mean_force_and_its_error():
     """Against the scatter of the means of 200 trials of a first-order process, whose means scatter as `√(S(0) / 2T)`."""
     rng = np.random.default_rng(4)

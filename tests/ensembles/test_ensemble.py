@@ -122,6 +122,7 @@ def test_a_reduced_ensemble_has_the_moments_of_the_whole_one():
     assert ax.get_ylabel().endswith("(N)") and len(ax.collections) == 1
 
 
+@pytest.mark.slow
 def test_a_stored_summary_is_the_one_in_memory(tmp_path):
     options: Any = {"seeds": 4, "duration": 15.0, "reduce": True}
     found = jm.ensemble(TASK, KEY, **options)
@@ -152,6 +153,7 @@ def test_what_breaks_is_left_out_and_named():
     assert not runs.success and f"{len(broken)} seed(s) did not stay finite" in runs.message
 
 
+@pytest.mark.slow
 def test_where_nothing_is_left_nothing_is_said():
     limit = {"amplitude": 50.0, "relative": False}
     broken = Brittle(noise=jm.BandLimitedNoise(**limit), harmonic=jm.Harmonic(0.0))
@@ -473,6 +475,7 @@ class Slow:
         return self.simulate(chunk, found)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("threads", [1, 3])
 def test_threads_change_nothing(tmp_path, monkeypatch, threads):
     """To the last bit, in whatever order they end: in memory, reduced, stored, swept, with cells and in double precision."""
@@ -739,6 +742,7 @@ def test_the_command_writes_resumes_and_refuses(tmp_path):
     assert replaced.exit_code == 0 and xarray.open_zarr(path).attrs["task"] == "PrescribedMotion"
 
 
+@pytest.mark.slow
 def test_the_command_speaks_json(tmp_path):
     arguments = ["--seeds", "20", "--duration", "1", "--chunk", "8", "--reduce", "--json", "--out", str(tmp_path / "a")]
     done = RUNNER.invoke(app, ["ensemble", "zagrodny-slifkin", "--vary", "c_w=2,3", "--vary", "k_w=1e6,2e6", *arguments])

@@ -79,6 +79,7 @@ def test_a_part_does_not_depend_on_the_devices(monkeypatch):
 # Parts and their merging
 
 
+@pytest.mark.slow
 @KINDS
 def test_parts_in_any_order_are_one_run(anywhere, kept):
     given: Any = {"seeds": 45, "store": anywhere, **SHORT, **kept}
@@ -135,6 +136,7 @@ def test_parts_of_a_sweep(tmp_path, seeds):
     np.testing.assert_array_equal(merged.coords["k_w"], sweep.labels["k_w"])
 
 
+@pytest.mark.slow
 @KINDS
 def test_what_fails_in_a_part_is_named_by_it_and_in_the_end(tmp_path, kept):
     given: Any = {"seeds": 40, "store": tmp_path / "a.zarr", **SHORT, **kept}
@@ -289,6 +291,7 @@ def test_commands_that_begin_together(tmp_path):
 # The command
 
 
+@pytest.mark.slow
 def test_the_command_makes_a_part_and_merges(tmp_path):
     path = tmp_path / "a.zarr"
     arguments = [
@@ -370,6 +373,7 @@ def test_a_store_at_a_url_is_resumed_and_overwritten(tmp_path, monkeypatch, kept
     assert not (tmp_path / "a.zarr").exists()
 
 
+@pytest.mark.slow
 def test_parts_begin_together_at_a_url(tmp_path):
     """Several times: it depends on the moment."""
     for turn in range(5):

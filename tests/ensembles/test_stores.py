@@ -122,6 +122,7 @@ class Broken(Brittle):
         return jnp.where(jnp.abs(u[:1]) > 1e-6, jnp.inf, u[:1]) - y
 
 
+@pytest.mark.slow
 def test_a_chunk_of_nothing_but_nan_is_there(tmp_path):
     task = Broken(noise=jm.OrnsteinUhlenbeckNoise(1.0, 0.01, relative=False), harmonic=jm.Harmonic(0.0))
     found = jm.ensemble(task, KEY, seeds=10, store=tmp_path / "a.zarr", **SHORT)

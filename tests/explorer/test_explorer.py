@@ -42,6 +42,7 @@ def test_the_table_has_every_structure_and_is_of_this_code():
     assert of == set(TASKS)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", FRESH)
 def test_the_table_is_what_python_computes(name, x64):
     """By the program that `expected_spectrum` calls."""
@@ -52,6 +53,7 @@ def test_the_table_is_what_python_computes(name, x64):
         np.testing.assert_allclose(here["variance"], row["variance"], rtol=ROUNDING)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(shutil.which("node") is None, reason="needs node")
 def test_javascript_computes_the_table():
     worst = cases.by_javascript(STORED["cases"])

@@ -50,6 +50,7 @@ def with_band(share: float, frequency: float = 9.0, width: float = 2.0) -> np.nd
 # --- chi² and its distribution
 
 
+@pytest.mark.slow
 def test_without_harmonic_and_correlation_chi_squared_has_its_distribution(x64):
     """Gaussian log powers of known spread, three nearly flat priors: chi² with 30 - 1 - 3 degrees of freedom."""
     free = ("c_w", "noise_K_w", "noise_K_z")
@@ -85,6 +86,7 @@ def test_what_the_fitted_directions_take_up_is_removed():
     np.testing.assert_allclose(without_fitted(np.column_stack([jacobian, jacobian[:, 0]])), left, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_line_in_the_bins_is_that_of_a_sine(x64):
     """Mean over 16 phases of the Welch power of √2 sin, mean square 1, without the low-pass."""
     settings = jm.SpectrumSettings(filter_cutoff=None)

@@ -69,6 +69,7 @@ def part_of(problem, seeds=8):
 # --- the spectrum as one matrix
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "changes",
     [
@@ -166,6 +167,7 @@ def test_theta_counts_standard_deviations_of_the_prior(x64):
         np.testing.assert_allclose(values[name], expected, rtol=1e-14)
 
 
+@pytest.mark.slow
 @given(theta=st.lists(st.floats(-0.8, 0.8), min_size=5, max_size=5))
 def test_from_theta_is_the_reverse_of_theta(theta):
     with jax.enable_x64(True):
@@ -317,6 +319,7 @@ def test_descent_takes_the_problem_that_prepare_gives(x64):
     np.testing.assert_allclose(found.s, 2.0, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_residuals_and_their_slopes_are_exact_where_the_model_was_seen(x64):
     objective, s = Curved(), np.array([[0.4, -0.3], [1.2, 0.7]])
     seen = expand(objective, s)
@@ -387,6 +390,7 @@ def test_slopes_that_were_seen_are_those_of_the_whole(x64):
     np.testing.assert_allclose(forward, eqx.filter_jit(jax.jacfwd(whole))(s), rtol=1e-6, atol=6e-8)
 
 
+@pytest.mark.slow
 def test_the_extra_residuals_are_log_variation_and_mean(x64):
     (objective,) = _problem("log", EXTRA).parts
     moments = _moments()(jnp.zeros(3))
@@ -662,6 +666,7 @@ def quick_fit(**arguments):
     return jm.fit(jm.Isometric(), simple_target(), free=FEW, **QUICK, **arguments)
 
 
+@pytest.mark.slow
 def test_one_failing_start_does_not_stop_the_others(monkeypatch):
     made = _search.starting_points
 
@@ -677,6 +682,7 @@ def test_one_failing_start_does_not_stop_the_others(monkeypatch):
     assert result.starts[1].cost is not None
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_fit():
     first, again = quick_fit(), jm.fit(jm.Isometric(), simple_target(), free=FEW, key=jax.random.key(0), **QUICK)
     assert {n: p.value for n, p in again.parameters.items()} == {n: p.value for n, p in first.parameters.items()}
@@ -693,6 +699,7 @@ def test_a_fit_is_in_double_precision_whatever_the_callers():
     assert float(np.float32(value)) != value
 
 
+@pytest.mark.slow
 def test_progress_is_told_up_to_the_end():
     told = []
     jm.fit(jm.Isometric(), simple_target(), free=FEW, key=0, progress=lambda *a: told.append(a), **QUICK)
@@ -724,6 +731,7 @@ def test_an_interrupted_fit_holds_what_had_been_reached(stage):
     assert all(start.steps <= (2 if stage == "searching from" else 12) for start in result.starts)
 
 
+@pytest.mark.slow
 def test_the_answer_comes_before_the_checks_and_an_interruption_in_them_keeps_it():
     order, given = [], {"free": FEW, "key": 0, **QUICK}
 
@@ -750,6 +758,7 @@ def test_the_answer_comes_before_the_checks_and_an_interruption_in_them_keeps_it
     assert unchecked.parameters == quick.parameters and [a.notices for a in answers] == [unchecked.notices]
 
 
+@pytest.mark.slow
 def test_an_interruption_between_the_search_and_the_answer_keeps_what_the_search_found(monkeypatch):
     def interrupt(*_):
         raise KeyboardInterrupt
@@ -771,6 +780,7 @@ def test_an_interruption_before_the_first_step_has_no_result():
     assert not isinstance(caught.value, jm.fits.FitInterrupted)
 
 
+@pytest.mark.slow
 def test_a_start_in_the_stiff_region_survives(x64):
     """c_w / m_w = 4000/s."""
     result = jm.fit(jm.Isometric().replace(c_w=2000.0), simple_target(), free=FEW, **QUICK)
@@ -909,6 +919,7 @@ def test_a_frequency_that_the_spectrum_leaves_open_is_called_ambiguous(x64):
     assert moved == {"harmonic_frequency"} and "harmonic_frequency is ambiguous: 6.60 Hz fits almost as well" in said
 
 
+@pytest.mark.slow
 def test_two_equal_lines_make_the_frequency_ambiguous():
     """A target with the same hump at 4.3 and 8.6 Hz: whichever one the harmonic takes, the other fits as well."""
     f = jm.SpectrumSettings().frequency

@@ -92,6 +92,7 @@ def test_the_preset_shows_the_papers_two_maxima(paper_force):
     assert [peak.bin for peak in found.local_maxima] == [11]
 
 
+@pytest.mark.slow
 def test_single_seeds_of_the_preset_show_both_maxima_more_often_than_not(paper_force, capsys):
     p = np.asarray(paper_force.proportional)
     both = (p.argmax(1) == 0) & (p[:, 10] > p[:, 9]) & (p[:, 10] > p[:, 11])

@@ -101,6 +101,7 @@ def test_an_interval_ends_where_the_profile_does(task, segments, x64):
         np.testing.assert_allclose(at, 1.96, rtol=0.04, err_msg=name)
 
 
+@pytest.mark.slow
 def test_the_level_is_zero_at_the_half_power_frequency(x64):
     for task in (STEEP, BENT, SHELF, jm.on_rung(STEEP, 1)):
         system = linearise(task)
@@ -110,6 +111,7 @@ def test_the_level_is_zero_at_the_half_power_frequency(x64):
         assert half_power_level(task, system, found - 0.1) > 0 > half_power_level(task, system, found + 0.1)
 
 
+@pytest.mark.slow
 def test_the_frequency_jumps_where_the_level_does_not(x64):
     """A third more of the passive damping: four times the frequency, and below it at most a third more power."""
     systems = [linearise(task) for task in (BENT, SHELF)]

@@ -199,6 +199,7 @@ def joint_problem(**options: Any):
     return planned(targets, {"force": ISOMETRIC, "shift": load}, **options).problem
 
 
+@pytest.mark.slow
 def test_the_joint_problem_is_its_parts(x64):
     problem = joint_problem(separate=("c_w",), coefficient_of_variation=False)
     assert problem.coordinates.names == ("k_w", "k_z", "c_w@force", "c_z", "harmonic_amplitude", "harmonic_frequency",
@@ -324,6 +325,7 @@ def test_a_result_holds_everything(quick):
     assert any(notice.startswith("in linear response") for notice in quick.notices)
 
 
+@pytest.mark.slow
 def test_a_result_in_words(quick):
     text = str(quick)
     assert text.startswith("The model describes the data: chi2 per bin ")

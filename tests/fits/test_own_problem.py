@@ -48,6 +48,7 @@ def test_coordinates_and_parameters(problem):
     assert str(problem).startswith("problem of vastus-lateralis-26mvc") and "<table>" in problem._repr_html_()
 
 
+@pytest.mark.slow
 def test_the_prior_is_a_density_of_the_coordinates(problem):
     """`ln N(z) + ln |dz/dθ|` with z the distance from the prior's centre in its standard deviations, from the parameters."""
     theta = problem.theta({"k_w": 3e5, "harmonic_frequency": 7.0, "noise_K_z": 0.02})
@@ -80,6 +81,7 @@ def test_log_density_and_its_slope(problem):
     np.testing.assert_allclose(slope, differences, rtol=1e-4, atol=1e-5)  # second-order differences of a smooth function
 
 
+@pytest.mark.slow
 def test_the_log_density_has_second_derivatives():
     """Against differences of the slope, in a step so small that the ripple along the frequency does not show."""
     problem = jm.problem(TASK, TARGET, free=("c_w", "noise_K_w", "harmonic_frequency"))
@@ -106,6 +108,7 @@ def test_a_theta_of_another_shape_is_refused(problem):
     assert jax.vmap(problem.log_prior)(many).shape == (5,)
 
 
+@pytest.mark.slow
 def test_the_log_likelihood_is_that_of_the_task_but_for_the_variation():
     """A coefficient of variation scatters as at the start; without one the two are the same."""
     target = jm.Target("a", TARGET.proportional_power, segments=12)
@@ -117,6 +120,7 @@ def test_the_log_likelihood_is_that_of_the_task_but_for_the_variation():
     np.testing.assert_allclose(off, off[0], atol=1e-8)
 
 
+@pytest.mark.slow
 def test_scipy_finds_the_minimum_of_the_fit(problem, result):
     """In the two descents that a fit makes: what the harmonic holds of the bins is unknown first, then known.
 

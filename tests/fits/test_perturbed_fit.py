@@ -205,6 +205,7 @@ def test_a_published_response_with_a_spectrum_of_the_same_muscle(published):
         assert result[name].stderr < 1.02 * alone[name].stderr
 
 
+@pytest.mark.slow
 def test_likelihood_of_a_stiffness(published):
     """Its Gaussian law, written again; and the gradient, forward, reverse and by differences."""
     target = jm.Target("published", None, stiffness=published)

@@ -40,6 +40,7 @@ def test_a_minute_gives_its_corner_frequency(recording, tmp_path):
     assert not of_several({"one": result.only, "two": result.only})
 
 
+@pytest.mark.slow
 def test_segments_that_a_simulation_does_not_hold_are_refused(recording):
     target = recording.target(settings=jm.SpectrumSettings(length=2048, last_bin=240))
     with pytest.raises(ValueError, match="length=2048: a fit simulates 10 s, which is shorter than a segment"):

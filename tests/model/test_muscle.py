@@ -111,6 +111,7 @@ def test_isometric_is_the_same_muscle_with_its_insertion_held(x64):
         np.testing.assert_allclose(force, MUSCLE["m_z"] * pulled, rtol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("argument", ["literal", "elongation"])
 @pytest.mark.parametrize("c_z, v_ref_z", [(5.0, 1.0), (500.0, 0.1)])
 def test_contraction_velocity_inverts_passive_force(x64, argument, c_z, v_ref_z):

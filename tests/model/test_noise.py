@@ -56,6 +56,7 @@ def test_psd_scales_with_the_square_of_the_amplitude():
     np.testing.assert_allclose(rows, np.square([[0.1] * 2, [0.2] * 2, [0.0] * 2, [1.0] * 2]) / 100, rtol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("noise", [WHITE, BAND, OU], ids=["white", "band-limited", "ornstein-uhlenbeck"])
 def test_paths_have_the_density(x64, noise):
     dt, steps, chunk = 4e-3, 2048, 256
@@ -86,6 +87,7 @@ def covariances(x, lags):
     return np.stack([(x[:, : n - k] * x[:, k:]).mean(axis=(1, 2)) for k in lags], axis=1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dt", [8e-3, 2e-3])
 @pytest.mark.parametrize("noise", [BAND, OU], ids=["band-limited", "ornstein-uhlenbeck"])
 def test_the_autocovariance_is_exact_at_any_step(x64, noise, dt):
@@ -102,6 +104,7 @@ def test_the_autocovariance_is_exact_at_any_step(x64, noise, dt):
     assert np.abs(standard).max() < 4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("noise", [BAND, OU], ids=["band-limited", "ornstein-uhlenbeck"])
 def test_the_transition_is_the_exact_one(x64, noise):
     """The map from normals to the path, taken as a matrix: its Gram matrix must be the closed-form covariance."""
@@ -146,12 +149,14 @@ def test_white_increments_have_the_variance_of_their_step(x64):
         assert abs(neighbours) < 3.3 / np.sqrt(increments.size)
 
 
+@pytest.mark.slow
 def test_paths_are_stationary_from_the_start(x64):
     for noise, variance in ((BAND, band_variance(BAND)), (OU, 1.0)):
         first = np.asarray(unit_paths(noise, 2e-3, 1, seeds=4096).values)[:, 0] / np.sqrt(variance)
         assert abs(np.mean(first**2) - 1) < 3.3 * np.sqrt(2 / first.size)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", [jm.WhiteNoise, jm.BandLimitedNoise, jm.OrnsteinUhlenbeckNoise])
 def test_channels_are_independent_unless_shared(x64, kind):
     def path(noise):
@@ -238,6 +243,7 @@ def test_impossible_rates_and_grids_are_refused():
         jm.simulate(jm.Isometric(noise=jm.OrnsteinUhlenbeckNoise(correlation_time=0.01)), KEY, dt=0.01)
 
 
+@pytest.mark.slow
 def test_single_precision_paths_follow_double_ones():
     for kind, attribute in ((jm.BandLimitedNoise, "values"), (jm.BandLimitedNoise, "slopes"),
                             (jm.OrnsteinUhlenbeckNoise, "values"), (jm.WhiteNoise, "increments")):  # fmt: skip

@@ -85,6 +85,7 @@ def test_the_density_is_the_transform_of_the_autocovariance(x64):
     np.testing.assert_allclose(jm.PinkNoise(0.3).psd(2.0), 0.09 * jm.PinkNoise(1.0).psd(2.0), rtol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dt", [5e-3, 2.5e-3])
 def test_the_transition_is_the_exact_one(x64, dt):
     """The map from normals to the path, taken as a matrix: its Gram matrix is the autocovariance at any step."""

@@ -34,6 +34,7 @@ def equation(frequency, width):
     return np.array([[0.0, omega], [-omega, -2 * np.pi * width]]), np.array([[0.0], [np.sqrt(4 * np.pi * width)]])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", CASES)
 def test_density_and_filter_are_those_of_the_equation(x64, case):
     frequency, width = CASES[case]
@@ -56,6 +57,7 @@ def test_density_and_filter_are_those_of_the_equation(x64, case):
         np.testing.assert_allclose(noise.density(x), transform, rtol=1e-5, atol=1e-9)  # 30 e-folds; Simpson's (ω h)⁴
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("precision", ["float64", "float32"])
 @pytest.mark.parametrize("case", CASES)
 def test_a_step_is_the_exact_one(case, precision):
@@ -80,6 +82,7 @@ def test_a_step_is_the_exact_one(case, precision):
         np.testing.assert_allclose(stationary, np.eye(2), rtol=0, atol=rounding / -np.expm1(2 * decay * dt))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", CASES)
 def test_the_path_is_exact_on_the_grid(x64, case):
     """The map from normals to the path, taken as a matrix: its Gram matrix must be the closed-form covariance."""
@@ -91,6 +94,7 @@ def test_the_path_is_exact_on_the_grid(x64, case):
         np.testing.assert_allclose(matrix @ matrix.T, autocovariance(lag, *CASES[case]), rtol=1e-9, atol=1e-11)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("precision", ["float64", "float32"])
 @pytest.mark.parametrize("case", CASES)
 def test_paths_have_variance_covariances_and_spectrum(case, precision):
@@ -117,6 +121,7 @@ def test_paths_have_variance_covariances_and_spectrum(case, precision):
     references.assert_standard_normal(standard(power, expected), every=len(bins) if case == "narrow" else 1)
 
 
+@pytest.mark.slow
 def test_a_sum_is_its_parts(x64):
     band, tremor = jm.BandLimitedNoise({"K_w": 0.2}), jm.ResonantNoise(0.03)
     both, f = band + tremor, np.array([1.0, 9.0])
@@ -137,6 +142,7 @@ def test_a_sum_is_its_parts(x64):
 FAST = jm.ResonantNoise(0.1, 90.0, 20.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "make, message",
     [

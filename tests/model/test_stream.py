@@ -80,6 +80,7 @@ def test_the_normal_of_a_word_is_the_inverse_of_the_distribution():
     assert np.all(np.diff(up) <= 8 * np.finfo(np.float32).eps * np.maximum(up[1:], 1)) and np.all(up >= 0)
 
 
+@pytest.mark.slow
 def test_normals_are_normal(normals):
     z = normals.ravel()
     assert scipy.stats.kstest(z, "norm").pvalue > P_LEAST
@@ -119,6 +120,7 @@ def test_channels_are_independent(normals):
     references.assert_standard_normal(together(pairs))
 
 
+@pytest.mark.slow
 def test_parts_of_a_sum_and_the_start_are_independent(normals):
     later = np.asarray(normals_of(streams(), STEPS, APART, 1), float)[..., 0]
     references.assert_standard_normal(together((channel, later) for channel in np.moveaxis(normals, -1, 0)))
@@ -134,6 +136,7 @@ def test_different_keys_make_different_noise(normals):
     references.assert_standard_normal(together([(normals.reshape(SEEDS, -1), other.reshape(SEEDS, -1))]))
 
 
+@pytest.mark.slow
 def test_every_bit_is_balanced_and_no_two_go_together(words):
     bits = 2.0 * ((words.ravel()[:, None] >> np.arange(32, dtype=np.uint32)) & 1) - 1
     references.assert_standard_normal(bits.sum(axis=0) / np.sqrt(len(bits)))
@@ -194,6 +197,7 @@ def test_words_are_those_of_the_formula(key):
         np.testing.assert_array_equal(found, exact)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("generator", ["hash", "threefry"])
 @pytest.mark.parametrize("increments", ["gaussian", "weak"])
 def test_a_number_depends_on_seed_step_and_place_alone(generator, increments):
@@ -220,6 +224,7 @@ def test_a_number_depends_on_seed_step_and_place_alone(generator, increments):
             np.testing.assert_allclose(single, [x[2, step - 7] for x in found[part]], rtol=1e-6, atol=1e-7)
 
 
+@pytest.mark.slow
 def test_both_precisions_have_the_same_numbers():
     for increments in ("gaussian", "weak"):
         made = []
@@ -258,6 +263,7 @@ def largest(ours, given):
     return np.max(np.abs(ours - given).max(axis=0) / np.abs(given).max(axis=0))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("double", [False, True], ids=["float32", "float64"])
 @pytest.mark.parametrize("noise, active", [pytest.param(n, a, id=k, marks=m) for k, (n, a, m) in NOISES.items()])
 def test_what_is_drawn_on_the_way_is_the_path_that_draw_and_realise_give(noise, active, double):
@@ -275,6 +281,7 @@ def test_what_is_drawn_on_the_way_is_the_path_that_draw_and_realise_give(noise, 
         assert largest(drawn[0], given[0]) < tolerance and largest(drawn[1], given[1]) < tolerance
 
 
+@pytest.mark.slow
 def test_simulate_draws_from_the_key_folded_with_the_seed(x64):
     found = jm.simulate(jm.PrescribedForce(noise=BAND), KEY, seed=4, duration=0.6, substeps=1)
     path = BAND.realise(BAND.draw(jax.random.fold_in(KEY, 4), 600), 1e-3)

@@ -117,6 +117,7 @@ def test_motion_needs_smooth_inputs():
     jm.PrescribedMotion(RampHold(0.01), Decay(5.0))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("t", [0.2, 0.8, 1.2, 5.0])
 def test_the_output_of_motion_is_equation_1a(x64, t):
     """P_w = m_w x_w'' + C_w x_w' + K_w x_w + m_z x_z'' + F_ext, x_w'' by differences of a NumPy x_w'(t, x_w, u)."""
@@ -187,6 +188,7 @@ def test_without_noise_everything_settles_at_the_roots_of_the_statics(x64, task,
     np.testing.assert_allclose(jm.response.equilibrium(task), states, rtol=1e-9, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_without_external_force_both_tissues_move_together(x64):
     task = references.quiet(jm.PrescribedForce(5.0), harmonic_amplitude=0.0)
     # k (x_ref² + x²) x = P

@@ -81,6 +81,7 @@ def test_gamma_level():
     np.testing.assert_allclose(slope, np.log(a) + 1 - digamma(a), rtol=1e-12, atol=2e-6)
 
 
+@pytest.mark.slow
 def test_slopes_by_hand_are_those_of_differences():
     """With a line that fills some bins, one beyond the share that still scatters, and bins that are left out."""
     target = jm.load_target("vastus-lateralis-26mvc")
@@ -108,6 +109,7 @@ def test_scale_of_the_model_does_not_count():
     assert heights[0] == pytest.approx(heights[1], rel=1e-12)
 
 
+@pytest.mark.slow
 def test_offset_is_the_likeliest():
     bins = jax.tree.map(jnp.asarray, measured_bins(jm.load_target("fdi-abduction-45mvc")))
     E, line = jnp.linspace(1.0, 0.01, 30), jnp.zeros(30)
@@ -138,6 +140,7 @@ SHAPES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shape", SHAPES)
 def test_score_and_information(shape):
     """At the truth the score has mean zero and the Fisher information as variance, over scipy's spectra of white noise."""
@@ -212,6 +215,7 @@ def test_a_recording_prefers_the_muscle_that_made_it():
     assert np.argmax(heights) == 1
 
 
+@pytest.mark.slow
 def test_what_has_no_likelihood():
     with pytest.raises(ValueError, match="does not state its segments"):
         jm.log_likelihood(jm.Isometric(), jm.Target("bare", np.linspace(2, 1, 30)))

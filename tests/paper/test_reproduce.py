@@ -322,6 +322,7 @@ def test_own_recordings_take_the_place_of_the_simulated_ones():
     assert max(found.rho_fft) < 0.3  # white noise: bins are ranked by chance
 
 
+@pytest.mark.slow
 def test_recordings_of_different_length_are_cut_to_the_shortest():
     found = experiment(given_recordings(_recordings((60.0, 45.0, 52.0))))
     assert {r.duration for r in found.recordings} == {45.0}

@@ -752,6 +752,7 @@ def refitted(names=("corner_frequency", "high_frequency_floor", "coefficient_of_
     return types.SimpleNamespace(target="vastus-lateralis-26mvc", quantities=each, replicates=51, failed={3: "no"})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "draw",
     [
@@ -779,6 +780,7 @@ def test_words_are_legible_in_a_column_of_a_journal_and_do_not_touch(draw):
     assert small_words(draw()) == ([], [], [])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("power", [1.0, 1e-6], ids=["fractions", "small"])
 @pytest.mark.parametrize("draw", [plot.spectrum, plot.target, plot.fit, plot.components])
 def test_no_number_of_a_logarithmic_axis_has_a_small_exponent(draw, power):

@@ -37,6 +37,7 @@ TASKS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", some_slow(TASKS, ["two resonances", "shared", "motion", "force"]))
 def test_the_variance_is_the_integral_of_the_density(x64, name):
     task = TASKS[name]
@@ -92,6 +93,7 @@ ANY = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ANY)
 def test_any_linear_system(x64, name):
     """`C (s - A)⁻¹ B + D + s E` of numbers at random, also where no muscle of this package has any: E of active inputs."""
@@ -215,6 +217,7 @@ def test_white_noise_counts_as_its_samples_in_the_second_order(x64, shared, acti
     np.testing.assert_allclose(added(white), added(band), rtol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("std", [0.8, 1.5])
 def test_negative_coefficients_behind_the_activation(std):
     """The activation smooths the noise of the active tissue, not that of the passive."""

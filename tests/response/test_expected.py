@@ -407,6 +407,7 @@ WHITE = np.eye(1, 2000)[0]
 RINGING = np.exp(-np.arange(2000) / 20) * np.cos(np.arange(2000) / 3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "changes",
     [
@@ -522,6 +523,7 @@ def test_single_precision(name):
     np.testing.assert_allclose(single, double, rtol=6e-8 * (280 + condition))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("samples, head", [(2, 1), (3, 1), (64, 1), (999, 1), (1000, 1), (1000, 20), (21, 20), (9, 20)])
 def test_lags_and_the_variance_of_a_mean_are_plain_sums(x64, samples, head):
     rng = np.random.default_rng(samples)
@@ -726,6 +728,7 @@ def test_what_has_no_linear_response(x64, name):
     assert has_response(jm.Isometric(), required=True)
 
 
+@pytest.mark.slow
 def test_without_an_equilibrium_under_a_transformation_it_is_not_finite(x64):
     @once
     def power(F_ext, k_w):
@@ -758,6 +761,7 @@ def test_a_harmonic_beyond_half_the_sampling_rate(x64):
     assert np.all(np.isfinite(jm.expected_spectrum(faster, Settings().replace(**changes)).power))
 
 
+@pytest.mark.slow
 def test_the_expected_spectrum_has_a_second_derivative(x64):
     """Against differences of the first; designs by gradient need it."""
     task = jm.Isometric()

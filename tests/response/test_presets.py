@@ -100,6 +100,7 @@ WRONG = {
 }  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", WRONG)
 def test_what_cannot_be_carried_is_refused(case, tmp_path):
     stated, message = WRONG[case]

@@ -131,6 +131,7 @@ def test_every_size_of_an_input_follows_and_its_times_stay():
 # --- size
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("task", TASKS.values(), ids=TASKS)
 def test_variation_falls_with_strength(x64, task):
     seen = np.array([variation(scaled(task, size)) for size in SIZES])

@@ -64,6 +64,7 @@ def test_nothing_is_said_where_simulation_and_linear_response_agree(task, x64):
         jm.expected_spectrum(task)
 
 
+@pytest.mark.slow
 def test_the_mean_of_a_squared_gaussian(x64):
     """A displacement that the stiffness K(x) = k (x_ref² + x²) answers: the mean shift against a simulation's."""
     task = jm.PrescribedForce(F_ext=3.0).replace(harmonic_amplitude=0.1)
@@ -109,6 +110,7 @@ def test_a_harmonic_makes_coefficients_negative_as_often_as_a_sine_is_below():
 # --- refused before
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", MOVING)
 def test_an_input_that_moves_in_the_window_is_refused(name):
     task = jm.Isometric(P_w=MOVING[name])
@@ -122,6 +124,7 @@ def test_an_input_that_moves_in_the_window_is_refused(name):
     assert np.all(np.isfinite(np.asarray(jm.expected_spectrum(jm.settled(task)).power)))
 
 
+@pytest.mark.slow
 def test_an_input_that_is_held_in_the_window_is_not():
     for signal in (5.0, jm.model.RampHold(5.0, start=0.5, ramp=4.0), jm.model.SmoothStep(5.0, start=3.0, rise=1.9)):
         held = jm.expected_spectrum(jm.Isometric(P_w=signal)).power
@@ -130,6 +133,7 @@ def test_an_input_that_is_held_in_the_window_is_not():
         jm.expected_spectrum(jm.Isometric(), window=(0.5, 10.5))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
 def test_a_spectrum_of_rounding_is_refused(dtype):
     """Without external force noise on K_z does not move Task 2; what is left is the arithmetic's."""

@@ -93,6 +93,7 @@ AT_PAPER_LEVEL = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", AT_PAPER_LEVEL)
 def test_at_the_papers_amplitudes_the_response_is_linear(x64, name):
     estimate = jm.ensemble(AT_PAPER_LEVEL[name], KEY, seeds=32, **TOGETHER).mean_spectrum()
@@ -164,6 +165,7 @@ def test_control_changes_no_trajectory_and_comes_in_chunks(x64):
     np.testing.assert_allclose(runs.mean_spectrum(control=False).power, plain.mean_spectrum().power, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_what_an_estimate_holds(x64):
     runs = jm.ensemble(jm.Isometric(), KEY, seeds=8, dt=2.5e-3, control=True)
     settings = jm.SpectrumSettings(first_bin=2, last_bin=20, detrend="linear")
@@ -207,6 +209,7 @@ def test_where_control_cannot_be(name):
         jm.ensemble(task, KEY, seeds=2, control=True, **options)
 
 
+@pytest.mark.slow
 def test_control_by_default_where_it_pays(x64):
     assert jm.ensemble(jm.Isometric(), KEY, seeds=2, dt=2.5e-3).linear is not None
     for task in (SLOW, UNDAMPED):

@@ -26,6 +26,7 @@ def test_single_precision_keeps_the_digits_of_the_fluctuations():
     np.testing.assert_allclose(rounded, scipy.signal.resample_poly(x, 1, 10, padtype="line"), atol=4 * 50.0 * 6e-8)
 
 
+@pytest.mark.slow
 def test_gradients_are_those_of_a_linear_map(x64):
     x = np.random.default_rng(1).normal(size=81)
     forward, reverse = (of(lambda x: decimated(x, 4))(x) for of in (jax.jacfwd, jax.jacrev))

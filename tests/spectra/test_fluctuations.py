@@ -33,6 +33,7 @@ def test_dfa_is_its_definition():
     assert dfa(x, largest=10) == pytest.approx(np.polyfit(np.log(sizes), np.log(left), 1)[0], rel=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", RECORDS)
 def test_dfa_is_that_of_antropy(name):
     import antropy  # takes 7 s: not in every worker

@@ -58,6 +58,7 @@ def slow_sample_entropy(x, m, tolerance):
     return np.log(b / a)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", RECORDS)
 @pytest.mark.parametrize("m, tolerance", [(1, 0.3), (2, 0.2), (3, 0.5)])
 def test_entropies_are_their_definitions(name, m, tolerance):
@@ -77,6 +78,7 @@ def test_entropies_are_those_of_antropy(name):
     assert sample_entropy(x) == pytest.approx(antropy.sample_entropy(x), abs=1e-10)
 
 
+@pytest.mark.slow
 def test_sample_entropy_of_white_noise():
     """Independent normal samples match with probability erf(r/2), so SampEn = -ln erf(r/2), for r in σ."""
     values = [sample_entropy(np.random.default_rng(seed).standard_normal(2000)) for seed in range(60)]
@@ -145,6 +147,7 @@ def test_variation_and_signal_to_noise(x64, dtype):
     np.testing.assert_allclose(ratio, mean / deviation, rtol=rtol)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("metric", [coefficient_of_variation, signal_to_noise])
 def test_derivatives_agree(x64, metric):
     signal = jnp.asarray(5 + RNG.standard_normal(20))

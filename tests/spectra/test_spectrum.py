@@ -145,6 +145,7 @@ def test_power_adds_up_to_the_variance(record, length):
         np.testing.assert_allclose(total, np.var(record), rtol=1e-9, atol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("direction", ["forward", "both"])
 def test_derivatives_agree(x64, direction):
     chosen = SpectrumSettings(length=64, last_bin=20, filter_direction=direction)
@@ -162,6 +163,7 @@ def test_derivatives_agree(x64, direction):
     np.testing.assert_allclose(forward, differences, rtol=1e-5, atol=1e-5 * np.max(np.abs(forward)))
 
 
+@pytest.mark.slow
 def test_jit_and_vmap_change_nothing(x64):
     chosen = SpectrumSettings()
     power = spectrum_of(FORCE, chosen).power
@@ -194,6 +196,7 @@ def test_degrees_of_freedom_of_the_design():
     assert SpectrumSettings(overlap=0.0).degrees_of_freedom(7) == pytest.approx(14, rel=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("window, overlap", [("hann", 0.5), ("hann", 0.75), ("hamming", 0.5), ("boxcar", 0.5)])
 def test_degrees_of_freedom_are_the_spread_of_white_noise(x64, window, overlap):
     chosen = SpectrumSettings(length=32, first_bin=3, last_bin=12, window=window, overlap=overlap, detrend="none")
@@ -284,6 +287,7 @@ def test_names():
         SpectrumSettings.named("slwo")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name, window", [("slow", ["hann"]), ("multitaper", scipy.signal.windows.dpss(1000, 2, 3))])
 def test_spectra_of_long_segments_are_scipys(x64, name, window):
     """Segments of 10 s, their straight line removed; NW = 2 and K = 3 for Slepian tapers, each as a window of its own."""
@@ -295,6 +299,7 @@ def test_spectra_of_long_segments_are_scipys(x64, name, window):
     np.testing.assert_allclose(chosen.frequency, np.arange(chosen.first_bin, 118) / 10)
 
 
+@pytest.mark.slow
 def test_a_drift_leaves_slow_spectra_alone(x64):
     """A straight line of any steepness: nothing of it is in a bin, where removing the mean alone leaves a lot."""
     noise = np.random.default_rng(5).standard_normal(3000)

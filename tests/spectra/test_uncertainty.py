@@ -85,6 +85,7 @@ def coloured(realisations, segments, corner, seed=1):
     return welch_powers(np.fft.irfft(np.fft.rfft(noise) * shape)[:, :samples], settings)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("corner", [np.inf, 0.9], ids=["white", "falling"])
 def test_statistics_are_those_of_measured_log_powers(corner):
     """Also of bin 1, which detrending and negative frequencies leave 0.8 times the degrees of freedom of the others.
@@ -105,6 +106,7 @@ def test_statistics_are_those_of_measured_log_powers(corner):
     assert statistics.known
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "tapers"), [("slow", ["hann"]), ("multitaper", scipy.signal.windows.dpss(1000, 2, 3))])
 def test_the_law_of_long_segments_is_that_of_coloured_noise(name, tapers):
     """Noise that falls from 0.9 Hz on, stationary from its first sample: spread of the bins, correlation of neighbours."""
@@ -141,6 +143,7 @@ def test_statistics_of_several_trials_add_their_degrees_of_freedom():
     np.testing.assert_allclose(three.correlation, one.correlation, atol=1e-15)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("overlap", [0.0, 0.5])
 def test_a_line_does_not_scatter(overlap):
     """A sine in white noise: a bin has 1 / (1 - share²) times the degrees of freedom."""

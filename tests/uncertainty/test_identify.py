@@ -458,6 +458,7 @@ def test_a_design_without_equilibrium_is_impossible_and_the_rest_goes_on():
     plt.close(figure)
 
 
+@pytest.mark.slow
 def test_a_target_with_a_sigma_only():
     power = np.asarray(jm.expected_spectrum(TRUTH).proportional)
     nu = jm.SpectrumSettings().degrees_of_freedom(SEGMENTS)

@@ -80,6 +80,7 @@ def information(lengthening):
     return np.einsum("ki,kj,k->ij", rows.conj(), rows, 1 / variance).real
 
 
+@pytest.mark.slow
 def test_the_information_is_that_of_the_closed_form(x64):
     lengthening = Lengthening.flat(1e-3, BAND, SECONDS)
     assert len(lengthening.frequency) == 295 and lengthening.rms == pytest.approx(1e-3, rel=1e-12)
@@ -152,6 +153,7 @@ def experiment(quantity):
         return Experiment.of(fitted(), quantity, Lengthening.flat(1e-3, BAND, SECONDS), None)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("quantity", [("K_w0",), ("C_z0",), ("K_w0", "K_z0", "C_w0", "C_z0")])
 def test_the_optimum_obeys_the_equivalence_theorem(quantity):
     """No direction towards any step of the density lowers the variance, and those that are used leave it as it is."""
@@ -183,6 +185,7 @@ def test_what_is_reported_is_of_the_motion():
     assert made.peak / made.rms < 2.0  # random phases: about 3.5
 
 
+@pytest.mark.slow
 def test_limits_are_kept():
     made = designed(quantity="K_z0", peak=1.2e-3, speed=8e-3, rate=1000.0)
     velocity = np.gradient(np.append(made.displacement, made.displacement[0]), 1e-3)
@@ -198,6 +201,7 @@ def test_an_even_design_is_the_flat_one():
     assert not made.moves and "nearly even" in str(made)
 
 
+@pytest.mark.slow
 def test_longer_records_tell_more_and_the_wanted_error_says_how_long():
     """A record of twice the length, designed as such, has the errors told for it; at the length needed they are as wanted.
 
@@ -223,6 +227,7 @@ def test_longer_records_tell_more_and_the_wanted_error_says_how_long():
         designed(error=-0.1)
 
 
+@pytest.mark.slow
 def test_the_same_key_the_same_motion():
     again = jm.design_input(fitted(), seconds=SECONDS, band=BAND, rate=50.0, key=jax.random.key(0))
     np.testing.assert_array_equal(again.displacement, designed().displacement)
@@ -301,6 +306,7 @@ def test_the_default_band_begins_where_the_page_advises():
     assert shell == f"{here[0]:g}:{here[1]:g}"
 
 
+@pytest.mark.slow
 def test_the_page(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     made = pages.run("docs/perturbed-design.md", {"result": fitted(), "jm": jm})["made"]

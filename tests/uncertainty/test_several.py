@@ -41,6 +41,7 @@ def alone(name, free=FREE):
     return jm.fit(TASKS[name], targets()[name], free=free, check_seeds=0, **QUICK)
 
 
+@pytest.mark.slow
 def test_a_joint_fit_of_one_target_is_the_fit_of_that():
     joint = jm.fit_joint({"low": targets()["low"]}, tasks={"low": TASKS["low"]}, free=FREE, **QUICK)
     for name in ("parameters", "derived", "correlation", "undetermined", "starts", "settings", "notices"):
@@ -49,6 +50,7 @@ def test_a_joint_fit_of_one_target_is_the_fit_of_that():
     assert jm.profile(joint, "c_w").intervals == jm.profile(alone("low"), "c_w").intervals
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("separate", [(), ("c_w", "harmonic_amplitude")], ids=["shared", "separate"])
 def test_a_fit_taken_up_again_is_at_the_same_point(x64, separate):
     joint = both(separate=separate)
@@ -61,6 +63,7 @@ def test_a_fit_taken_up_again_is_at_the_same_point(x64, separate):
     assert {n: float(c) for n, c in centre.items()} == joint.settings["prior_centre"]
 
 
+@pytest.mark.slow
 def test_proportional_parameters_are_taken_up_with_their_ratio(x64):
     names = ("k_w", "k_z", "c_w", "c_z", "noise_K_w", "noise_K_z", "noise_C_w", "noise_C_z", "harmonic_amplitude")
     tasks = {"low": jm.at_level(TRUTH, 0.15), "high": jm.at_level(TRUTH, 0.6)}
@@ -70,6 +73,7 @@ def test_proportional_parameters_are_taken_up_with_their_ratio(x64):
         np.testing.assert_allclose(part.coordinates.centre, [float(task[n]) for n in ("k_w", "c_w")], rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_the_likelihoods_of_the_targets_add_up(x64):
     joint = both()
     problem = reopened(joint)
@@ -81,6 +85,7 @@ def test_the_likelihoods_of_the_targets_add_up(x64):
     assert float(likelihood.marginal(moments)) == pytest.approx(sum(each), rel=1e-9)
 
 
+@pytest.mark.slow
 def test_information_adds_up(x64):
     """Of what is shared: at the same point, that of both is the sum of that of each."""
     joint = both()

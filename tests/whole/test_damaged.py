@@ -25,6 +25,7 @@ def test_valid_files_are_read_as_they_say(valid):
         assert damage.fault(of, of.text.encode(), path) == "", of.name
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_mutants_are_read_as_they_say_or_refused(name, valid):
     formats, folder = valid
@@ -34,6 +35,7 @@ def test_mutants_are_read_as_they_say_or_refused(name, valid):
     assert min(counts["read"], counts["refused"]) > COUNT / 50  # neither refuses all nor takes all
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["fit.json", "preset.toml"])
 def test_a_key_that_is_not_there_gets_no_default(name, valid):
     """Without any key that a file of its kind has, it is refused: but for what is no number of a preset's task."""

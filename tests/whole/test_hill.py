@@ -117,6 +117,7 @@ def test_force_length_passive_and_tendon_pass_through_what_is_published(x64):
     np.testing.assert_allclose(hill.tendon(hill.tendon_strain(force)), force, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_the_passive_curves_are_smooth(x64):
     h = 1e-5
     for curve in (hill.force_length, hill.passive_length, hill.tendon):
@@ -290,6 +291,7 @@ def test_simulation_is_the_solution_of_the_equations(x64, name, amplitude):
     assert np.all(errors[0] / errors[1] > 3.0)
 
 
+@pytest.mark.slow
 def test_prescribed_motion_is_the_inverse_problem(x64):
     task = TASKS["motion"](muscle=HillMuscle())
     p = {key: float(value) for key, value in task.parameters.items()}
@@ -393,6 +395,7 @@ def test_the_mean_of_simulations_is_the_linear_response(x64):
     references.assert_standard_normal(z, every=3)
 
 
+@pytest.mark.slow
 def test_the_spectrum_goes_by_its_rules(x64):
     task = hill.held_task()
     power = np.asarray(jm.expected_spectrum(task).power)
@@ -411,6 +414,7 @@ def test_the_spectrum_goes_by_its_rules(x64):
     np.testing.assert_allclose(jm.expected_spectrum(alone).power[1:12], 2 * (0.15 * K_w * x_w) ** 2 * density, rtol=0.01)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("time", [0.0, 0.05])
 def test_a_noisy_drive_multiplies_the_activation(x64, time):
     """By differences of the NumPy forces: F_act n drives m x'' + (C_w + c_T) x' + (K_w + K_z) x, felt through the tendon."""

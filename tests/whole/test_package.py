@@ -59,6 +59,7 @@ def installed(built, tmp_path_factory):
     return folder
 
 
+@pytest.mark.slow
 def test_wheel_holds_the_package_and_its_data_and_nothing_else(built):
     (wheel,) = built.glob("*.whl")
     names = set(zipfile.ZipFile(wheel).namelist())
@@ -92,6 +93,7 @@ def test_sdist_holds_what_users_and_packagers_need(built):
     assert not [name for name in names if re.match(r"(\.venv|out|site|\.test-out|\.git)(/|$)", name)]
 
 
+@pytest.mark.slow
 def test_the_installed_package_is_the_wheels_and_has_one_version(installed):
     program = """
 import importlib.metadata, json, sys, jaxmuscle as jm
@@ -104,6 +106,7 @@ print(json.dumps([sys.prefix, jm.__file__, version, jm.__version__, jm.list_targ
     assert rest == [jm.__version__, jm.__version__, list(jm.list_targets()), list(jm.list_presets())]
 
 
+@pytest.mark.slow
 def test_the_installed_command_fits_a_bundled_target(installed):
     command = installed / "clean" / "bin" / "jaxmuscle"
     assert run(command, "--version", cwd=installed).split() == ["jaxmuscle", jm.__version__]

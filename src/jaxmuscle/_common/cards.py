@@ -77,9 +77,8 @@ class Result(Shown):
         return self._card()
 
 
-def facts(heading: str, rows: Sequence[tuple[str, str]]) -> Card:
-    """A card of a heading and named facts, a line for each."""
-    width = max([8, *(len(name) for name, _ in rows)])
+def facts(heading: str, rows: Sequence[tuple[str, str]], width: int = 8) -> Card:
+    """A card of a heading and named facts, a line for each; names are filled up to `width`."""
     return Card(folded([heading, *(f"  {name:<{width}}  {value}" for name, value in rows)]), heading, ("", ""), tuple(rows))
 
 

@@ -38,7 +38,7 @@ class Sweep(Shown, eqx.Module):
         if not leaves or not all(isinstance(leaf, np.ndarray) for leaf in leaves):
             return Card(eqx.tree_pformat(self))  # a tree that JAX or Equinox took apart
         count = f"{len(self)} point{'' if len(self) == 1 else 's'}"
-        return facts(f"sweep of {type(self.task).__name__}: {count}", _differing(self.labels))
+        return _facts(f"sweep of {type(self.task).__name__}: {count}", _differing(self.labels))
 
     @staticmethod
     def of(tasks: Sequence[AbstractTask], names: Sequence[str] | None = None) -> "Sweep":
@@ -105,6 +105,11 @@ class Sweep(Shown, eqx.Module):
         return (self[i] for i in range(len(self)))
 
 
+def _facts(heading: str, rows: list[tuple[str, str]]) -> Card:
+    """Names of parameters may be long."""
+    return facts(heading, rows, max([8, *(len(name) for name, _ in rows)]))
+
+
 def _differing(labels: Mapping[str, np.ndarray]) -> list[tuple[str, str]]:
     """What differs between the points: how many values, from the smallest to the largest."""
     rows = []
@@ -136,8 +141,8 @@ class Population(Shown, eqx.Module):
         first = self.members[0]
         known = [("task", type(first.task).__name__), ("time", f"0 to {first.time[-1]:g} s at {first.rate:g} Hz"),
                  ("seeds", f"{np.size(first.seeds)} at every point"), *_differing(self.sweep.labels)]  # fmt: skip
-        return facts(f"{len(self)} ensembles of {first.task.output_name} [{first.task.output_unit}]: [i] is that of point i",
-                     known)  # fmt: skip
+        what = f"{first.task.output_name} [{first.task.output_unit}]"
+        return _facts(f"{len(self)} ensembles of {what}: [i] is that of point i", known)
 
     def __len__(self) -> int:
         return len(self.members)
