@@ -82,7 +82,6 @@ def refused():
     return count
 
 
-@pytest.mark.slow
 def test_wrong_arguments_are_sentences():
     """In a process without the checks of types that tests have."""
     done = subprocess.run([sys.executable, __file__], capture_output=True, text=True, check=True)

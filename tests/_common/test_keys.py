@@ -64,6 +64,7 @@ def public_calls(key):
     }  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("call", public_calls(0))
 @pytest.mark.parametrize("kind", ["negative", "fraction", "list"])
 def test_a_wrong_key_is_an_error_of_every_function(kind, call):

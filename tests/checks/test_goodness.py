@@ -238,6 +238,7 @@ def test_verdicts_of_known_refits():
     assert of(1.0, shift=0.3).bias == pytest.approx(0.3)
 
 
+@pytest.mark.slow
 def test_bootstrap_refuses():
     with pytest.raises(ValueError, match="at least 2"):
         jm.bootstrap(perfect(), replicates=1)

@@ -253,6 +253,7 @@ def test_a_moved_insertion_is_simulated(tmp_path):
 # --- listings
 
 
+@pytest.mark.slow
 def test_listings_and_help_do_not_wait_for_jax():
     code = """
 import sys
@@ -612,6 +613,7 @@ def test_a_cohort_as_json(tmp_path, monkeypatch):
     assert (tmp_path / "out" / "differences.csv").exists()
 
 
+@pytest.mark.slow
 def test_a_cohort_leaves_nothing_of_an_earlier_one(tmp_path, monkeypatch):
     """One without groups has no differences; what others wrote there stays."""
     for name in ("differences.csv", "mine.csv"):
@@ -645,6 +647,7 @@ OVERWRITES = {
 }  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("case", "file"), [(case, file) for case, (*_, files) in OVERWRITES.items() for file in files])
 def test_an_earlier_result_is_overwritten_by_force_only(case, file, tmp_path, monkeypatch):
     work, arguments, _ = OVERWRITES[case]
@@ -687,6 +690,7 @@ def made_comparison(target, *, success):
     return jm.comparison.Comparison(target, tuple(rows), {}, tasks, fitted, 12.0, 3, 0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("success", [True, False])
 def test_the_spectrum_of_a_fit_is_compared(success, tmp_path, monkeypatch):
     """`compare` takes a fit.json and says which search did not come to its end, in words and in the figure."""
@@ -819,6 +823,7 @@ def test_the_cache_is_the_users_without_environment(tmp_path, monkeypatch):
     assert keep_compiled_programs() == tmp_path / "jaxmuscle" / "jax"
 
 
+@pytest.mark.slow
 def test_the_console_script_is_the_command():
     script = Path(sys.executable).with_name("jaxmuscle")
     done = subprocess.run([script, "targets"], capture_output=True, text=True, env={**os.environ, "COLUMNS": "200"})

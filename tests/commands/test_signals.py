@@ -81,6 +81,7 @@ time.sleep(60)""", 143),
 }  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", ALONE)
 def test_without_a_command(case):
     text, code = ALONE[case]
@@ -106,6 +107,7 @@ with signals.heard():
     assert ended(begun(code), 130).strip() == "interrupted"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("module", ["typer", pytest.param("jax", marks=pytest.mark.slow)])
 def test_while_a_module_is_imported(module, tmp_path):
     """Of the command, and of what a fit needs."""

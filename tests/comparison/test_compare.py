@@ -234,6 +234,7 @@ def test_without_harmonic_its_power_is_zero(x64):
     assert len(Candidate.of(problem, harmonic=True).starts) >= 32
 
 
+@pytest.mark.slow
 def test_a_richer_model_is_also_sought_from_where_the_best_poorer_one_ended(x64):
     """From the prior's centre alone a muscle that rings at the tremor's frequency was missed by 100 in AIC."""
     task, on = jm.Isometric(), functools.partial(jm.on_rung, jm.Isometric())
@@ -287,6 +288,7 @@ def made(*, disagree=False, sigma=False, success=True, p=0.2):
     return jm.comparison.Comparison(target, rows, {"white": "WhiteNoise on K_z cannot"}, tasks, fitted, 12.8, GROUPS, 0)
 
 
+@pytest.mark.slow
 def test_differences_and_weights():
     found = made()
     by = {(row.noise, row.harmonic): row for row in found.rows}
@@ -423,6 +425,7 @@ def test_bad_arguments(case):
         jm.compare_noise(task(), jm.load_target(FORCE), **options)
 
 
+@pytest.mark.slow
 def test_a_target_has_to_say_how_much_it_scatters():
     target = jm.Target("mine", 1 / np.arange(1, 31))
     with pytest.raises(ValueError, match="mine: states neither segments nor sigma"):

@@ -250,6 +250,7 @@ def abroad(h5py, file, way, other):
         file.create_virtual_dataset("more", layout)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("way", ["external link", "external storage", "virtual dataset"])
 def test_hdf5_takes_nothing_from_other_files(way, tmp_path):
     h5py = pytest.importorskip("h5py")

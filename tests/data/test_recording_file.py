@@ -170,6 +170,7 @@ def test_stated_rate_gives_way(tmp_path):
     assert recording.rate == 500 and "rate 500 Hz as asked; the file states 1000 Hz" in recording.notices
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shape", [(-1,), (-1, 1), (1, -1)])
 def test_npy(shape, tmp_path):
     np.save(tmp_path / "a.npy", X.reshape(shape))
@@ -339,6 +340,7 @@ BAD_FILES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", BAD_FILES)
 def test_bad_files(case, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)

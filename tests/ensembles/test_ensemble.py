@@ -276,6 +276,7 @@ def test_a_store_of_a_sweep_has_points(tmp_path):
         np.testing.assert_array_equal(dataset.coords["k_w"], [4e5, 5e5, 6e5])
 
 
+@pytest.mark.slow
 def test_failed_seeds_are_marked_in_a_store(tmp_path):
     dataset = jm.ensemble(BRITTLE, KEY, seeds=40, store=tmp_path / "a", **SHORT)
     reduced = jm.ensemble(BRITTLE, KEY, seeds=40, reduce=True, store=tmp_path / "b", **SHORT)
@@ -300,6 +301,7 @@ def stopped_after(chunks):
     return tell
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("reduce", [False, True], ids=["trajectories", "reduced"])
 def test_an_interrupted_store_is_resumed(tmp_path, monkeypatch, reduce):
     monkeypatch.setattr(_ensemble_run, "KEEP_EVERY", 0.0)

@@ -47,6 +47,7 @@ def same_as_one_run(found, seeds, kept):
 # Who does what
 
 
+@pytest.mark.slow
 @hypothesis.given(st.integers(0, 500), st.integers(1, 40))
 def test_every_chunk_is_in_one_part(chunks, count):
     shares = [Part(number, count).chunks(chunks) for number in range(1, count + 1)]
@@ -150,6 +151,7 @@ def test_what_fails_in_a_part_is_named_by_it_and_in_the_end(tmp_path, kept):
     np.testing.assert_array_equal(whole.failed, failed)
 
 
+@pytest.mark.slow
 @KINDS
 def test_a_part_that_was_stopped_goes_on(anywhere, monkeypatch, kept):
     monkeypatch.setattr(_ensemble_run, "KEEP_EVERY", 0.0)
@@ -166,6 +168,7 @@ def test_a_part_that_was_stopped_goes_on(anywhere, monkeypatch, kept):
     same_as_one_run(jm.ensembles.merge(anywhere), 96, kept)
 
 
+@pytest.mark.slow
 @KINDS
 @pytest.mark.parametrize("change", [{}, {"seeds": 17}], ids=["same settings", "other settings"])
 def test_two_parts_begin_at_the_same_moment(anywhere, monkeypatch, kept, change):

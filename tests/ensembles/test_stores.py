@@ -58,6 +58,7 @@ def flipped(data, bit):
 # What is damaged is noticed
 
 
+@pytest.mark.slow
 @KINDS
 def test_a_hundred_flipped_bits_are_noticed(tmp_path, kept):
     """Of chunks, at random places: by the package, and by whoever reads the chunk through xarray."""
@@ -169,6 +170,7 @@ def test_a_damaged_store_is_mended_bit_by_bit(tmp_path, kept, parts, caplog):
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a.zarr"]
 
 
+@pytest.mark.slow
 def test_the_command_mends(tmp_path, capfd):
     import test_ensemble
 

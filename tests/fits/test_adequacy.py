@@ -191,6 +191,7 @@ def test_a_good_fit_is_called_so():
     assert result.verdict.startswith("describes the data: ")
 
 
+@pytest.mark.slow
 def test_nothing_is_judged_where_the_scatter_is_unknown():
     target = jm.Target("no spread", own_power())
     with jax.enable_x64(True):

@@ -177,6 +177,7 @@ def test_from_theta_is_the_reverse_of_theta(theta):
         np.testing.assert_allclose(again, theta, atol=1e-12)
 
 
+@pytest.mark.slow
 @given(s=st.lists(st.floats(-1e6, 1e6), min_size=5, max_size=5))
 def test_bounds_hold_wherever_the_coordinates_go(s):
     with jax.enable_x64(True):
@@ -411,6 +412,7 @@ def test_the_residuals_vanish_for_a_target_that_the_model_makes(x64):
         assert np.abs(shifted).max() > 0.1
 
 
+@pytest.mark.slow
 def test_linear_and_cumulative_residuals_are_in_standard_deviations(x64):
     """Of simulated spectra about their expectation, p_k and its running sum."""
     segments = 12
@@ -690,6 +692,7 @@ def test_the_same_seed_gives_the_same_fit():
     assert first.seed == 0 and again.seed is None
 
 
+@pytest.mark.slow
 def test_a_fit_is_in_double_precision_whatever_the_callers():
     assert not jax.config.jax_enable_x64
     result = quick_fit()
@@ -709,6 +712,7 @@ def test_progress_is_told_up_to_the_end():
         assert any(stage in text for text, _ in told)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stage", ["searching from", "correcting by"])
 def test_an_interrupted_fit_holds_what_had_been_reached(stage):
     count = 0
@@ -909,6 +913,7 @@ def test_other_minima_in_frequency_are_polished_too(x64):
     assert contenders(other, ended(other.coordinates, [400.0, 500.0], [2.0, 1.0]), 9.0) == [1]
 
 
+@pytest.mark.slow
 def test_a_frequency_that_the_spectrum_leaves_open_is_called_ambiguous(x64):
     problem = setup_of(jm.Isometric(), VASTUS, ("harmonic_frequency",))
     close = ended(problem.coordinates, [3.9, 6.6], [5.0, 5.0 + 0.9 * AMBIGUOUS])

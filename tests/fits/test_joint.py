@@ -219,6 +219,7 @@ def test_the_joint_problem_is_its_parts(x64):
     np.testing.assert_allclose(residuals, np.concatenate([*parts, theta[0]]))
 
 
+@pytest.mark.slow
 def test_slopes_of_the_joint_moments_are_those_of_differences(x64):
     objective = joint_problem(separate=("harmonic_frequency",)).linear()
     theta, step = np.full((1, 9), 0.1), 1e-5
@@ -336,6 +337,7 @@ def test_a_result_in_words(quick):
     assert max(map(len, text.splitlines())) <= 125
 
 
+@pytest.mark.slow
 def test_what_is_saved_is_read_back_equal(quick, tmp_path):
     path = tmp_path / "new" / "joint.json"
     quick.save(path)

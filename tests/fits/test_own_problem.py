@@ -31,6 +31,7 @@ def result():
     return jm.fit(TASK, TARGET, **ALONE)
 
 
+@pytest.mark.slow
 def test_coordinates_and_parameters(problem):
     start = problem.parameters(problem.start)
     assert tuple(start) == problem.names == jm.fits.Problem.of(problem.fit_problem).names
@@ -155,6 +156,7 @@ def test_a_target_without_scatter_has_residuals_but_no_density():
         bare.log_density(bare.start)
 
 
+@pytest.mark.slow
 def test_results_summarise_themselves(result):
     summary = result.summary()
     assert str(summary) == repr(summary) == str(result) == repr(result)

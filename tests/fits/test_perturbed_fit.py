@@ -127,6 +127,7 @@ def test_the_fitted_muscle_sees_what_it_was_fitted_to(minute, result):
     assert np.max(np.abs(off)) < 0.2
 
 
+@pytest.mark.slow
 def test_the_estimate_of_the_stiffness_is_not_biased(minute):
     """Seen with the true muscle, whatever window, the points scatter about the truth by what they state."""
     task = jm.PrescribedLength(harmonic=jm.Harmonic(amplitude=0.0)).replace(**TRUE)

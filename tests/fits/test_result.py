@@ -503,6 +503,7 @@ ENVELOPES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("envelope", ENVELOPES)
 @pytest.mark.parametrize("noise", NOISES)
 @pytest.mark.parametrize("kind", TASKS)

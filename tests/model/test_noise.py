@@ -140,6 +140,7 @@ def test_slopes_are_the_derivative_of_values(x64):
         np.testing.assert_allclose(rms, np.sqrt(np.sqrt(2) * omega * dt / 6), rtol=0.5 * omega * dt + 0.01)
 
 
+@pytest.mark.slow
 def test_white_increments_have_the_variance_of_their_step(x64):
     for dt in (1e-3, 2.5e-4):
         increments = np.asarray(unit_paths(WHITE, dt, 1000, seeds=64).increments)

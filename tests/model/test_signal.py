@@ -52,6 +52,7 @@ def test_the_slope_is_not_lost_at_a_joint(signal, precision):
         np.testing.assert_allclose(here, 0.5 * (before + after), atol=1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CASES)
 def test_derivatives_are_those_of_finite_differences(x64, name):
     signal, smooth, _ = CASES[name]
@@ -76,6 +77,7 @@ def test_a_step_is_the_incomplete_beta_function(x64):
     np.testing.assert_allclose(signal(t), references.smooth_step(t, 2.5), atol=1e-12)
 
 
+@pytest.mark.slow
 def test_ends_are_reached_and_held_exactly():
     for dtype in (np.float32, np.float64):
         with jax.enable_x64(dtype == np.float64):

@@ -65,6 +65,7 @@ def grid_of_words():
     return np.unique(np.concatenate([ends, spread]))
 
 
+@pytest.mark.slow
 def test_the_normal_of_a_word_is_the_inverse_of_the_distribution():
     halves = grid_of_words()
     tail = (halves + 0.5) * 2.0**-31
@@ -105,6 +106,7 @@ def together(pairs):
     return np.concatenate([np.ravel(each) for each in found])
 
 
+@pytest.mark.slow
 def test_neighbouring_seeds_are_independent(normals):
     flat = normals.reshape(SEEDS, -1)
     references.assert_standard_normal(together((flat[:-apart], flat[apart:]) for apart in (1, 2, 128)))
@@ -237,6 +239,7 @@ def test_both_precisions_have_the_same_numbers():
         np.testing.assert_array_equal(made[0].astype(float), made[1])
 
 
+@pytest.mark.slow
 def test_threefry_makes_other_numbers_of_the_same_law(normals):
     other = np.asarray(normals_of(streams(64, draws=Draws.of("threefry", "gaussian")), 512, 0, CHANNELS), float)
     assert scipy.stats.kstest(other.ravel(), "norm").pvalue > P_LEAST

@@ -92,6 +92,7 @@ def test_what_is_observed_is_saved(tmp_path):
         jm.load_preset(tmp_path / "wrong.toml")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("moved", [
     SmoothStep(-0.002, 1.0, 0.5), Sampled.through(np.linspace(0, 15, 31), 1e-3 * np.sin(np.arange(31.0))),
 ], ids=["step", "sampled"])  # fmt: skip

@@ -102,6 +102,7 @@ def test_slopes_by_hand_are_those_of_differences():
             assert float(slopes[which][i]) == pytest.approx(expected, rel=1e-5, abs=1e-6)
 
 
+@pytest.mark.slow
 def test_scale_of_the_model_does_not_count():
     bins = jax.tree.map(jnp.asarray, measured_bins(jm.load_target("vastus-lateralis-26mvc")))
     E, line = jnp.linspace(1.0, 0.01, 30), jnp.zeros(30).at[10].set(0.3)

@@ -213,6 +213,7 @@ def test_trajectory_of_a_displacement():
     assert ax.get_ylabel() == r"Acceleration $a_\mathrm{z}$ (m/s²)"
 
 
+@pytest.mark.slow
 def test_simulation_shows_run_window_and_spectra():
     runs = trajectories((3,))
     figure = plot.simulation(runs)
@@ -649,6 +650,7 @@ def test_a_study_has_one_key_that_lies_outside_all_spectra():
     assert [bool(ax.get_xlabel()) for ax in figure.axes] == [False, True, True]  # what stands lowest in its column
 
 
+@pytest.mark.slow
 def test_a_dollar_in_a_name_is_no_mathematics():
     groups = ["$x_1$ at rest", "b"]
     people = cohort_of(groups=groups, name="$p$")

@@ -154,6 +154,7 @@ class Multiplied(jm.AbstractMuscle):
         return v_z - (force - (250.0 + u[1]) * (x_z - x_w)) / (5.0 + u[3])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", [jm.Isometric, jm.PrescribedMotion])
 def test_a_drive_that_multiplies(x64, kind):
     """By hand: the drive's noise is a force `F (1 - (x/ℓ)²) n`; in Isometric it moves the mass, a motion asks P_w for it."""
@@ -184,6 +185,7 @@ def test_a_drive_that_multiplies(x64, kind):
 # --- all off, and beyond first order
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["drive", pytest.param("activation", marks=pytest.mark.slow)])
 def test_what_is_off_changes_no_spectrum(x64, name):
     task = TASKS[name]
@@ -210,6 +212,7 @@ def test_the_second_order_of_a_sum_of_one(x64, name):
     assert negative_coefficients(one) == negative_coefficients(task) == ()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shared, activation", [(True, None), pytest.param(False, TWITCH, marks=pytest.mark.slow)])
 def test_white_noise_counts_as_its_samples_in_the_second_order(x64, shared, activation):
     noises = [jm.WhiteNoise(BOTH, shared=shared), jm.BandLimitedNoise(BOTH, cutoff=50.0, shared=shared)]

@@ -312,6 +312,7 @@ def test_what_is_filtered_is_a_recording_of_a_signal_known_at_all_times(x64, mon
     assert np.max(instant.power / expected) > 1.04
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("f", [0.4, 3.0, 11.0, 60.0])
 def test_the_transfer_function_of_acceleration_is_that_of_displacement_twice_differentiated(x64, f):
     moved, felt = (jm.PrescribedForce(5.0, 1.0, observe=what) for what in ("displacement", "acceleration"))
@@ -346,6 +347,7 @@ def test_the_variance_is_that_of_so_many_samples(x64):
     np.testing.assert_array_equal(begun.power, short.power)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("phase", [0.0, np.pi / 2])
 def test_phase_of_a_slow_harmonic(x64, phase):
     """At 0.5 Hz the leakage from negative frequencies depends on the phase; a segment starts it anew."""
@@ -383,6 +385,7 @@ def test_line_is_the_spectrum_of_a_noise_free_simulation(x64, name):
     np.testing.assert_allclose(expected, power, rtol=6e-4 + LAG.get(name, 0.0), atol=1e-6 * power.max())
 
 
+@pytest.mark.slow
 def test_an_envelope_that_does_not_change_is_a_constant_one(x64):
     task = references.quiet(jm.Isometric(5.0, 0.003))
     still = task.with_parts(harmonic=jm.Harmonic(0.003, 4.25, 0.7, Constant(0.5)))
@@ -445,6 +448,7 @@ def test_covariance_operator_is_scipys_expectation(changes, covariance):
     np.testing.assert_allclose(passed - of_mean + lowered / n**2, variance, rtol=1e-8 if n > 200 else 1e-4)
 
 
+@pytest.mark.slow
 def test_settled_tasks_rest(x64):
     for kind, inputs in INPUTS.items():
         held = jm.settled(kind(*inputs))
@@ -509,6 +513,7 @@ def test_gradient_by_a_natural_name_under_jit_and_vmap(x64):
     np.testing.assert_allclose(slope, [(last_bin(k + h) - last_bin(k - h)) / (2 * h) for k in k_w], rtol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", some_slow(["isometric, band-limited", "force, band-limited"], ["force, band-limited"]))
 def test_single_precision(name):
     kind, noise, _ = CASES[name]

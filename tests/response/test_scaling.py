@@ -88,6 +88,7 @@ def test_one_and_seven_tenths_percent_at_the_steadiest_level_stay_within_what_pe
     assert 1.3 < at[0.95] < 5.0 and 1.3 < at[0.05] < 5.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("task", TASKS.values(), ids=TASKS)
 def test_the_reference_is_the_task_itself_and_steps_add_up(x64, task):
     assert_same(at_level(task, 0.4, reference=0.4), task)
@@ -105,6 +106,7 @@ def test_without_resting_stiffness_forces_follow_the_level_and_nothing_moves(x64
     assert ratio == pytest.approx(3.0 if task.output_unit == "N" else 1.0, rel=1e-9)
 
 
+@pytest.mark.slow
 def test_the_spectrum_keeps_its_maximum_at_every_level(x64):
     """[30]: the maximum of power is at the same frequency at every level, proportional power varies slightly."""
     spectra = [np.asarray(jm.expected_spectrum(at_level(jm.Isometric(), level)).proportional) for level in LEVELS[1:]]
@@ -121,6 +123,7 @@ def test_damping_keeps_the_corner_or_the_damping_ratio(x64):
         np.testing.assert_allclose(after[2:] / before[2:], (after[:2] / before[:2]) ** kept)
 
 
+@pytest.mark.slow
 def test_every_size_of_an_input_follows_and_its_times_stay():
     task = jm.Isometric(P_w=jm.model.RampHold(4.0, start=1.0, ramp=3.0, initial=2.0))
     moved = at_level(task, 0.6).P_w
@@ -173,6 +176,7 @@ def test_dynamic_similarity_is_exact_far_from_linear(x64):
     assert np.abs(here.state("x_w")).max() > 2 * float(small["x_ref_w"])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("task", TASKS.values(), ids=TASKS)
 def test_sizes_multiply(x64, task):
     assert_same(scaled(task, 1.0), task)

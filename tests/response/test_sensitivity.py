@@ -52,6 +52,7 @@ def test_the_table_has_its_labels():
     np.testing.assert_allclose(table["frequency"], TASK.settings.frequency)
 
 
+@pytest.mark.slow
 def test_the_heat_map_names_what_matters():
     ax = whole().plot()
     labels = [text.get_text() for text in ax.get_yticklabels()]

@@ -91,12 +91,14 @@ def test_a_users_muscle_is_seen_through_its_methods():
     plt.close("all")
 
 
+@pytest.mark.slow
 def test_every_field_has_a_unit_and_the_range_contains_the_operating_point():
     seen = static_characteristics(jm.load_preset("zagrodny-slifkin"))
     assert set(seen.units) == {field.name for field in dataclasses.fields(seen)}
     assert seen.displacement[-1] == pytest.approx(2 * seen.x_w)
 
 
+@pytest.mark.slow
 def test_the_figure_has_units_a_legend_and_the_callers_axes():
     seen = static_characteristics(jm.Isometric())
     figure, given = plt.subplots(1, 3)

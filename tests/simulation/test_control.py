@@ -102,6 +102,7 @@ def test_at_the_papers_amplitudes_the_response_is_linear(x64, name):
     assert np.median(estimate.variance_reduction) >= 10_000
 
 
+@pytest.mark.slow
 def test_at_human_amplitudes_most_of_the_variance_goes(x64):
     estimate = jm.ensemble(VASTUS, KEY, seeds=32, **TOGETHER).mean_spectrum()
     assert np.median(estimate.variance_reduction) >= 200
@@ -202,6 +203,7 @@ IMPOSSIBLE = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", IMPOSSIBLE)
 def test_where_control_cannot_be(name):
     task, options, message = IMPOSSIBLE[name]
@@ -222,6 +224,7 @@ def test_a_settled_task_has_no_transient_however_slow(x64):
     assert jm.ensemble(jm.settled(SLOW), KEY, seeds=2, dt=2.5e-3).linear is not None
 
 
+@pytest.mark.slow
 def test_without_what_a_controlled_mean_needs(x64):
     plain = jm.ensemble(jm.Isometric(), KEY, seeds=2, dt=2.5e-3, control=False)
     with pytest.raises(ValueError, match="control = True needs a trajectory simulated with control"):

@@ -66,6 +66,7 @@ def test_forward_reverse_and_differences_agree():
     np.testing.assert_allclose(between, forward, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_small_motion_is_answered_linearly():
     """The issue's bound: 1e-4 relative."""
     lines, motion = multisine(1e-6)

@@ -82,6 +82,7 @@ def test_half_the_step_gives_the_same_spectrum(x64, name):
     assert 4 / 3 * np.abs(coarse / fine - 1).max() < 0.3 * 0.03
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("activation", [jm.Activation(), pytest.param(None, marks=pytest.mark.slow)], ids=["slowed", "none"])
 def test_what_is_off_changes_no_path(x64, activation):
     task = jm.settled(jm.Isometric(5.0, 0.003, noise=jm.BandLimitedNoise(HUMAN), activation=activation))

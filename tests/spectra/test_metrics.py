@@ -69,6 +69,7 @@ def test_entropies_are_their_definitions(name, m, tolerance):
     assert sample_entropy(x, m, tolerance) == pytest.approx(expected, abs=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", RECORDS)
 def test_entropies_are_those_of_antropy(name):
     import antropy  # takes 7 s: not in every worker
@@ -160,6 +161,7 @@ def test_derivatives_agree(x64, metric):
     np.testing.assert_allclose(forward, differences, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_constant_and_centred_signals(x64):
     constant = jnp.full(8, 3.0)
     assert coefficient_of_variation(constant) == 0

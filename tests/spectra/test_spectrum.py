@@ -110,12 +110,14 @@ def test_the_window_is_cut_after_the_filter(x64):
     assert (spectrum.unit, spectrum.settings) == ("mm", chosen)
 
 
+@pytest.mark.slow
 def test_without_cutoff_nothing_is_filtered(x64):
     chosen = SpectrumSettings(filter_cutoff=None)
     # One is compiled as a whole, the other step by step: the same up to rounding.
     np.testing.assert_allclose(spectrum_of(FORCE, chosen).power, welch(FORCE, chosen), rtol=1e-14)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("window", ["hann", "boxcar"])
 @pytest.mark.parametrize("samples", [999, 1000])
 def test_periodogram_is_scipy(x64, window, samples):
@@ -178,6 +180,7 @@ def test_jit_and_vmap_change_nothing(x64):
     np.testing.assert_allclose(jitted, welch(FORCE, chosen), rtol=ROUNDING)
 
 
+@pytest.mark.slow
 def test_whole_numbers_are_samples_too(x64):
     counts = np.arange(300) % 7
     np.testing.assert_array_equal(welch(counts, SpectrumSettings()), welch(counts.astype(float), SpectrumSettings()))
@@ -227,6 +230,7 @@ def test_overlap_is_not_lost_to_rounding():
     assert SpectrumSettings(length=255, overlap=0.5).step == 128  # scipy: nperseg // 2 shared
 
 
+@pytest.mark.slow
 def test_pwelch_puts_the_mean_into_the_first_bin(x64):
     noise = 0.1 * np.random.default_rng(3).standard_normal(1000)
     matlab = Spectrum(SpectrumSettings().frequency, welch(10 + noise, SpectrumSettings.pwelch()), SpectrumSettings())

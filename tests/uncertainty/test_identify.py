@@ -107,6 +107,7 @@ def test_the_information_is_that_of_log_contrasts(x64):
     same_information(information_of(problem, seen_here(problem, theta)), proportional_information(TRUTH, (SEGMENTS,)))
 
 
+@pytest.mark.slow
 def test_a_coefficient_of_variation_adds_its_gradient(x64):
     result = fitted(coefficient_of_variation=0.015)
     problem, theta = setup_at(result)
@@ -333,6 +334,7 @@ def test_the_report_agrees_with_itself():
     assert gains == sorted(gains, reverse=True)
 
 
+@pytest.mark.slow
 def test_what_is_proportional_is_known_alike():
     for outlook in (report().present, *report().designs):
         for one, other in (("k_w", "K_w0"), ("c_z", "C_z0")):
@@ -371,6 +373,7 @@ def test_the_report_names_what_it_knows_and_the_fit_does_not():
     assert not other.open_in_fit and "not determined in the fit" not in str(other)
 
 
+@pytest.mark.slow
 def test_a_report_about_a_fit_that_misses_its_data_says_so_first():
     kept = fitted().adequacy
     missing = eqx.tree_at(lambda r: r.adequacy, fitted(), kept._replace(chi2=4 * kept.expected, p=1e-4),
@@ -406,6 +409,7 @@ def test_without_newtons_values_are_stated_per_newton_as_in_the_fit():
     assert rows["K_w0"][2] == "1/m" and "per newton of mean force" in " ".join(str(found).split())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("order", [1, -1])
 def test_of_designs_that_determine_as_much_the_one_with_smaller_errors_is_named(order):
     lengthenings = [jm.uncertainty.Lengthening.flat(1e-3, (0.5, 5.0), seconds) for seconds in (30.0, 240.0)]

@@ -170,6 +170,7 @@ def test_the_optimum_obeys_the_equivalence_theorem(quantity):
     assert here < criterion(made, made.even.power)
 
 
+@pytest.mark.slow
 def test_what_is_reported_is_of_the_motion():
     made = designed()
     spectrum = np.abs(np.fft.rfft(made.displacement)) / made.displacement.size
@@ -335,6 +336,7 @@ def test_the_figure():
         plt.close(figure)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("given", "message"),
     [

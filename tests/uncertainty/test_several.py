@@ -107,6 +107,7 @@ def test_information_adds_up(x64):
     assert "low: Isometric, P_w = 4 N; high: Isometric, P_w = 8 N" in found.present.task
 
 
+@pytest.mark.slow
 def test_a_design_names_the_target_that_it_is_like():
     design = jm.Design("longer", segments=100, target="high")
     assert "P_w = 8 N" in jm.identifiability(both(), designs=[design]).designs[0].task

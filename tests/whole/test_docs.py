@@ -189,6 +189,7 @@ def test_parameter_page_is_current():
     assert generate.FILES.read_text(encoding="utf-8") == generate.files_page(), "run `python docs/generate.py`"
 
 
+@pytest.mark.slow
 def test_the_picture_of_the_layers_is_current():
     architecture = module(ROOT / "docs" / "architecture.py")
     assert architecture.PICTURE.read_text(encoding="utf-8") == architecture.picture(), "run `python docs/architecture.py`"

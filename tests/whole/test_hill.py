@@ -92,6 +92,7 @@ def test_lengthening_rises_to_its_plateau(x64):
     np.testing.assert_allclose(f, numpy_velocity(v), rtol=1e-12, atol=1e-15)
 
 
+@pytest.mark.slow
 def test_force_velocity_is_smooth_at_rest(x64):
     f, h = lambda v: float(hill.force_velocity(jnp.asarray(v))), 1e-5
     slopes = [(f(0.0) - f(-h)) / h, (f(h) - f(0.0)) / h]
@@ -104,6 +105,7 @@ def test_force_velocity_is_smooth_at_rest(x64):
         assert jax.grad(jax.grad(hill.force_velocity))(v) == pytest.approx(40.0, rel=1e-8)
 
 
+@pytest.mark.slow
 def test_force_length_passive_and_tendon_pass_through_what_is_published(x64):
     np.testing.assert_allclose(hill.force_length(np.array([0.5, 1.0, 1.5])), np.exp([-0.25 / 0.45, 0, -0.25 / 0.45]))
     np.testing.assert_allclose(hill.passive_length(np.array([1.0, 1.6])), [0.0, 1.0], atol=1e-15)
@@ -145,6 +147,7 @@ def test_forces_are_the_equations(muscle):
         np.testing.assert_allclose(muscle.passive_force(y[0], v_w, y[2], y[3], u), 3.0 * y[1], rtol=1e-10, atol=1e-10)
 
 
+@pytest.mark.slow
 def test_at_rest_nothing_pulls_and_shortening_lowers_the_force(muscle):
     zero = jnp.zeros(())
     assert abs(muscle.active_force(zero, zero, STILL)) < 1e-14 * muscle.force_max
