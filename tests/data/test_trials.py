@@ -301,8 +301,8 @@ def test_a_recording_of_an_array():
 
 
 WRONG = {
-    "array": (np.ones(100), r"knows its rate: jaxmuscle.Recording\(samples, rate\)"),
-    "number": (3, "this is a int; give a Target"),
+    "array": (np.ones(100), r"shape \(100,\) .* give jaxmuscle.Recording\(samples, rate\)\. Powers"),
+    "number": (3, "this is of type int; give a Target"),
     "targets": (["fdi-abduction-45mvc", "vastus-lateralis-26mvc"], "several people are fitted by fit_cohort"),
     "none": ([], "give a Target"),
 }

@@ -78,12 +78,14 @@ def _check_options(options: Mapping[str, Any], known: tuple[str, ...], what: str
 
 
 def _remedy(given: Any) -> str:
-    what = f"target: this is a {type(given).__name__}; give"
+    what = f"target: this is of type {type(given).__name__}; give"
     usual = "a Target, the name of a bundled one, a Recording, a list of the recordings of one condition, or their paths"
     if hasattr(given, "columns") and hasattr(given, "index"):
         return f"{what} a recording made of it: jaxmuscle.Recording.from_dataframe(...)"
     if hasattr(given, "shape"):
-        return f"{what} a recording, which knows its rate: jaxmuscle.Recording(samples, rate)"
+        return (f"target: an array of shape {given.shape} does not say what it is. Samples of a force: give "
+                "jaxmuscle.Recording(samples, rate). Powers of a spectrum: give jaxmuscle.Target(name, power, "
+                "segments=...)")  # fmt: skip
     if isinstance(given, Sequence) and len(given) > 0:
         return ("target: a list holds the recordings of one condition, or their paths; spectra of several people are "
                 "fitted by fit_cohort, those of one person by fit_joint")  # fmt: skip

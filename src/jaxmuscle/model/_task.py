@@ -232,7 +232,7 @@ def require_task(task: Any, example: str) -> None:
     """Raise a `ValueError` for what is no task, where one is needed."""
     require(
         isinstance(task, AbstractTask),
-        f"task: a {type(task).__name__}; give a task first, as jaxmuscle.Isometric(): {example}",
+        f"task: this is of type {type(task).__name__}; give a task first, as jaxmuscle.Isometric(): {example}",
     )
 
 
