@@ -19,6 +19,7 @@ from jaxmuscle.fits._adequacy import Adequacy
 from jaxmuscle.fits._fit_file import FORMAT
 from jaxmuscle.fits._ladder import Rung
 from jaxmuscle.fits._part import Start
+from jaxmuscle.fits._report import may_be_elsewhere
 from jaxmuscle.fits._result_text import card_of
 from jaxmuscle.model._task_tables import task_from_table, task_to_table
 
@@ -683,3 +684,11 @@ def test_an_unknown_preset_names_the_nearest(monkeypatch):
 ])  # fmt: skip
 def test_the_ends_of_an_interval_can_be_told_apart(ends, words):
     assert Estimate(1.0, "N", 0.1, interval=ends).interval_in_words() == words
+
+
+@pytest.mark.parametrize(("share", "words"), [(0.0031, "0.3 %"), (0.35, "35 %"), (0.999, "100 %")])
+def test_a_harmonic_that_may_be_elsewhere_says_with_which_probability(share, words):
+    """A small one is not rounded to nothing, and the limit stands beside it."""
+    said = may_be_elsewhere(share)
+    assert f"a probability of {words} it is more than a bin" in said
+    assert said.endswith("no errors (none are stated above 0.1 %)" if share < 0.1 else "no errors")

@@ -62,6 +62,14 @@ TOGETHER = (
 )
 
 
+def may_be_elsewhere(share: float) -> str:
+    """Why a harmonic that is elsewhere with this probability has no errors; where it seems small, from where on."""
+    percent, limit = f"{100 * share:.{0 if share >= 0.1 else 1}f}", f" (none are stated above {100 * UNSETTLED:g} %)"
+    return ("the harmonic may have another frequency, or be too faint to be seen: with a probability of "
+            f"{percent} % it is more than a bin from the frequency shown. So it has no errors"
+            f"{limit if share < 0.1 else ''}")  # fmt: skip
+
+
 def report_fit(
     plan: Plan,
     stages: list[Stage],
@@ -122,8 +130,7 @@ def report_fit(
     share = elsewhere(ended)
     if share > UNSETTLED:
         moved |= {n for n in parameters | derived if base_of(n).startswith("harmonic_")}
-        other += (f"the harmonic may have another frequency, or be too faint to be seen: with a probability of "
-                  f"{100 * share:.0f} % it is more than a bin from the frequency shown. So it has no errors",)  # fmt: skip
+        other += (may_be_elsewhere(share),)
     moved |= too_curved(problem, derived, known)
     parameters, derived = (widened(without_errors(moved, table), ended.widening) for table in (parameters, derived))
     ends = ended.intervals([n for n, p in (parameters | derived).items() if p.stderr and (n in derived or n in c.names)])
