@@ -86,7 +86,7 @@ def _optimise_only_what_runs_often() -> None:
     programs.kept = kept
 
 
-MOST_MAPS = 25_000
+MOST_MAPS, MOST_MEMORY = 25_000, 3 * 2**30
 # Tracing makes objects by the million, few of them in circles: looking for these at Python's own pace takes a tenth of it.
 gc.set_threshold(5_000, 20, 10)
 
@@ -131,12 +131,21 @@ def _close_figures():
         sys.modules["matplotlib.pyplot"].close("all")
 
 
+def _is_full() -> bool:
+    """Whether this process has too many compiled programs: by their memory maps, or by the memory of the process."""
+    maps, pages = Path("/proc/self/maps"), Path("/proc/self/statm")
+    if not maps.exists():
+        return True
+    resident = int(pages.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+    return resident > MOST_MEMORY or len(maps.read_text().splitlines()) > MOST_MAPS
+
+
 @pytest.fixture(scope="module", autouse=True)
 def _forget_compiled_programs():
-    """Every compiled program takes memory maps, of which Linux allows a process 65530: thousands of tests use them up."""
+    """Every compiled program takes memory maps, of which Linux allows a process 65530: thousands of tests use them up. And
+    programs of one piece take few maps, but as much memory: 9 GiB in the end if all were kept."""
     yield
-    maps = Path("/proc/self/maps")
-    if not maps.exists() or len(maps.read_text().splitlines()) > MOST_MAPS:
+    if _is_full():
         from jaxmuscle._common.programs import forget
 
         forget()

@@ -75,6 +75,9 @@ def design(
         record(output / "design.json")
         out.print(plain(found), highlight=False, soft_wrap=True)
         out.print(f"Written: {output}/{', '.join(['motor.csv', 'design.json', *figures])}", highlight=False)
+        out.print("When you have recorded force and displacement with such a motion, fit both channels of the file: "
+                  "jaxmuscle fit RECORD.csv --task prescribed-length --out out/moved", highlight=False,
+                  soft_wrap=True)  # fmt: skip
 
 
 def _source(name: str) -> Any:
