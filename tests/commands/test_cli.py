@@ -895,7 +895,7 @@ def test_a_designed_motion(tmp_path):
     np.testing.assert_allclose(signal[:, 1], 1e3 * found.displacement, rtol=1e-6, atol=1e-9)
     assert (tmp_path / "out" / "design.png").stat().st_size > 10_000
     said = run("design", preset, *asked, "--out", tmp_path / "out", "--force").stdout
-    assert said.endswith("jaxmuscle fit RECORD.csv --task prescribed-length --out out/moved\n")
+    assert said.endswith("fit RECORD.csv --task prescribed-length --window 10:30 --out out/moved\n")
     for arguments, message in (
         (("--out", tmp_path / "out"), "motor.csv: is there already; overwrite it with --force"),
         (("--band", "5", "--out", tmp_path / "new"), "--band 5: give lowest and highest frequency in Hz, as --band 0.5:5"),

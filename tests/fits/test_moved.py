@@ -121,3 +121,13 @@ def test_a_file_of_both_channels_is_fitted_from_the_command_line_alone_and_with_
     titles = [ax.get_title(loc="left") for ax in figure.axes]
     assert {"pull: PrescribedLength", "hold: Isometric", "pull: dynamic stiffness"} <= set(titles)
     plt.close(figure)
+
+
+def test_a_hold_is_not_taken_for_a_moved_record(tmp_path):
+    """A displacement that was not found would else be an insertion at rest."""
+    np.savetxt(tmp_path / "hold.csv", np.random.default_rng(0).normal(5.0, 0.1, 3000), header="force_N", comments="")
+    options = ["--rate", "100", "--task", "prescribed-length", "--out", str(tmp_path / "out")]
+    said = CliRunner().invoke(app, ["fit", str(tmp_path / "hold.csv"), *options], env={"COLUMNS": "1000"})
+    assert said.exit_code == 2 and "hold.csv: no displacement was found beside the force" in said.stderr
+    assert "--force-column and --displacement; a hold is fitted with --task isometric" in said.stderr
+    assert not (tmp_path / "out").exists()

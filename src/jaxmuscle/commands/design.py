@@ -75,9 +75,10 @@ def design(
         record(output / "design.json")
         out.print(plain(found), highlight=False, soft_wrap=True)
         out.print(f"Written: {output}/{', '.join(['motor.csv', 'design.json', *figures])}", highlight=False)
-        out.print("When you have recorded force and displacement with such a motion, fit both channels of the file: "
-                  "jaxmuscle fit RECORD.csv --task prescribed-length --out out/moved", highlight=False,
-                  soft_wrap=True)  # fmt: skip
+        period = found.lengthening.seconds
+        out.print(f"Play the motion for {1.5 * period:g} s and record force and displacement. Then fit both channels of its "
+                  f"last period: jaxmuscle fit RECORD.csv --task prescribed-length --window {period / 2:g}:{1.5 * period:g} "
+                  "--out out/moved", highlight=False, soft_wrap=True)  # fmt: skip
 
 
 def _source(name: str) -> Any:

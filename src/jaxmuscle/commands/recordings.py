@@ -66,6 +66,10 @@ def read_recordings(
         return read_trials(paths, reading, window)
     tables = [table_of(path, reading) for path in paths]
     both = all(channels(table, reading) for table in tables)
+    if task == "prescribed-length" and not both:
+        raise ValueError(f"{paths[0]}: no displacement was found beside the force, and --task prescribed-length fits both: "
+                         "name the columns with --force-column and --displacement; a hold is fitted with --task "
+                         "isometric")  # fmt: skip
     return read_perturbed(tables, reading, window) if both else read_trials(tables, reading, window)
 
 

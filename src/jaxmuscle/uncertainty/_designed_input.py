@@ -153,11 +153,12 @@ class DesignedInput(Printed, Result, eqx.Module):
         )
         return folded([
             f"designed input: one record of {self.lengthening.seconds:g} s would tell {best}",
+            *self._vague(),
             *(f"  note: {notice}" for notice in self.notices),
             f"  a flat input of {1e3 * self.even.rms:.3g} mm rms: {flat}; with it the {variance} is {self.gain:.2g} times "
             "as large",
-            f"  lengthening of the muscle: {1e3 * self.rms:.3g} mm rms, peak {1e3 * self.peak:.3g} mm, "
-            f"{1e3 * self.speed:.3g} mm/s, {low:.2g} to {high:.2g} Hz",
+            f"  lengthening of the muscle: {1e3 * self.rms:.3g} mm rms, at most {1e3 * self.peak:.3g} mm to "
+            f"either side and {1e3 * self.speed:.3g} mm/s, {low:.2g} to {high:.2g} Hz",
             f"  most of the motion: {most}" if most else "  the density is nearly even",
             "  expected standard errors, in percent of the value:",
             f"    {'':<22}{'now':>10}{'flat':>10}{'designed':>10}",
@@ -191,9 +192,11 @@ class DesignedInput(Printed, Result, eqx.Module):
         lines = ["  assumed: the muscle is the one given here" + f", with a mean force of {mean[0]:.3g} N" * bool(mean)]
         if mean:
             lines[0] += ". If you measured another one, fit with it first (mean and unit of the target)"
+        return lines
+
+    def _vague(self) -> list[str]:
+        """A motion designed for what is hardly known is none to begin with."""
         known = {name: self.percent(name, self.now) for name in self.quantity}
         vague = [f"{name} to {percent:.2g} %" for name, percent in known.items() if percent > DOUBTFUL]
-        if vague:
-            lines.append(f"  so far only known: {', '.join(vague)}. So record a first minute with a flat motion "
-                         "(--spread 1, spread=1.0), fit it, and design again from that fit")  # fmt: skip
-        return lines
+        return [f"  so far only known: {', '.join(vague)}. So do not begin with this motion: record a first minute with a "
+                "flat one (--spread 1, spread=1.0), fit it, and design again from that fit"] * bool(vague)  # fmt: skip
