@@ -75,9 +75,9 @@ def design(
         record(output / "design.json")
         out.print(plain(found), highlight=False, soft_wrap=True)
         out.print(f"Written: {output}/{', '.join(['motor.csv', 'design.json', *figures])}", highlight=False)
-        period = found.lengthening.seconds
-        out.print(f"Play the motion for {1.5 * period:g} s and record force and displacement. Then fit both channels of its "
-                  f"last period: jaxmuscle fit RECORD.csv --task prescribed-length --window {period / 2:g}:{1.5 * period:g} "
+        begin, end = found.window
+        out.print(f"Play the motion for {end:g} s and record force and displacement. Then fit both channels, without the "
+                  f"first {begin:g} s: jaxmuscle fit RECORD.csv --task prescribed-length --window {begin:g}:{end:g} "
                   "--out out/moved", highlight=False, soft_wrap=True)  # fmt: skip
 
 

@@ -10,6 +10,7 @@ from ._style import BLUE, COLUMN, GREY, ORANGE, canvas, fitted_to, key, log_axis
 
 SHOWN = 20.0  # s
 HEIGHTS, ROW = (1.7, 1.5), 0.2  # inches
+LEAST = 2.0  # densities that differ by less are shown as even
 NOW, FLAT, DESIGNED = "now, without a motion", "flat motion", "designed motion"
 
 
@@ -39,6 +40,9 @@ def _density(ax: Axes, found: Any) -> None:
     for lines, colour, label in ((found.even, GREY, FLAT), (found.lengthening, BLUE, DESIGNED)):
         ax.step(found.frequency, 1e6 * lines.power * lines.seconds, where="mid", color=colour, lw=1.2, label=label)
     log_axis(ax)
+    low, high = ax.dataLim.intervaly
+    if high < LEAST * low:
+        ax.set_ylim(low / LEAST, high * LEAST)
     log_axis(ax, "y")
     ax.set(xlabel="Frequency (Hz)", ylabel="Density (mm²/Hz)", title="Motion of the insertion")
 

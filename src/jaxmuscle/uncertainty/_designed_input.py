@@ -110,6 +110,14 @@ class DesignedInput(Printed, Result, eqx.Module):
         """A standard error in percent of the value."""
         return 100 * errors[name] / abs(self.values[name])
 
+    @property
+    def window(self) -> tuple[float, float]:
+        """From when to when a record is analysed [s]: whole periods of the motion, after half of one. One period, or as many
+        as reach the error that was asked for."""
+        period, seconds = self.lengthening.seconds, 0.0 if self.needed is None else self.needed[1]
+        periods = max(1, int(np.ceil(seconds / period - 1e-9))) if np.isfinite(seconds) else 1
+        return period / 2, period / 2 + periods * period
+
     def to_dict(self) -> dict[str, Any]:
         """As nested tables of numbers and strings, without the signal."""
         errors = {"now": self.now, "flat": self.flat, "stderr": self.stderr}
@@ -178,12 +186,12 @@ class DesignedInput(Printed, Result, eqx.Module):
                       for n in self.told]  # fmt: skip
         if self.needed is not None:
             error, seconds = self.needed
-            period, goal = self.lengthening.seconds, f"{' and '.join(self.quantity)} to {100 * error:.3g} % (standard error)"
+            goal = f"{' and '.join(self.quantity)} to {100 * error:.3g} % (standard error)"
             if not np.isfinite(seconds):
                 return [*lines, f"  no length of the record tells {goal}: raise rms, or choose another band"]
-            whole = period * max(1, int(np.ceil(seconds / period - 1e-9)))
+            begin, end = self.window
             lines += [f"  to know {goal}, record {seconds:.3g} s. In whole periods of this motion: play it for "
-                      f"{whole + period / 2:.3g} s, and analyse the last {whole:.3g} s"]  # fmt: skip
+                      f"{end:.3g} s, and analyse the last {end - begin:.3g} s"]  # fmt: skip
         return lines
 
     def _as_fitted(self) -> list[str]:
