@@ -1,6 +1,6 @@
 """Perturbation experiments, simulated with NumPy alone, and what is found in them; the tables of docs/perturbed.md.
 
-    python benchmarks/perturbed.py classical|amplitude|reflex|inertia|seconds|coverage|time [--count N]
+    python benchmarks/perturbed.py classical|amplitude|reflex|inertia|active|seconds|coverage|time [--count N]
 
 Takes a minute to a quarter of an hour each.
 """
@@ -170,6 +170,20 @@ def inertia(count: int) -> None:
             told([jm.fit(TASK, run, fix={"m_z": fixed}, **QUICK) for run in runs])
 
 
+def active(count: int) -> None:
+    """An active mass m_w that is not the assumed one; and m_w fitted with the rest."""
+    runs = recorded(TASK, np.random.default_rng(4), count)
+    for held in (0.05, 0.25, 0.5, 1.0, 2.5):
+        print(f"m_w 0.5 kg, fitted with {held:g} kg")
+        told([jm.fit(TASK, run, fix={"m_w": held}, **QUICK) for run in runs])
+    free = [*jm.fit(TASK, runs[0], **QUICK).free, "m_w"]
+    fits = [jm.fit(TASK, run, free=free, **QUICK) for run in runs]
+    print("fitted with m_w free")
+    told(fits)
+    known = [fit["m_w"] for fit in fits if fit["m_w"].stderr is not None]
+    print(f"m_w known in {len(known)} of {count}: {', '.join(map(str, known))}", flush=True)
+
+
 def seconds(count: int) -> None:
     """Errors over the length of the recording, and over the amplitude."""
     for length, rms in ((30.0, 1e-3), (60.0, 1e-3), (120.0, 1e-3), (60.0, 0.5e-3), (60.0, 2e-3)):
@@ -213,7 +227,7 @@ def time(count: int) -> None:
 
 
 PARTS: dict[str, Callable[[int], None]] = {
-    part.__name__: part for part in (classical, amplitude, reflex, inertia, seconds, coverage, time)
+    part.__name__: part for part in (classical, amplitude, reflex, inertia, active, seconds, coverage, time)
 }
 
 

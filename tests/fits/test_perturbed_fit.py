@@ -1,6 +1,7 @@
 """Fits of perturbed muscles, to data that a simulation written here makes: the numbers, their errors, and what follows."""
 
 import dataclasses
+import re
 
 import jax
 import numpy as np
@@ -10,7 +11,10 @@ from scipy.interpolate import make_interp_spline
 from scipy.optimize import brentq
 
 import jaxmuscle as jm
+from jaxmuscle.fits._adequacy import Endpoint
 from jaxmuscle.fits._perturbed import seen_with
+from jaxmuscle.objective._consequences import expand
+from jaxmuscle.uncertainty._identifiability import fitted_problem
 
 # The bundled knee extension as fitted, with masses of 0.5 kg.
 TRUE = {"k_w": 4.6e5, "k_z": 7.8e5, "c_w": 114.0, "c_z": 1.8, "P_w": 5.0, "m_w": 0.5, "m_z": 0.5}
@@ -89,6 +93,7 @@ def test_stiffness_and_damping_are_known(result):
 def test_what_a_fit_says_and_keeps(result, tmp_path):
     text = str(result)
     assert "The model describes the data: chi2 per datum" in text and "PrescribedLength" in text
+    assert "held fixed: m_w = 0.5 kg. The data do not tell it" in text
     result.save(tmp_path / "fit.json")
     again = jm.load_result(tmp_path / "fit.json")
     assert str(again) == text
@@ -116,6 +121,25 @@ def test_the_posterior_is_as_wide_as_stated(result):
         draws = found.quantities[name]
         assert 0.67 < np.std(draws) / result[name].stderr < 1.5, name
         assert abs(np.mean(draws) - true) < 4 * result[name].stderr, name
+
+
+@pytest.mark.slow
+def test_a_bad_spectrum_does_not_hide_behind_a_good_response(result, x64):
+    """The residuals of the fit, those of the spectrum made larger and those of the response smaller."""
+    assert not any("alone is missed" in notice for notice in result.notices)
+    problem, theta = fitted_problem(result, None)
+    objective = problem.linear()
+    ended = Endpoint(problem, objective, expand(objective, theta[None]).row(0))
+    bins, points = len(result.target.bins) - (problem.residual == "cumulative"), len(result.target.stiffness.known.frequency)
+    changed = np.array(ended.found.residuals)
+    changed[:bins] *= 9.0 / np.linalg.norm(changed[:bins])
+    changed[-2 * points :] *= 0.7
+    ended.__dict__["found"] = ended.found._replace(residuals=changed)
+    verdict, (said,) = ended.judged
+    assert verdict.adequate and verdict.chi2 == pytest.approx(np.sum(changed**2))
+    # 30 logs about their mean, less some of the six numbers of muscle and noise; and 81 is beyond all of these.
+    found = re.fullmatch(r"the spectrum alone is missed: chi2 81, expected ([\d.]+), p <= 0.001\. .*", said)
+    assert found and bins - 7 < float(found[1]) < bins
 
 
 @pytest.mark.slow

@@ -13,7 +13,7 @@ import jaxmuscle as jm
 from jaxmuscle.comparison._comparison import NEEDED
 from jaxmuscle.fits._adequacy import Endpoint
 from jaxmuscle.fits._checks import twitch_notices
-from jaxmuscle.fits._ladder import Rung, _fewer, criterion, gains, told_apart
+from jaxmuscle.fits._ladder import Rung, _fewer, criterion, gains, passed_over, told_apart
 from jaxmuscle.fits._part import Estimate
 from jaxmuscle.model._rungs import RUNGS
 from jaxmuscle.objective._arguments import COEFFICIENTS, FitOptions, planned
@@ -191,6 +191,14 @@ def test_every_part_of_the_chosen_model_says_what_it_gains_over_the_poorer_one()
     )
     assert f"2 or less says nothing; jaxmuscle compare asks for at least {NEEDED:g}." in said[-1]
     assert "no p-value" in said[-1] and "No model" not in said[-1]
+
+
+def test_a_model_that_is_missing_in_the_table_is_explained():
+    (said,) = passed_over(tried((0, -10.0), (2, -60.0), chosen=2))
+    assert said.startswith("model 1 was not tried: model 0 describes the data without it") and "model 2 was tried" in said
+    assert passed_over(tried((0, -10.0), (1, -20.0), chosen=1)) == ()
+    failed = tuple(rung._replace(p=0.001) for rung in tried((0, -10.0), (2, -60.0), chosen=2))
+    assert passed_over(failed) == ()  # it was tried, and had no finite spectrum
 
 
 def test_what_was_not_tried_is_counted_with_the_next_model():

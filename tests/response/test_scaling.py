@@ -325,3 +325,13 @@ def test_carrying_back_is_the_task_and_a_displacement_cannot_be_carried(x64):
     for still in (jm.Isometric(P_w=0.0), jm.PrescribedMotion(F_ext=0.0)):
         with pytest.raises(ValueError, match="mean force of this task is zero"):
             jm.at_force(still, 3.0)
+
+
+@pytest.mark.slow
+def test_a_held_force_tells_no_length():
+    """What the printed fit says: half of both x_ref, twice the stiffness k x_ref², damping and masses, the same force."""
+    task = jm.Isometric(noise_K_w=0.2, noise_K_z=0.01)
+    factors = {"x_ref_w": 0.5, "x_ref_z": 0.5, "k_w": 8, "k_z": 8, "c_w": 2, "c_z": 2, "m_w": 2, "m_z": 2}
+    half = task.replace(**{name: factor * task[name] for name, factor in factors.items()})
+    one, other = (jm.expected_spectrum(each).power for each in (task, half))
+    np.testing.assert_allclose(other, one, rtol=2e-4)  # single precision

@@ -19,7 +19,7 @@ from jaxmuscle.commands.design import design
 from jaxmuscle.data import FrequencyResponse
 from jaxmuscle.objective._coordinates import Coordinates
 from jaxmuscle.uncertainty import Lengthening
-from jaxmuscle.uncertainty._designs import information_of, seen_here
+from jaxmuscle.uncertainty._designs import design_information, information_of, seen_here
 from jaxmuscle.uncertainty._identifiability import fitted_problem
 from jaxmuscle.uncertainty._input_design import Experiment, steps_of
 
@@ -89,6 +89,49 @@ def test_the_information_is_that_of_the_closed_form(x64):
     size = np.sqrt(np.diag(expected))
     found = lengthening.information(TRUTH, coordinates, np.zeros(4))
     np.testing.assert_allclose(found / np.outer(size, size), expected / np.outer(size, size), atol=1e-6)
+
+
+@pytest.mark.slow
+def test_the_mass_that_moves_is_open_as_in_the_fit_of_a_record(x64):
+    """By hand: H also has m_z s²; what is known of ln m_z before is its prior, and then it is left out."""
+    problem, theta = fitted_problem(fitted(), None)
+    lengthening = Lengthening.flat(1e-3, BAND, SECONDS)
+    moved = TRUTH if isinstance(TRUTH, jm.PrescribedLength) else TRUTH.as_task(jm.PrescribedLength, P_w=TRUTH.P_w)
+    design = jm.Design("moved", moved, segments=0, lengthening=lengthening)
+    found = design_information(problem, theta, design)
+    f = lengthening.frequency
+    rows = np.concatenate([slopes(f), VALUES["m_z"] * (2j * np.pi * f)[:, None] ** 2], axis=1)
+    rows *= (np.sqrt(2 * lengthening.power) / 2)[:, None]
+    variance = density(VALUES, f) / (4 * SECONDS)
+    whole = np.einsum("ki,kj,k->ij", rows.conj(), rows, 1 / variance).real
+    sd = np.array([jm.model.PARAMETERS[n].prior_sd for n in (*BASE, "m_z")])
+    whole *= np.outer(sd, sd)
+    whole[4, 4] += 1.0
+    expected = np.linalg.inv(np.linalg.inv(whole)[:4, :4])
+    own = [problem.coordinates.names.index(n) for n in BASE]
+    size = np.sqrt(np.diag(whole))[:4]
+    np.testing.assert_allclose(found[np.ix_(own, own)] / np.outer(size, size), expected / np.outer(size, size), atol=1e-5)
+    assert expected[1, 1] < 0.9 * whole[1, 1]  # a known mass would tell more of K_z0
+    assert "m_z fitted with it" in design.told(problem)[1]
+
+
+@pytest.mark.slow
+def test_what_a_record_tells_if_the_muscle_is_another_one():
+    """The prior of a task is independent of all else: a standard error up multiplies k_w by exp of its prior's, no more."""
+    task = TRUTH if isinstance(TRUTH, jm.PrescribedLength) else TRUTH.as_task(jm.PrescribedLength, P_w=TRUTH.P_w)
+    given = {"seconds": SECONDS, "band": BAND, "rate": 50.0}
+    made = jm.design_input(task, "K_w0", **given)
+    factor = np.exp(made.now["K_w0"] / made.values["K_w0"])
+    (low, below), (high, above) = made.elsewhere["K_w0"]
+    assert high / made.values["K_w0"] == pytest.approx(factor, rel=1e-6)
+    assert made.values["K_w0"] / low == pytest.approx(factor, rel=1e-6)
+    for times, error in ((1 / factor, below), (factor, above)):
+        other = task.replace(k_w=float(task["k_w"]) * times)
+        with jax.enable_x64(True):
+            known = Experiment.of(other, ("K_w0",), made.even, None).errors(made.lengthening.power)
+        assert error == pytest.approx(known["K_w0"], rel=1e-6)
+    assert f"if it is {low:.3g} N/m" in " ".join(str(made).split())
+    assert made.to_dict()["elsewhere"]["K_w0"][0] == {"value": low, "stderr": below}
 
 
 def estimates(displacement, rate, lines, seed):
@@ -199,7 +242,7 @@ def test_limits_are_kept():
 def test_an_even_design_is_the_flat_one():
     made = designed(spread=1.0)
     assert made.gain == pytest.approx(1.0)
-    assert not made.moves and "nearly even" in str(made)
+    assert not made.moves and "this motion is flat itself" in str(made)
 
 
 @pytest.mark.slow
@@ -216,7 +259,9 @@ def test_longer_records_tell_more_and_the_wanted_error_says_how_long():
     assert made.needed is not None and made.needed[0] == 0.04
     found = designed(durations=(made.needed[1],))
     assert found.by_seconds[made.needed[1]]["K_w0"] / found.values["K_w0"] == pytest.approx(0.04, rel=1e-6)
-    assert f"to know K_w0 to 4 % (standard error), record {made.needed[1]:.3g} s" in str(made)
+    assert f"to know K_w0 to 4 % (standard error), {made.needed[1]:.3g} s of record are enough" in " ".join(
+        str(made).split()
+    )
     assert "by the length of the record" in str(made) and "by the length" not in str(designed())
     assert "no length of the record" in str(designed(error=1e-9))
     assert (
@@ -262,8 +307,8 @@ def test_the_standard_designs_know_what_a_flat_motion_tells():
     for name in ("K_w0", "K_z0", "C_w0", "C_z0"):
         assert large.quantities[name].stderr == pytest.approx(made.flat[name], rel=1e-6)
         assert small.quantities[name].stderr > large.quantities[name].stderr
-    assert large.task == "PrescribedLength, P_w = 5 N"
-    assert large.data.endswith("response to a lengthening of 1 mm rms, 0.5 to 5 Hz, for 60 s")
+    assert large.task == "PrescribedLength (insertion moved by a motor, force measured), P_w = 5 N"
+    assert large.data.endswith("response to a lengthening of 1 mm rms, 0.5 to 5 Hz, for 60 s (m_z fitted with it)")
 
 
 @pytest.mark.slow
@@ -321,8 +366,13 @@ def test_in_words():
     said = " ".join(text.split())
     assert f"would tell K_w0 to {100 * designed().stderr['K_w0'] / designed().values['K_w0']:.2g} %" in said
     assert f"with it the relative variance of K_w0 is {designed().gain:.2g} times as large" in said
-    assert "A reflex can change K_w0" in said and "also fits m_z" in said and "no fatigue. Split a long" in said
-    assert "1 mm rms, at most" in said and "most of the motion: 81 % at 0.7 to 0.93 Hz" in said
+    assert (
+        "A reflex can change K_w0" in said
+        and "active mass m_w is 0.5 kg, as here" in said
+        and "no fatigue. Split a long" in said
+    )
+    ((low, high, share),) = designed().moves
+    assert "1 mm rms, at most" in said and f"most of the motion: {100 * share:.0f} % at {low:.2g} to {high:.2g} Hz" in said
 
 
 def test_the_figure():

@@ -27,7 +27,10 @@ def design(
     ] = "0.5:5",
     seconds: Annotated[float, typer.Option(metavar="S", help="Length of the record and period of the motion in s.")] = 60.0,
     rate: Annotated[float, typer.Option(metavar="HZ", help="Sampling rate of the motor's signal in Hz.")] = 1000.0,
-    peak: Annotated[float | None, typer.Option(metavar="MM", help="Largest displacement to either side in mm.")] = None,
+    peak: Annotated[
+        float | None,
+        typer.Option(metavar="MM", help="Largest displacement to either side in mm: half of the motor's travel."),
+    ] = None,
     speed: Annotated[float | None, typer.Option(metavar="MM/S", help="Largest speed of the motor in mm/s.")] = None,
     spread: Annotated[
         float, typer.Option(metavar="SHARE", help="Share of the motion, 0 to 1, that is spread evenly over the band.")

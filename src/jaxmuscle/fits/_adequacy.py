@@ -12,6 +12,7 @@ from scipy.special import gammaincinv, ndtr
 
 from jaxmuscle._common.keys import fold_in
 from jaxmuscle._common.programs import kept
+from jaxmuscle._common.text import probability
 from jaxmuscle.objective._arguments import base_of
 from jaxmuscle.objective._consequences import Consequences, Expansion, consequences
 from jaxmuscle.objective._covariance import parameter_covariance, residual_covariance
@@ -90,9 +91,14 @@ class Endpoint:
         return parameter_covariance(self.found.jacobian, self.scatter, self.problem.prior)
 
     @functools.cached_property
+    def judged(self) -> tuple[Adequacy | None, tuple[str, ...]]:
+        """`adequacy`, and a sentence for each kind of data that the model misses although it describes all data together."""
+        return judged(self)
+
+    @property
     def adequacy(self) -> Adequacy | None:
         """Whether the model describes the data; None where the spread is unknown."""
-        return adequacy(self)
+        return self.judged[0]
 
     @functools.cached_property
     def further(self) -> tuple[dict[str, float], ...]:
@@ -137,8 +143,10 @@ def further_of(part: PartResiduals, moments: Moments) -> dict[str, float]:
 _further = kept(further_residuals)
 
 
-def adequacy(ended: Endpoint) -> Adequacy | None:
+def judged(ended: Endpoint) -> tuple[Adequacy | None, tuple[str, ...]]:
     """Chi² of the data residuals against its distribution under the fitted model; None where the spread is unknown.
+
+    Also chi² of each kind of data by itself, where there are several: many good points can hide a few bad ones.
 
     The reference: residuals ε drawn by the law of the bins about the fitted spectrum, and what a refit leaves of them. The
     parameters are taken as linear there, `(1 - H) ε` with `H = J (Jᵀ J + Λ)⁻¹ Jᵀ`, the pull of the prior included for truths
@@ -147,19 +155,43 @@ def adequacy(ended: Endpoint) -> Adequacy | None:
     """
     problem, objective, found, scatter, refit = ended.problem, ended.objective, ended.found, ended.scatter, ended.refit
     if not all(part.statistics.known for part in objective.parts):
-        return None
+        return None, ()
     generator = generator_of(problem, 5)
     count, rows = len(found.residuals), len(refit.prior)
     drawn = np.concatenate([_drawn(objective, scatter, generator), generator.normal(size=(REPLICATES, rows))], axis=1)
     rest = refit.left(drawn, np.argmin(refit.cost(drawn), axis=1))
-    chi2 = np.sum(rest[:, :count] ** 2, axis=1)
-    here = float(np.sum(found.residuals**2))
-    p = (1 + np.sum(chi2 >= here)) / (1 + REPLICATES)
+    here, expected, p = _tested(found.residuals, rest[:, :count])
     misfit = ""
     if p < ADEQUATE:
         inner = refit.left(refit.left(np.pad(scatter, (0, rows))).T)[:count, :count]
         misfit = _misfit(problem, objective, found.residuals, inner)
-    return Adequacy(here, float(np.mean(chi2)), float(p), misfit)
+    kinds = _kinds(problem, objective)
+    alone = {words: _tested(found.residuals[rows], rest[:, rows]) for words, rows in kinds.items()}
+    hidden = {words: each for words, each in alone.items() if each[2] < ADEQUATE / len(kinds)} if p >= ADEQUATE else {}
+    said = tuple(f"{words} alone is missed: chi2 {chi2:.3g}, expected {mean:.3g}, {probability(own)}. The verdict counts "
+                 "all data together, and the rest hides it. What to do: look at its residuals in the figure"
+                 for words, (chi2, mean, own) in hidden.items())  # fmt: skip
+    return Adequacy(here, expected, p, misfit), said
+
+
+def _tested(residuals: np.ndarray, rest: np.ndarray) -> tuple[float, float, float]:
+    """Chi², its expectation and p-value among replicates."""
+    here, chi2 = float(np.sum(residuals**2)), np.sum(rest**2, axis=1)
+    return here, float(np.mean(chi2)), float((1 + np.sum(chi2 >= here)) / (1 + len(chi2)))
+
+
+def _kinds(problem: FitProblem, objective: Residuals) -> dict[str, slice]:
+    """Rows of each target's spectrum and dynamic stiffness, by what they are in words."""
+    start, kinds = 0, dict[str, slice]()
+    for part, own in zip(problem.parts, objective.parts, strict=True):
+        of = f" of {part.name}" if len(problem.parts) > 1 else ""
+        end = start + _rows_of(own)
+        if bins := _rows_of(own) - own.data.further:
+            kinds[f"the spectrum{of}"] = slice(start, start + bins)
+        if part.points is not None:
+            kinds[f"the dynamic stiffness{of}"] = slice(end - 2 * len(part.points), end)
+        start = end
+    return kinds
 
 
 def elsewhere(ended: Endpoint) -> float:

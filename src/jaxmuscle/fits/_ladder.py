@@ -85,6 +85,14 @@ def gains(ladder: tuple[Rung, ...], *, describes: bool | None) -> tuple[str, ...
     return (*said, meaning)
 
 
+def passed_over(ladder: tuple[Rung, ...]) -> tuple[str, ...]:
+    """Which models between those of a table are missing there, and why, in sentences."""
+    return tuple(f"model {number} was not tried: model {before.number} describes the data without it. Its harmonic may be "
+                 f"tremor, so model {after.number} was tried"
+                 for before, after in itertools.pairwise(ladder) if before.p >= ADEQUATE
+                 for number in range(before.number + 1, after.number))  # fmt: skip
+
+
 def _gain(before: Rung, after: Rung) -> str:
     """AIC and chi² of a model against those of a poorer one."""
     added = " and ".join("with a harmonic" if n == 0 else rung_name(n) for n in range(before.number + 1, after.number + 1))

@@ -156,6 +156,7 @@ def report_fit(
         harmonic_p_value=None if line_test is None else line_test.p_value,
         notices=(
             *notices,
+            *ended.judged[1],
             *other,
             *twitch_notices(derived),
             *polish_notices(polish),

@@ -14,7 +14,7 @@ from jaxmuscle.objective._consequences import MEANINGS
 from jaxmuscle.objective._covariance import spelt
 from jaxmuscle.spectra._fluctuations import BANDS, in_bands
 
-from ._ladder import HEAD, gains
+from ._ladder import HEAD, gains, passed_over
 from ._part import Estimate, FittedPart
 
 if TYPE_CHECKING:
@@ -26,6 +26,7 @@ ALIASES = {
     "resonance_width": "tremor_width",
     "activation_time": "contraction_time",
 }
+LENGTHS = ("x_ref_w", "x_ref_z")
 COLUMNS = ("name", "value", "95 % interval", "unit", "in the fit", "what it is")
 
 
@@ -61,6 +62,7 @@ def text_of(result: "FitResult") -> str:
         lines += [f"  {name}: {p.target.name}, {p.model}{_closeness(p, ', ')}" for name, p in result.parts.items()]
     lines += [f"  {'' if single else f'{name}: '}{words}" for name, p in result.parts.items() for words in _trials(p.target)]
     lines += [f"  {HEAD}", *(f"  {rung}" for rung in result.ladder)] if len(result.ladder) > 1 else []
+    lines += [f"  {sentence}" for sentence in passed_over(result.ladder)]
     lines += [f"  {sentence}" for sentence in _gains(result)]
     lines += [f"  {sentence}" for sentence in result.advice]
     lines += [f"  note: {notice}" for notice in result.notices]
@@ -84,6 +86,7 @@ def text_of(result: "FitResult") -> str:
         what = "P_w, masses, stiffness" if single and result.only.stiffness is None else "P_w, stiffness"
         lines += [f"  before the fit {what} and damping were multiplied by {factor:.3g}, so that the muscle has the "
                   "measured mean force (mean_force=False leaves the mean out)"]  # fmt: skip
+    lines += [f"  {sentence}" for sentence in _held(result)]
     if result.per_newton:
         lines += ["  no mean force in newtons was given, so the scale of force is unknown: forces, masses, stiffness and "
                   "damping are stated per newton of mean force. In newtons, as in result['K_w0'], in to_dataframe() and in "
@@ -93,6 +96,27 @@ def text_of(result: "FitResult") -> str:
         whose = "the data leave" if single else "all targets together leave"
         lines += [f"  {whose} open:", *(f"    - {sentence}" for sentence in result.undetermined)]
     return folded(lines)
+
+
+def _held(result: "FitResult") -> list[str]:
+    """The masses and lengths that a fit takes as given, where its stiffness in newtons hangs on them."""
+    if len(result.parts) > 1 or not result.derived:
+        return []
+    task, moved = result.only.task, result.only.stiffness is not None
+    if not moved and (task.output_unit != "N" or result.settings.get("mean_force") is None):
+        return []
+    held = [name for name in ("m_w",) + ("m_z", *LENGTHS) * (not moved) if name in task.parameter_names]
+    held = [name for name in held if name not in result.parameters or not result.parameters[name].free]
+    if "m_w" not in held or (not moved and not set(LENGTHS) <= set(held)):
+        return []
+    told = [f"{name} = {1e3 * float(task[name]):.3g} mm" if name in LENGTHS else f"{name} = {float(task[name]):.3g} kg"
+            for name in held]  # fmt: skip
+    means = ("The data do not tell it, and the verdict notices no wrong one. With half or twice as much C_w0 changes by "
+             "about 10 %, K_w0 by 5 % (docs/perturbed.md). To have that in the errors fit it: free=(*result.free, 'm_w')"
+             if moved else
+             "A held force tells no length and no mass: with half of both x_ref, stiffness, damping and masses would be "
+             "twice as large, and the fit the same")  # fmt: skip
+    return [f"held fixed: {', '.join(told)}. {means}"]
 
 
 def _per_newton(result: "FitResult", shown: Mapping[str, Estimate]) -> str:

@@ -12,6 +12,7 @@ from jaxmuscle._common.arrays import with_nulls
 from jaxmuscle._common.cards import Printed, Result
 from jaxmuscle._common.files import replacing, write_json
 from jaxmuscle._common.text import folded
+from jaxmuscle.model._parameters import PARAMETERS
 
 from ._identifiability_report import BASE
 from ._lengthening import Lengthening
@@ -20,10 +21,10 @@ from ._multisine import speed_of
 if TYPE_CHECKING:
     from matplotlib.figure import Figure, SubFigure
 
+USUAL = PARAMETERS["m_w"].default  # kg
 SHOWN = 2.0  # times the even density: where a design moves the most
-DOUBTFUL = 30.0  # percent
+DOUBTFUL = 0.3  # relative standard error
 ASSUMED = (
-    "  assumed: the masses are known. A fit of the record also fits m_z, so its error of K_z0 is larger",
     "  assumed: no reflex. A reflex can change K_w0 by 10 to 45 %, and the fit does not notice: call it muscle plus reflex",
     "  assumed: no fatigue. Split a long or strong hold into trials with rests between, and give all trials to one fit",
 )
@@ -39,7 +40,8 @@ class DesignedInput(Printed, Result, eqx.Module):
     `units` of every free parameter and derived quantity, and their standard errors in these units: `now`, without the
     record; `flat`, with the flat motion; `stderr`, with this one; `by_seconds`, with records of it that have other lengths
     [s]; `needed`, the relative error that was asked for and the length [s] of the record that reaches it, or None;
-    `notices`, what to know before.
+    `notices`, what to know before; `elsewhere`, of each quantity that is hardly known so far: its value one standard error
+    below and above, and the error that this motion gives there, both in its unit; `active_mass` m_w [kg], which is assumed.
     """
 
     quantity: tuple[str, ...] = eqx.field(static=True)
@@ -55,6 +57,8 @@ class DesignedInput(Printed, Result, eqx.Module):
     by_seconds: dict[float, dict[str, float]]
     needed: tuple[float, float] | None
     notices: tuple[str, ...] = eqx.field(static=True, default=())
+    elsewhere: dict[str, tuple[tuple[float, float], ...]] = eqx.field(default_factory=dict)
+    active_mass: float | None = None
 
     @property
     def time(self) -> Float[np.ndarray, " samples"]:
@@ -129,7 +133,9 @@ class DesignedInput(Printed, Result, eqx.Module):
             "by_seconds": [{"seconds": seconds, "stderr": errors} for seconds, errors in self.by_seconds.items()],
             "needed": None if self.needed is None else {"error": self.needed[0], "seconds": with_nulls(self.needed[1])},
             "frequency_hz": self.frequency.tolist(), "density": self.density.tolist(), "quantities": known,
-            "notices": list(self.notices),
+            "elsewhere": {n: [{"value": with_nulls(value), "stderr": with_nulls(error)} for value, error in sides]
+                          for n, sides in self.elsewhere.items()},
+            "active_mass": self.active_mass, "notices": list(self.notices),
         }  # fmt: skip
 
     def save(self, path: str | Path) -> None:
@@ -150,10 +156,10 @@ class DesignedInput(Printed, Result, eqx.Module):
 
     def __str__(self) -> str:
         low, high = self.frequency[0], self.frequency[-1]
-        best = ", ".join(f"{n} to {self.percent(n, self.stderr):.2g} %" for n in self.quantity)
-        flat = ", ".join(f"{self.percent(n, self.flat):.2g} %" for n in self.quantity)
+        best = ", ".join(f"{n} to {_digits(self.percent(n, self.stderr))} %" for n in self.quantity)
+        flat = ", ".join(f"{_digits(self.percent(n, self.flat))} %" for n in self.quantity)
         most = " and ".join(f"{100 * share:.0f} % at {a:.2g} to {b:.2g} Hz" for a, b, share in self.moves)
-        rows = [f"    {n:<22}" + "".join(f"{self.percent(n, e):>10.2g}" for e in (self.now, self.flat, self.stderr))
+        rows = [f"    {n:<22}" + "".join(f"{_digits(self.percent(n, e)):>10}" for e in (self.now, self.flat, self.stderr))
                 for n in self.told]  # fmt: skip
         names = " and ".join(filter(None, [", ".join(self.quantity[:-1]), self.quantity[-1]]))
         variance = (
@@ -162,12 +168,13 @@ class DesignedInput(Printed, Result, eqx.Module):
         return folded([
             f"designed input: one record of {self.lengthening.seconds:g} s would tell {best}",
             *self._vague(),
+            *self._elsewhere(),
             *(f"  note: {notice}" for notice in self.notices),
             f"  a flat input of {1e3 * self.even.rms:.3g} mm rms: {flat}; with it the {variance} is {self.gain:.2g} times "
-            "as large",
+            "as large" if self.moves else "  this motion is flat itself: no frequency is preferred",
             f"  lengthening of the muscle: {1e3 * self.rms:.3g} mm rms, at most {1e3 * self.peak:.3g} mm to "
             f"either side and {1e3 * self.speed:.3g} mm/s, {low:.2g} to {high:.2g} Hz",
-            f"  most of the motion: {most}" if most else "  the density is nearly even",
+            *[f"  most of the motion: {most}"] * bool(most),
             "  expected standard errors, in percent of the value:",
             f"    {'':<22}{'now':>10}{'flat':>10}{'designed':>10}",
             *rows,
@@ -182,7 +189,7 @@ class DesignedInput(Printed, Result, eqx.Module):
         if self.by_seconds:
             heads = "".join(f"{f'{seconds:g} s':>10}" for seconds in self.by_seconds)
             lines += ["  the same by the length of the record, the motion being repeated:", f"    {'':<22}{heads}"]
-            lines += [f"    {n:<22}" + "".join(f"{self.percent(n, e):>10.2g}" for e in self.by_seconds.values())
+            lines += [f"    {n:<22}" + "".join(f"{_digits(self.percent(n, e)):>10}" for e in self.by_seconds.values())
                       for n in self.told]  # fmt: skip
         if self.needed is not None:
             error, seconds = self.needed
@@ -190,8 +197,16 @@ class DesignedInput(Printed, Result, eqx.Module):
             if not np.isfinite(seconds):
                 return [*lines, f"  no length of the record tells {goal}: raise rms, or choose another band"]
             begin, end = self.window
-            lines += [f"  to know {goal}, record {seconds:.3g} s. In whole periods of this motion: play it for "
-                      f"{end:.3g} s, and analyse the last {end - begin:.3g} s"]  # fmt: skip
+            period, periods = self.lengthening.seconds, round((end - begin) / self.lengthening.seconds)
+            lines += [f"  to know {goal}, {seconds:.3g} s of record are enough"]
+            if periods > 1:
+                lines[-1] += f": {periods} periods of this motion. Play {end:.3g} s and analyse the last {end - begin:.3g} s"
+            elif seconds < 0.5 * period:
+                shorter = float(np.ceil(seconds))
+                lines[-1] += (f", less than the {period:.3g} s of this motion. For a shorter one design again "
+                              f"(--seconds {shorter:g}, in Python seconds={shorter:.1f})")  # fmt: skip
+            else:
+                lines[-1] += f": one period of this motion. Play {end:.3g} s and analyse the last {period:.3g} s"
         return lines
 
     def _as_fitted(self) -> list[str]:
@@ -200,11 +215,33 @@ class DesignedInput(Printed, Result, eqx.Module):
         lines = ["  assumed: the muscle is the one given here" + f", with a mean force of {mean[0]:.3g} N" * bool(mean)]
         if mean:
             lines[0] += ". If you measured another one, fit with it first (mean and unit of the target)"
+        if self.active_mass is not None:
+            held = f"{self.active_mass:.3g}"
+            lines += [f"  assumed: the active mass m_w is {held} kg, as here. No record tells it. With half or twice as "
+                      "much a fit has C_w0 off by about 10 %, K_w0 by 5 %"]  # fmt: skip
+            if float(held) != USUAL:
+                lines[-1] += f". The fit of a record takes {USUAL:g} kg unless you say --fix m_w={held}"
         return lines
 
     def _vague(self) -> list[str]:
         """A motion designed for what is hardly known is none to begin with."""
         known = {name: self.percent(name, self.now) for name in self.quantity}
-        vague = [f"{name} to {percent:.2g} %" for name, percent in known.items() if percent > DOUBTFUL]
+        vague = [f"{name} to {_digits(percent)} %" for name, percent in known.items() if percent > 100 * DOUBTFUL]
         return [f"  so far only known: {', '.join(vague)}. So do not begin with this motion: record a first minute with a "
                 "flat one (--spread 1, spread=1.0), fit it, and design again from that fit"] * bool(vague)  # fmt: skip
+
+    def _elsewhere(self) -> list[str]:
+        """What the record would tell if the muscle is not as fitted, as far as that is likely."""
+        lines = []
+        for name, sides in self.elsewhere.items():
+            unit = "" if self.units[name] == "1" else f" {self.units[name]}"
+            told = [f"if it is {value:.3g}{unit}, to {_digits(100 * error / abs(value))} %"
+                    for value, error in sides if np.isfinite(value) and value != 0]  # fmt: skip
+            lines += [f"  {name} may well be one standard error off {self.values[name]:.3g}{unit}. Then this record would "
+                      f"tell it: {'; '.join(told)}"] * bool(told)  # fmt: skip
+        return lines
+
+
+def _digits(percent: float) -> str:
+    """Two digits, or all of a number above 100."""
+    return f"{percent:.2g}" if percent < 99.5 else f"{percent:.0f}"

@@ -9,8 +9,9 @@ from jaxtyping import Float
 
 from jaxmuscle._common.text import choices
 from jaxmuscle.data._target import Target
+from jaxmuscle.model._parameters import PARAMETERS
 from jaxmuscle.model._tasks import AbstractTask, Isometric, PrescribedForce, PrescribedLength
-from jaxmuscle.objective._arguments import INPUTS
+from jaxmuscle.objective._arguments import INPUTS, MOVED_MASS
 from jaxmuscle.objective._consequences import Expansion, expand
 from jaxmuscle.objective._coordinates import Coordinates
 from jaxmuscle.objective._likelihood import Likelihood, require_spread, without_offsets
@@ -29,6 +30,11 @@ LONGER = 10
 MOVED = ((1e-4, (0.5, 10.0)), (1e-3, (0.5, 5.0)))  # rms [m] and band [Hz] of standard perturbations; slower, force drifts
 MOST_VARIATION = 1e3
 VAGUE = 1e-6  # prior precision of what is separate
+HELD: dict[type[AbstractTask], str] = {
+    Isometric: "insertion held, force measured",
+    PrescribedForce: "insertion free under a constant force, displacement measured",
+    PrescribedLength: "insertion moved by a motor, force measured",
+}
 
 
 class Design(eqx.Module):
@@ -90,7 +96,9 @@ class Design(eqx.Module):
             data.append(_spectrum_in_words(self.counts or segments_of(like.target)))
         data += ["coefficient of variation"] if self.coefficient_of_variation else []
         data += [] if self.mean is None else [f"mean to {100 * self.mean:.2g} %"]
-        data += [] if self.lengthening is None else [f"response to a {self.lengthening}"]
+        if self.lengthening is not None:
+            task = like.task if self.task is None else self.task
+            data.append(f"response to a {self.lengthening}" + f" ({MOVED_MASS} fitted with it)" * _mass_is_open(like, task))
         kind = None if self.lengthening is None else PrescribedLength
         return _task_in_words(like.task if self.task is None else self.task, kind), ", ".join(data)
 
@@ -118,7 +126,8 @@ def told_data(problem: FitProblem) -> tuple[str, str]:
 def _task_in_words(task: AbstractTask, kind: type[AbstractTask] | None = None) -> str:
     inputs = [f"{n} = {float(task[n]):.3g} {'m' if n == 'x_z' else 'N'}" for n in INPUTS
               if n in task.parameter_names and float(task[n]) != 0]  # fmt: skip
-    return ", ".join([(kind or type(task)).__name__, *inputs])
+    kind = kind or type(task)
+    return ", ".join([kind.__name__ + (f" ({HELD[kind]})" if kind in HELD else ""), *inputs])
 
 
 def _spectrum_in_words(counts: tuple[int, ...]) -> str:
@@ -252,7 +261,7 @@ def design_information(
     (moments,) = seen.moments
     found = _information(dataclasses.replace(here, parts=(_with_data(local, design, moments),)), design, seen)
     if design.lengthening is not None:
-        found = found + design.lengthening.information(task, coordinates, theta[own])
+        found = found + _response_information(design.lengthening, like, task, coordinates, theta[own])
     kept = np.array([names[i] not in design.separate for i in own])
     whole = np.zeros((len(names), len(names)))
     if not np.all(kept):
@@ -271,6 +280,39 @@ def coordinates_of(like: Part, theta: np.ndarray, task: Any) -> tuple[np.ndarray
     centre = np.where(positive, values * np.exp(-step), values - step)
     unbounded = np.full(len(own), np.inf)
     return own, Coordinates(tuple(c.names[i] for i in has), centre, sd, positive, -unbounded, unbounded)
+
+
+def with_moved_mass(like: Part, coordinates: Coordinates, task: Any) -> Coordinates:
+    """These, and m_z of the record with its usual prior: the fit of a moved record finds it, too, as a rig adds mass.
+
+    As they are where the fit says what it knows of m_z: it has it free, or was one of a moved record and has it fixed.
+    """
+    if not _mass_is_open(like, task):
+        return coordinates
+    row, value, c = PARAMETERS[MOVED_MASS], float(task[MOVED_MASS]), coordinates
+    ends = np.append(c.low, -np.inf), np.append(c.high, np.inf)
+    return Coordinates((*c.names, MOVED_MASS), np.append(c.centre, value), np.append(c.sd, row.prior_sd),
+                       np.append(c.positive, row.positive), *ends)  # fmt: skip
+
+
+def _mass_is_open(like: Part, task: Any) -> bool:
+    told = MOVED_MASS in like.coordinates.names or like.target.stiffness is not None
+    return not told and MOVED_MASS in task.parameter_names
+
+
+def _response_information(
+    lengthening: Lengthening, like: Part, task: Any, coordinates: Coordinates, theta: Float[np.ndarray, " own"]
+) -> Float[np.ndarray, "own own"]:
+    """Information in the response to a motion; the mass that moves is eliminated, if it is not one of the coordinates.
+
+    The fluctuations of a held insertion do not depend on that mass.
+    """
+    own, wide = len(theta), with_moved_mass(like, coordinates, task)
+    whole = lengthening.information(task, wide, np.append(theta, 0.0)[: len(wide.names)])
+    if len(whole) == own:
+        return whole
+    tied = whole[:own, own]
+    return whole[:own, :own] - np.outer(tied, tied) / (1.0 + whole[own, own])
 
 
 def _local(like: Part, coordinates: Coordinates, task: Any, design: Design) -> Part:

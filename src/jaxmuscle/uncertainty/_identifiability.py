@@ -23,6 +23,7 @@ from ._designs import Design, design_information, designs_for, information_of, s
 from ._identifiability_report import TOGETHER, UNDESCRIBED, IdentifiabilityReport, Known, Outlook
 
 LEAST_PRIOR = 1e-6
+MASSES = ("m_w", "m_z")
 
 
 def identifiability(
@@ -71,8 +72,10 @@ def identifiability(
     fitted = {} if target is not None else result.found
     known = {n for n, k in present.quantities.items() if k.determined}
     doubted = tuple(n for n, p in fitted.items() if n in known and p.stderr is None)
+    first = problem.parts[0].task
+    masses = {n: float(first[n]) for n in MASSES if n in first.parameter_names and n not in problem.coordinates.names}
     return IdentifiabilityReport(problem.title, problem.coordinates.names, present, alone, tuple(pairs), notices, mean_force,
-                                 doubted)  # fmt: skip
+                                 doubted, masses)  # fmt: skip
 
 
 def missed(result: FitResult) -> tuple[str, ...]:

@@ -119,7 +119,8 @@ class IdentifiabilityReport(Printed, Result, eqx.Module):
 
     `target` and `free` name the data and the fitted parameters; the pairs are sorted, best first; `notices` of the fit;
     `mean_force` [N] of the fitted muscle where the data have no newtons: print states values per newton of it, as the fit
-    does, and `to_dict` in newtons; `open_in_fit`, what is determined here and was not in the fit, which is stricter.
+    does, and `to_dict` in newtons; `open_in_fit`, what is determined here and was not in the fit, which is stricter;
+    `masses` [kg] that are taken as known.
     """
 
     target: str
@@ -130,6 +131,7 @@ class IdentifiabilityReport(Printed, Result, eqx.Module):
     notices: tuple[str, ...]
     mean_force: float | None = None
     open_in_fit: tuple[str, ...] = ()
+    masses: dict[str, float] = eqx.field(default_factory=dict)
 
     @property
     def telling_pairs(self) -> tuple[Outlook, ...]:
@@ -161,7 +163,7 @@ class IdentifiabilityReport(Printed, Result, eqx.Module):
             "format": 1, "target": self.target, "free": list(self.free), "threshold": DETERMINED,
             "present": self.present.to_dict(), "designs": [d.to_dict() for d in self.designs],
             "pairs": [d.to_dict() for d in self.pairs], "notices": list(self.notices),
-            "not_determined_in_fit": list(self.open_in_fit),
+            "not_determined_in_fit": list(self.open_in_fit), "masses": self.masses,
         }  # fmt: skip
 
     def to_dataframe(self) -> "pandas.DataFrame":
@@ -248,10 +250,14 @@ def _table(report: IdentifiabilityReport) -> list[str]:
     names = told(report.present.quantities)
     possible = [(letter(i), d) for i, d in enumerate(report.designs) if d.failed is None]
     wide = max(24, *(1 + len(name) for name in names))
-    lines = ["  standard error in percent, by data and prior; in brackets: not determined"]
+    lines = _wrapped("standard error in percent of the value; in brackets: not determined. Columns: prior, before any data; "
+                     "now, with those of the fit; A and on, with that measurement, too", 4, "  ")  # fmt: skip
     if report.mean_force is not None:
         lines += _wrapped("no mean force in newtons was given: forces, stiffness and damping are stated per newton of mean "
                           f"force (that of the fitted muscle is {report.mean_force:.3g} N)", 4, "  ")  # fmt: skip
+    elif report.masses:
+        known = ", ".join(f"{name} = {value:.3g} kg" for name, value in report.masses.items())
+        lines += _wrapped(f"taken as known, as in the fit: {known}", 4, "  ")
     for start in range(0, max(len(possible), 1), COLUMNS):
         block = possible[start : start + COLUMNS]
         heads = ["prior", "now", *(label for label, _ in block)]

@@ -8,8 +8,10 @@ import jax
 import numpy as np
 import scipy
 from jaxtyping import Float
+from scipy.linalg import block_diag
 
 from jaxmuscle._common.arrays import as_numbers, require
+from jaxmuscle._common.errors import OperatingPointError
 from jaxmuscle._common.keys import check_key, key_of
 from jaxmuscle._common.text import choices
 from jaxmuscle._common.types import Key
@@ -21,8 +23,8 @@ from jaxmuscle.objective._consequences import derived_names
 from jaxmuscle.objective._problem import FitProblem
 from jaxmuscle.response._expected_spectrum import expected_spectrum
 
-from ._designed_input import DesignedInput
-from ._designs import coordinates_of, design_information, moved_insertion, seen_here
+from ._designed_input import DOUBTFUL, DesignedInput
+from ._designs import coordinates_of, design_information, moved_insertion, seen_here, with_moved_mass
 from ._identifiability import Here, fitted_problem, missed
 from ._identifiability_report import BASE
 from ._lengthening import Lengthening, information_of_lines, lines_in, require_positive
@@ -117,8 +119,24 @@ def design_input(
     now, flat, best = (experiment.errors(p) for p in (None, even.power, own.power))
     longer = {one: experiment.errors(own.power, one / seconds) for one in durations}
     needed = None if error is None else (float(error), seconds * experiment.times_for(own.power, error))
+    vague = {n: now[n] for n in quantities if now[n] > DOUBTFUL * abs(values[n])}
+    with jax.enable_x64(True):
+        others = {n: tuple(_elsewhere(result, n, even, target, own.power, side * experiment.towards(n)) for side in (-1, 1))
+                  for n in vague}  # fmt: skip
     notices = missed(result) if isinstance(result, FitResult) else ()
-    return DesignedInput(quantities, own, even, motion, float(rate), values, units, now, flat, best, longer, needed, notices)
+    return DesignedInput(quantities, own, even, motion, float(rate), values, units, now, flat, best, longer, needed, notices,
+                         {n: tuple(sides) for n, sides in others.items()}, experiment.active_mass)  # fmt: skip
+
+
+def _elsewhere(
+    given: FitResult | AbstractTask, name: str, record: Lengthening, target: str | None, power: np.ndarray, step: np.ndarray
+) -> tuple[float, float]:
+    """A quantity's value a step away from the fit, and the standard error there with a motion; nan where no muscle is."""
+    try:
+        there = Experiment.of(given, (name,), record, target, step)
+    except OperatingPointError:
+        return np.nan, np.nan
+    return there.here.values[name][0], there.errors(power)[name]
 
 
 class Experiment(NamedTuple):
@@ -126,6 +144,7 @@ class Experiment(NamedTuple):
 
     here: Here
     quantity: tuple[str, ...]
+    active_mass: float | None
     start: Float[np.ndarray, "free free"]
     apart: Float[np.ndarray, "free free"]
     frequency: Float[np.ndarray, " lines"]
@@ -133,10 +152,19 @@ class Experiment(NamedTuple):
 
     @classmethod
     def of(
-        cls, given: FitResult | AbstractTask, quantity: Iterable[str], record: Lengthening, target: str | None
+        cls,
+        given: FitResult | AbstractTask,
+        quantity: Iterable[str],
+        record: Lengthening,
+        target: str | None,
+        step: Float[np.ndarray, " free"] | None = None,
     ) -> "Experiment":
-        """Of a record, at the values of a fit or task. Needs double precision."""
+        """Of a record, at the values of a fit or task, or a step of its θ away from them. Needs double precision."""
         problem, theta, derived = _problem(given)
+        if step is not None:
+            theta = theta + step
+            parts = (dataclasses.replace(part, task=part.task_at(theta)) for part in problem.parts)
+            problem = dataclasses.replace(problem, parts=tuple(parts))
         seen = seen_here(problem, theta)
         here = Here.of(problem, seen, derived)
         for name in quantity:
@@ -150,9 +178,16 @@ class Experiment(NamedTuple):
         start = np.diag(problem.prior) + (here.information if isinstance(given, FitResult) else 0.0)
         still = dataclasses.replace(design, task=task, lengthening=None)
         own, coordinates = coordinates_of(like, theta, task)
+        wide = with_moved_mass(like, coordinates, task)
+        more = len(wide.names) - len(own)
+        own, place = np.append(own, len(theta))[: len(wide.names)], np.append(theta, 0.0)
+        apart = start + design_information(problem, theta, still)
+        start, apart = (np.asarray(block_diag(matrix, np.eye(more))) for matrix in (start, apart))
+        here = here._replace(gradients={name: np.pad(g, (0, more)) for name, g in here.gradients.items()})
         lines = np.zeros((len(record.frequency), *start.shape))
-        lines[:, own[:, None], own] = information_of_lines(task, coordinates, theta[own], record.frequency, record.seconds)
-        return cls(here, tuple(quantity), start, start + design_information(problem, theta, still), record.frequency, lines)
+        lines[:, own[:, None], own] = information_of_lines(task, wide, place[own], record.frequency, record.seconds)
+        assumed = None if "m_w" in coordinates.names else float(task["m_w"])
+        return cls(here, tuple(quantity), assumed, start, apart, record.frequency, lines)
 
     @property
     def rows(self) -> Float[np.ndarray, "quantities free"]:
@@ -190,6 +225,15 @@ class Experiment(NamedTuple):
         known = self.start + times * record
         after = np.linalg.pinv(known, hermitian=True)
         return {name: float(np.sqrt(g @ after @ g)) for name, g in self.here.gradients.items()}
+
+    def towards(self, name: str) -> Float[np.ndarray, " free"]:
+        """The step `Σ g / √(gᵀ Σ g)` of the fit's θ to the likeliest muscle in which a quantity is a standard error larger.
+
+        Σ is the covariance by what is known without the record.
+        """
+        g = self.here.gradients[name]
+        far = np.linalg.pinv(self.start, hermitian=True) @ g
+        return (far / np.sqrt(g @ far))[: len(self.here.coordinates.names)]
 
     def times_for(self, power: Float[np.ndarray, " lines"], error: float) -> float:
         """How many times as long a record must be for a relative error of every quantity; infinite where none is."""
