@@ -1,8 +1,9 @@
 """The designed motion against the flat one on simulated repeats: `python benchmarks/perturbed_design.py --repeats 300`.
 
-Of the bundled knee extension, carried to nothing but its fit: for every repeat the force is drawn in the linear Gaussian law
-(the dynamic stiffness at the fit times the motion, and noise of the model's density), and ln of the four coefficients is
-found by least squares of the whitened ordinates, without a prior and with the noise known. Prints the variances.
+Of the bundled knee extension as fitted. For every repeat the force is drawn in the linear Gaussian law: the dynamic
+stiffness at the fit times the motion, and noise of the model's density. ln of the four coefficients and of the mass that
+moves is found by least squares of the whitened ordinates. What is known of them besides (the data of the fit, the prior, the
+fluctuations of the record) is an estimate that is drawn, too, with that covariance. Prints the variances.
 """
 
 import argparse
@@ -15,30 +16,42 @@ import jaxmuscle as jm
 from jaxmuscle._common.arrays import as_arrays
 from jaxmuscle.response._input_response import parts_of_stiffness
 from jaxmuscle.response._linearised import linearise
+from jaxmuscle.uncertainty._input_design import Experiment
 
 COEFFICIENTS = ("k_w", "k_z", "c_w", "c_z")
+FREE = (*COEFFICIENTS, "m_z")
 
 
-def repeats(task, made, power, count, seed):
-    """ln of the coefficients over their true values, in repeats with these lines."""
+def beside(result, made):
+    """Information of ln of what is free, without the motion; noise and harmonic, which are not in the response, left out."""
+    experiment = Experiment.of(result, made.quantity, made.even, None)
+    names = [*experiment.here.coordinates.names, "m_z"]
+    sd = np.append(experiment.here.coordinates.sd, jm.model.PARAMETERS["m_z"].prior_sd)
+    own = [names.index(name) for name in FREE]
+    covariance = np.linalg.inv(experiment.apart)[np.ix_(own, own)] * np.outer(sd[own], sd[own])
+    return np.linalg.inv(covariance)
+
+
+def repeats(task, made, power, known, count, seed):
+    """ln of what is free over its true value, in repeats with these lines."""
     rng, f, seconds = np.random.default_rng(seed), made.frequency, made.lengthening.seconds
     sd = np.sqrt(np.asarray(jm.response.noise_density(task, f)) / (4 * seconds))
     moved = np.sqrt(2 * power) / 2
-    true = np.array([float(task[name]) for name in COEFFICIENTS])
+    true = np.array([float(task[name]) for name in FREE])
+    root = np.linalg.cholesky(known).T
 
     @jax.jit
-    def ordinates(x):
-        changed = as_arrays(task).replace(**dict(zip(COEFFICIENTS, true * jax.numpy.exp(x), strict=True)))
-        return parts_of_stiffness(changed, linearise(changed), f) * moved / sd
+    def data(x):
+        changed = as_arrays(task).replace(**dict(zip(FREE, true * jax.numpy.exp(x), strict=True)))
+        ordinates = parts_of_stiffness(changed, linearise(changed), f) * moved / sd
+        return jax.numpy.concatenate([jax.numpy.ravel(ordinates), root @ x])
 
-    slopes = jax.jit(jax.jacfwd(ordinates))
-    reply = np.asarray(ordinates(np.zeros(4)))
+    slopes, none = jax.jit(jax.jacfwd(data)), np.zeros(len(FREE))
+    reply = np.asarray(data(none))
     found = []
     for _ in range(count):
         seen = reply + rng.standard_normal(reply.shape)
-        found.append(scipy.optimize.least_squares(
-            lambda x, seen=seen: np.ravel(ordinates(x) - seen), np.zeros(4), lambda x: np.reshape(slopes(x), (-1, 4))
-        ).x)  # fmt: skip
+        found.append(scipy.optimize.least_squares(lambda x, seen=seen: data(x) - seen, none, slopes).x)
     return np.array(found)
 
 
@@ -54,7 +67,8 @@ def main():
         for quantity, name in zip(("K_w0", "K_z0", "C_w0", "C_z0"), COEFFICIENTS, strict=True):
             made = jm.design_input(result, quantity)
             i = COEFFICIENTS.index(name)
-            sd = [repeats(result.task, made, lines.power, asked.repeats, 1)[:, i].std(ddof=1)
+            known = beside(result, made)
+            sd = [repeats(result.task, made, lines.power, known, asked.repeats, 1)[:, i].std(ddof=1)
                   for lines in (made.even, made.lengthening)]  # fmt: skip
             ratio = (sd[0] / sd[1]) ** 2
             band = f"{made.frequency[0]:g}-{made.frequency[-1]:g}"
