@@ -898,7 +898,7 @@ def test_a_designed_motion(tmp_path):
     assert said.endswith("fit RECORD.csv --task prescribed-length --window 10:30 --out out/moved\n")
     said = run("design", preset, *asked, "--error", "10", "--out", tmp_path / "out", "--force").stdout
     end = 10 + 20 * np.ceil(table["needed"]["seconds"] / 20)
-    assert end > 30 and f"play it for {end:.3g} s, and analyse the last {end - 10:.3g} s" in " ".join(said.split())
+    assert end > 30 and f"Play {end:.3g} s and analyse the last {end - 10:.3g} s" in " ".join(said.split())
     assert said.endswith(f"--window 10:{end:g} --out out/moved\n")  # as long as is said above
     for arguments, message in (
         (("--out", tmp_path / "out"), "motor.csv: is there already; overwrite it with --force"),

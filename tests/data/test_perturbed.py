@@ -238,6 +238,21 @@ def test_steady_part_and_window():
         whole.steady((10, 14)).frequency_response()
 
 
+def test_the_hold_of_a_weak_force_that_answers_with_half_of_itself():
+    moved, force, _ = drawn(1, 0.05)
+    weak, still = 3.0, 0 * np.linspace(0, 1, 300)
+    ramp = np.linspace(0, weak, 300)
+    whole = recorded(np.concatenate([still, moved[0], still]), np.concatenate([ramp, force[0] - MEAN + weak, ramp[::-1]]))
+    assert np.std(force[0]) > 0.3 * weak
+    with pytest.raises(ValueError, match="no plateau found"):
+        whole.force.steady()
+    held = whole.steady()
+    assert held.window is not None and held.window == held.displacement.window
+    assert 3 <= held.window[0] < 5 < 61 < held.window[1] <= 63
+    np.testing.assert_array_equal(held.force.whole, whole.force.whole)  # only looked for without the answer
+    assert sum("steady part" in notice for notice in held.notices) == 1
+
+
 UNITS = {  # units of the force's and of the displacement's column, lever arm, their scales
     "plain": ("N", "m", None, 1.0, 1.0),
     "small": ("mN", "mm", None, 1e3, 1e3),

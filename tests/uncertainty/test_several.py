@@ -104,7 +104,8 @@ def test_information_adds_up(x64):
     levels = [design.name for design in found.designs if "force level" in design.name]
     assert levels == ["a second force level 0.5 times as high (low)", "a second force level 2 times as high (high)"]
     assert sum("10 times as long" in design.name for design in found.designs) == 2
-    assert "low: Isometric, P_w = 4 N; high: Isometric, P_w = 8 N" in found.present.task
+    held = "Isometric (insertion held, force measured)"
+    assert f"low: {held}, P_w = 4 N; high: {held}, P_w = 8 N" in found.present.task
 
 
 @pytest.mark.slow

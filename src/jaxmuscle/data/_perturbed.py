@@ -138,13 +138,29 @@ class PerturbedRecording(Printed, eqx.Module):
     def steady(self, window: Sequence[float | int] | None = None) -> "PerturbedRecording":
         """The recording with the part as window in which the mean force is held: given, or found as by `Recording.steady`.
 
-        The running median that finds it passes over the perturbation. Both channels are cut alike.
+        Where a weak force answers with more than a tenth of itself, so that none is found, it is looked for in what is left
+        of the force without the answer of a spring, a damper and a mass. Both channels are cut alike.
 
         **Raises:** `ValueError` as `Recording.steady`.
         """
-        held = self.force.steady(window)
+        try:
+            held = self.force.steady(window)
+        except ValueError:
+            if window is not None:
+                raise
+            found = self._without_answer().steady()  # or it raises the same
+            held = self.force._with(self.force.whole, self.rate, found.window, found.notices)
         moved = self.displacement.steady(held.window)
         return PerturbedRecording(held, moved, name=self.name, source=self.source, notices=self.notices)
+
+    def _without_answer(self) -> Recording:
+        """The force less `K x + B x' + I x''` of the displacement, by least squares over all of the recording."""
+        x = self.displacement.whole
+        speed = np.gradient(x, 1 / self.rate)
+        columns = np.stack([np.ones_like(x), x, speed, np.gradient(speed, 1 / self.rate)], axis=1)
+        columns /= np.linalg.norm(columns, axis=0)
+        sizes = np.linalg.lstsq(columns, self.force.whole, rcond=None)[0]
+        return self.force._with(self.force.whole - columns[:, 1:] @ sizes[1:], self.rate, None, self.force.notices)
 
     def frequency_response(self, settings: SpectrumSettings | str | None = None) -> FrequencyResponse:
         """The dynamic stiffness H(f) by Welch's segments: what of the force follows the displacement.

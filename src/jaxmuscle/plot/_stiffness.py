@@ -17,7 +17,7 @@ POINTS: dict[str, Any] = {"fmt": "o", "ms": 2.8, "lw": 0.8, "zorder": 3}
 def gain(ax: Axes, response: Any, curve: Curve | None = None, title: str = "Dynamic stiffness") -> None:
     """The gain with two standard errors either way, and the gain of a curve with its name, at the same frequencies.
 
-    Points whose error is larger than the curve, where nothing moved the insertion, are left out.
+    Points of which two standard errors are larger than the curve, where nothing moved the insertion, are left out.
     """
     f, known, shown = response.frequency, np.isfinite(response.stderr), _shown(response, curve)
     low = np.minimum(2 * response.stderr, 0.95 * response.gain)  # a bar to 0 has no end on a logarithmic axis
@@ -69,8 +69,8 @@ def stiffness_residuals(ax: Axes, part: Any) -> None:
 
 
 def _shown(response: Any, curve: Curve | None) -> np.ndarray:
-    """Which points say something: those whose error is smaller than the curve, where there is one."""
-    return np.full(len(response.frequency), True) if curve is None else ~(response.stderr > np.abs(curve[1]))
+    """Which points say something: those with two standard errors smaller than the curve, where there is one."""
+    return np.full(len(response.frequency), True) if curve is None else ~(2 * response.stderr > np.abs(curve[1]))
 
 
 def _smooth(f: np.ndarray, values: Any) -> tuple[np.ndarray, np.ndarray]:
