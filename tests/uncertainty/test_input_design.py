@@ -130,7 +130,7 @@ def test_what_a_record_tells_if_the_muscle_is_another_one():
         with jax.enable_x64(True):
             known = Experiment.of(other, ("K_w0",), made.even, None).errors(made.lengthening.power)
         assert error == pytest.approx(known["K_w0"], rel=1e-6)
-    assert f"if it is {low:.3g} N/m" in " ".join(str(made).split())
+    assert f"K_w0 may well be {low:.3g} N/m or {high:.3g} N/m instead of" in " ".join(str(made).split())
     assert made.to_dict()["elsewhere"]["K_w0"][0] == {"value": low, "stderr": below}
 
 
@@ -243,6 +243,7 @@ def test_an_even_design_is_the_flat_one():
     made = designed(spread=1.0)
     assert made.gain == pytest.approx(1.0)
     assert not made.moves and "this motion is flat itself" in str(made)
+    assert "so it is one to begin with" in " ".join(str(made).split()) and "do not begin" not in str(made)
 
 
 @pytest.mark.slow

@@ -111,8 +111,8 @@ def _held(result: "FitResult") -> list[str]:
         return []
     told = [f"{name} = {1e3 * float(task[name]):.3g} mm" if name in LENGTHS else f"{name} = {float(task[name]):.3g} kg"
             for name in held]  # fmt: skip
-    means = ("The data do not tell it, and the verdict notices no wrong one. With half or twice as much C_w0 changes by "
-             "about 10 %, K_w0 by 5 % (docs/perturbed.md). To have that in the errors fit it: free=(*result.free, 'm_w')"
+    means = ("The data do not tell it, and the verdict notices no wrong one. Where it is wrong, C_w0 and K_w0 are, too "
+             "(docs/perturbed.md has by how much). To have that in the errors fit it: free=(*result.free, 'm_w')"
              if moved else
              "A held force tells no length and no mass: with half of both x_ref, stiffness, damping and masses would be "
              "twice as large, and the fit the same")  # fmt: skip

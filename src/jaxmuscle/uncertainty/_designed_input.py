@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure, SubFigure
 
 USUAL = PARAMETERS["m_w"].default  # kg
+FEWER_LINES = 1.6  # times as long as a part of a longer motion
 SHOWN = 2.0  # times the even density: where a design moves the most
 DOUBTFUL = 0.3  # relative standard error
 ASSUMED = (
@@ -201,10 +202,9 @@ class DesignedInput(Printed, Result, eqx.Module):
             lines += [f"  to know {goal}, {seconds:.3g} s of record are enough"]
             if periods > 1:
                 lines[-1] += f": {periods} periods of this motion. Play {end:.3g} s and analyse the last {end - begin:.3g} s"
-            elif seconds < 0.5 * period:
-                shorter = float(np.ceil(seconds))
-                lines[-1] += (f", less than the {period:.3g} s of this motion. For a shorter one design again "
-                              f"(--seconds {shorter:g}, in Python seconds={shorter:.1f})")  # fmt: skip
+            elif (shorter := float(np.ceil(FEWER_LINES * seconds))) < period:
+                lines[-1] += (f", less than the {period:.3g} s of this motion. A shorter motion has fewer frequencies: "
+                              f"design again with more (--seconds {shorter:g}, seconds={shorter:.1f})")  # fmt: skip
             else:
                 lines[-1] += f": one period of this motion. Play {end:.3g} s and analyse the last {period:.3g} s"
         return lines
@@ -217,28 +217,32 @@ class DesignedInput(Printed, Result, eqx.Module):
             lines[0] += ". If you measured another one, fit with it first (mean and unit of the target)"
         if self.active_mass is not None:
             held = f"{self.active_mass:.3g}"
-            lines += [f"  assumed: the active mass m_w is {held} kg, as here. No record tells it. With half or twice as "
-                      "much a fit has C_w0 off by about 10 %, K_w0 by 5 %"]  # fmt: skip
+            lines += [f"  assumed: the active mass m_w is {held} kg, as here. No record tells it. Where it is "
+                      "wrong, C_w0 and K_w0 are, too (docs/perturbed.md has by how much)"]  # fmt: skip
             if float(held) != USUAL:
-                lines[-1] += f". The fit of a record takes {USUAL:g} kg unless you say --fix m_w={held}"
+                lines[-1] += f". The fit of a record takes {USUAL:g} kg; to compare with this design say --fix m_w={held}"
         return lines
 
     def _vague(self) -> list[str]:
         """A motion designed for what is hardly known is none to begin with."""
         known = {name: self.percent(name, self.now) for name in self.quantity}
         vague = [f"{name} to {_digits(percent)} %" for name, percent in known.items() if percent > 100 * DOUBTFUL]
-        return [f"  so far only known: {', '.join(vague)}. So do not begin with this motion: record a first minute with a "
-                "flat one (--spread 1, spread=1.0), fit it, and design again from that fit"] * bool(vague)  # fmt: skip
+        what = "This motion is flat, so it is one to begin with. Fit its record, and design again from that fit"
+        if self.moves:
+            what = ("So do not begin with this motion: record a first minute with a flat one (--spread 1, spread=1.0), fit "
+                    "it, and design again from that fit")  # fmt: skip
+        return [f"  so far only known: {', '.join(vague)}. {what}"] * bool(vague)
 
     def _elsewhere(self) -> list[str]:
         """What the record would tell if the muscle is not as fitted, as far as that is likely."""
         lines = []
         for name, sides in self.elsewhere.items():
             unit = "" if self.units[name] == "1" else f" {self.units[name]}"
-            told = [f"if it is {value:.3g}{unit}, to {_digits(100 * error / abs(value))} %"
-                    for value, error in sides if np.isfinite(value) and value != 0]  # fmt: skip
-            lines += [f"  {name} may well be one standard error off {self.values[name]:.3g}{unit}. Then this record would "
-                      f"tell it: {'; '.join(told)}"] * bool(told)  # fmt: skip
+            known = [(value, error) for value, error in sides if np.isfinite(value) and value != 0]
+            may = " or ".join(f"{value:.3g}{unit}" for value, _ in known)
+            to = " or ".join(f"{_digits(100 * error / abs(value))} %" for value, error in known)
+            lines += [f"  {name} may well be {may} instead of {self.values[name]:.3g}{unit}. Then this record would tell it "
+                      f"to {to}"] * bool(known)  # fmt: skip
         return lines
 
 
