@@ -119,13 +119,13 @@ def design_input(
     now, flat, best = (experiment.errors(p) for p in (None, even.power, own.power))
     longer = {one: experiment.errors(own.power, one / seconds) for one in durations}
     needed = None if error is None else (float(error), seconds * experiment.times_for(own.power, error))
-    vague = {n: now[n] for n in quantities if now[n] > DOUBTFUL * abs(values[n])}
+    vague = [n for n in quantities if now[n] > DOUBTFUL * abs(values[n])]
     with jax.enable_x64(True):
         others = {n: tuple(_elsewhere(result, n, even, target, own.power, side * experiment.towards(n)) for side in (-1, 1))
                   for n in vague}  # fmt: skip
     notices = missed(result) if isinstance(result, FitResult) else ()
     return DesignedInput(quantities, own, even, motion, float(rate), values, units, now, flat, best, longer, needed, notices,
-                         {n: tuple(sides) for n, sides in others.items()}, experiment.active_mass)  # fmt: skip
+                         others, experiment.active_mass)  # fmt: skip
 
 
 def _elsewhere(
