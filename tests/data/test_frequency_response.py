@@ -52,6 +52,26 @@ def test_no_coherence_no_error():
     assert np.isfinite(response.stderr[[0, 1, 3]]).all()
 
 
+def test_no_response_is_told_from_a_small_one():
+    """Errors alone are called a response as often as stated, and hardly less; 48 frequencies that add up are one."""
+    f, sd, rng = np.linspace(0.5, 12.0, 48), np.linspace(5.0, 20.0, 48), np.random.default_rng(3)
+    errors = sd * (rng.standard_normal((2000, 48, 2)) @ [1, 1j])
+    p = np.array([jm.FrequencyResponse(f, error, sd).p_none for error in errors])
+    for level in (0.05, 0.2):
+        spread = 4 * np.sqrt(level / p.size)
+        assert 0.6 * level - spread < np.mean(p <= level) < level + spread
+    # A spring below the error of most points; all of them together know it to a sixth.
+    spring = 6 / np.sqrt(np.sum(1 / sd**2))
+    assert spring < np.median(sd)
+    assert np.mean([jm.FrequencyResponse(f, error + spring, sd).p_none <= 1e-3 for error in errors[:200]]) > 0.9
+    assert "does not follow the displacement" in str(jm.FrequencyResponse(f, errors[np.argmax(p)], sd))
+    assert "does not follow" not in str(jm.FrequencyResponse(f, errors[0] + 10 * spring, sd))
+    # A point without error counts for nothing.
+    assert jm.FrequencyResponse(f, errors[0], np.where(f < 0.6, np.inf, sd)).p_none == pytest.approx(
+        jm.FrequencyResponse(f[1:], errors[0][1:], sd[1:]).p_none, rel=1e-9
+    )
+
+
 def test_tables_are_exact():
     for coherence in (COHERENCE, None):
         response = jm.FrequencyResponse(F, GAIN * np.exp(1j * PHASE), [1.5, np.inf, 0.1, 1 / 3], coherence, **FIELDS)

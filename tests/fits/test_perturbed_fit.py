@@ -182,6 +182,24 @@ def test_a_task_that_cannot_be_moved(minute):
     assert isinstance(jm.task_for(target), jm.PrescribedLength)
 
 
+def test_a_displacement_that_moved_nothing(minute, tmp_path):
+    """The right force beside a motion of another time: neither a fit nor one trial of several takes it."""
+    force, moved = minute.force.whole, np.roll(minute.displacement.whole, 20 * RATE)
+    wrong = jm.PerturbedRecording.from_array(force, moved, RATE, source="other.csv")
+    assert any("sign of the displacement is not found" in notice for notice in wrong.notices)
+    with pytest.raises(ValueError, match=r"does not follow the displacement at any frequency.*Check that the displacement"):
+        jm.fit(jm.PrescribedLength(), wrong)
+    with pytest.raises(ValueError, match=r"does not follow"):
+        jm.fit(jm.PrescribedLength(), wrong.frequency_response())
+    with pytest.raises(ValueError, match=r"trial 2 of 2 \(other\.csv\): the force does not follow"):
+        jm.fit(jm.PrescribedLength(), [minute, wrong])
+    time = np.arange(force.size) / RATE
+    path = tmp_path / "wrong.csv"
+    np.savetxt(path, np.stack([time, force, 1e3 * moved], 1), delimiter=",", header="time_s,force_N,displacement_mm", comments="")
+    with pytest.raises(ValueError, match=r"does not follow"):
+        jm.fit(jm.PrescribedLength(), path)
+
+
 def test_a_target_keeps_its_stiffness(minute, tmp_path):
     target = minute.target()
     target.save(tmp_path / "target.toml")

@@ -7,6 +7,7 @@ from typing import Annotated, Any, Literal
 
 import equinox as eqx
 import numpy as np
+import scipy
 from jaxtyping import Complex, Float
 from msgspec import Meta
 
@@ -17,9 +18,11 @@ from jaxmuscle._common.files import write_text
 from jaxmuscle._common.text import folded
 from jaxmuscle.spectra._settings import require
 
+from ._second_order import parts, second_order_shape
 from ._target_fields import frozen
 
 Numbers = list[float]
+UNSEEN = 1e-3  # how probable by chance a response may be at most, to be one
 COLUMNS = ("frequency_hz", "gain_N/m", "phase_deg", "stderr_N/m", "coherence")
 
 
@@ -175,6 +178,23 @@ class FrequencyResponse(Printed, eqx.Module):
         with np.errstate(divide="ignore", invalid="ignore"):
             return (1 - self.coherence) / (2 * self.coherence) * (self.gain / self.stderr) ** 2
 
+    @property
+    def p_none(self) -> float:
+        """How probable a response as large as this one is if the force does not follow the displacement at all.
+
+            chi² = Σ |H|² / stderr²   over the frequencies, and the part of it along (K + iωB - ω²I) / stderr
+
+        have the chi² distribution with 2 · frequencies and with 3 degrees of freedom where H is 0. The smaller of both
+        probabilities is doubled, since two are looked at. Where neighbouring frequencies share errors it is a little too
+        small. Above 0.001 (`UNSEEN`) the displacement says nothing of the muscle, and a fit refuses it.
+        """
+        one = self.known
+        weight = 1 / np.concatenate([one.stderr] * 2)
+        seen, shapes = parts(one.value) * weight, [second_order_shape(one.frequency, unit) for unit in np.eye(3)]
+        basis = np.linalg.qr(np.stack([parts(shape) * weight for shape in shapes], axis=1))[0]
+        both = (seen @ seen, seen.size), (np.sum((basis.T @ seen) ** 2), min(3, seen.size))
+        return float(min(1.0, 2 * min(scipy.stats.chi2.sf(size, count) for size, count in both)))
+
     def to_table(self) -> dict[str, Any]:
         """The response as plain lists, for TOML and JSON; an infinite error is the text "inf"."""
         table: dict[str, Any] = {
@@ -232,6 +252,9 @@ class FrequencyResponse(Printed, eqx.Module):
             low = int(np.argmin(self.coherence))
             median = np.median(self.coherence)
             lines.append(f"  coherence {median:.2f} (median), lowest {self.coherence[low]:.2f} at {f[low]:.3g} Hz")
+        if self.p_none > UNSEEN:
+            lines.append("  notice    the force does not follow the displacement: no gain is larger than chance makes it. Is this "
+                         "the channel that moved the insertion?")  # fmt: skip
         return folded(lines + [f"  notice    {notice}" for notice in self.notices])
 
 

@@ -38,9 +38,9 @@ def second_order_fit(response: Response, delayed: bool) -> SecondOrder:
     scale = np.append(scale, 1 / (2 * np.pi * f.max()))[:count]
 
     def residuals(x: Float[np.ndarray, " parameters"]) -> Float[np.ndarray, " twice"]:
-        return _parts(second_order_shape(f, x * scale) - response.value) * weight
+        return parts(second_order_shape(f, x * scale) - response.value) * weight
 
-    start = np.linalg.lstsq(shapes, _parts(response.value) * weight)[0]
+    start = np.linalg.lstsq(shapes, parts(response.value) * weight)[0]
     found = scipy.optimize.least_squares(residuals, np.append(start, 0.0)[:count], x_scale="jac", jac="3-point")
     inverse = np.linalg.pinv(found.jac.T @ found.jac)
     c = response.correlation
@@ -57,7 +57,7 @@ def lengthens(response: Response) -> float:
     A spring, a damper and a mass, none of them negative, are fitted to H and to -H. Over the chi² of the better one for each
     number, where that is more than 1.
     """
-    shapes, values = _terms(response)[1], _parts(response.value) / np.concatenate([response.stderr] * 2)
+    shapes, values = _terms(response)[1], parts(response.value) / np.concatenate([response.stderr] * 2)
     as_it_is, turned = (scipy.optimize.nnls(shapes, sign * values)[1] ** 2 for sign in (1, -1))
     return float((turned - as_it_is) / max(1.0, min(turned, as_it_is) / values.size))
 
@@ -66,9 +66,10 @@ def _terms(response: Response) -> tuple[Float[np.ndarray, " 3"], Float[np.ndarra
     """Scales of K, B and I, and the response to one of each, in standard errors."""
     f = response.frequency
     scale = np.abs(response.value).max() / (2 * np.pi * f.max()) ** np.arange(3)
-    shapes = np.stack([_parts(second_order_shape(f, unit * scale)) for unit in np.eye(3)], axis=1)
+    shapes = np.stack([parts(second_order_shape(f, unit * scale)) for unit in np.eye(3)], axis=1)
     return scale, shapes / np.concatenate([response.stderr] * 2)[:, None]
 
 
-def _parts(values: Complex[np.ndarray, " bins"]) -> Float[np.ndarray, " twice"]:
+def parts(values: Complex[np.ndarray, " bins"]) -> Float[np.ndarray, " twice"]:
+    """Real parts, then imaginary parts."""
     return np.concatenate([np.real(values), np.imag(values)])

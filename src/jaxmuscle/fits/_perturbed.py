@@ -8,6 +8,7 @@ import jax
 import numpy as np
 
 from jaxmuscle.data._as_target import as_target
+from jaxmuscle.data._frequency_response import UNSEEN
 from jaxmuscle.data._perturbed import PerturbedRecording
 from jaxmuscle.data._perturbed_target import perturbed_target
 from jaxmuscle.data._target import Target
@@ -15,7 +16,7 @@ from jaxmuscle.data._two_channels import perturbed_recordings
 from jaxmuscle.model._parameters import HARMONIC
 from jaxmuscle.model._rungs import is_base
 from jaxmuscle.model._tasks import AbstractTask, PrescribedLength
-from jaxmuscle.objective._arguments import FitOptions, at_mean, planned
+from jaxmuscle.objective._arguments import FitOptions, at_mean, no_response, planned
 from jaxmuscle.objective._least_squares import least_squares
 from jaxmuscle.objective._starts import starting_points
 from jaxmuscle.response._input_response import dynamic_stiffness
@@ -69,6 +70,7 @@ def recordings_of(given: object, task: AbstractTask | None = None) -> tuple[Pert
 def analysed(recordings: Sequence[PerturbedRecording], task: AbstractTask, options: FitOptions) -> Target:
     """Their target, with the response by the muscle that fits it: found in a few rounds from the nonparametric one."""
     target, points = perturbed_target(recordings), None
+    _check_trials(recordings, target)
     for _ in range(ROUNDS):
         carried, given = at_mean(task, target, options)
         problem = planned(carried, target, dataclasses.replace(given, method="linear")).problem
@@ -80,3 +82,16 @@ def analysed(recordings: Sequence[PerturbedRecording], task: AbstractTask, optio
         points = found.s[np.argsort(np.where(np.isfinite(found.cost), found.cost, np.inf))[:KEPT]]
         target = seen_with(muscle, recordings)
     return target
+
+
+def _check_trials(recordings: Sequence[PerturbedRecording], target: Target) -> None:
+    """Refuse a trial whose force does not follow its displacement, though it would be seen to follow as in all trials."""
+    for number, recording in enumerate(recordings if len(recordings) > 1 else (), 1):
+        own = recording.frequency_response(target.settings).known
+        if own.p_none <= UNSEEN or target.stiffness is None:
+            continue
+        f, value = target.stiffness.frequency, target.stiffness.value
+        usual = np.interp(own.frequency, f, np.real(value)) + 1j * np.interp(own.frequency, f, np.imag(value))
+        apart = dataclasses.replace(own, value=own.value - usual).p_none
+        if apart <= UNSEEN:
+            raise no_response(f"trial {number} of {len(recordings)} ({recording.source})", own.p_none)
