@@ -1,8 +1,8 @@
 """The designed motion against the flat one on simulated repeats: `python benchmarks/perturbed_design.py --repeats 300`.
 
 Of the bundled knee extension as fitted. For every repeat the force is drawn in the linear Gaussian law: the dynamic
-stiffness at the fit times the motion, and noise of the model's density. ln of the four coefficients and of the mass that
-moves is found by least squares of the whitened ordinates. What is known of them besides (the data of the fit, the prior, the
+stiffness at the fit times the motion, and noise of the model's density. ln of the four coefficients and of both masses
+is found by least squares of the whitened ordinates. What is known of them besides (the data of the fit, the prior, the
 fluctuations of the record) is an estimate that is drawn, too, with that covariance. Prints the variances.
 """
 
@@ -19,14 +19,15 @@ from jaxmuscle.response._linearised import linearise
 from jaxmuscle.uncertainty._input_design import Experiment
 
 COEFFICIENTS = ("k_w", "k_z", "c_w", "c_z")
-FREE = (*COEFFICIENTS, "m_z")
+MASSES = ("m_w", "m_z")
+FREE = (*COEFFICIENTS, *MASSES)
 
 
 def beside(result, made):
     """Information of ln of what is free, without the motion; noise and harmonic, which are not in the response, left out."""
     experiment = Experiment.of(result, made.quantity, made.even, None)
-    names = [*experiment.here.coordinates.names, "m_z"]
-    sd = np.append(experiment.here.coordinates.sd, jm.model.PARAMETERS["m_z"].prior_sd)
+    names = [*experiment.here.coordinates.names, *MASSES]
+    sd = np.append(experiment.here.coordinates.sd, [jm.model.PARAMETERS[name].prior_sd for name in MASSES])
     own = [names.index(name) for name in FREE]
     covariance = np.linalg.inv(experiment.apart)[np.ix_(own, own)] * np.outer(sd[own], sd[own])
     return np.linalg.inv(covariance)

@@ -68,8 +68,10 @@ def recorded(
     *,
     reflex: Callable[[np.ndarray], np.ndarray] | None = None,
     mass: float = 0.0,
+    line: float = 0.0,
 ) -> list[jm.PerturbedRecording]:
-    """Recordings of the muscle with noise on its stiffnesses; `reflex`, drive over lengthening; `mass` of a rig."""
+    """Recordings of the muscle with noise on its stiffnesses; `reflex`, drive over lengthening; `mass` of a rig; `line`, of
+    which relative amplitude a sine of 4.25 Hz is in both."""
     sines = Sines(rng, seconds + 2 * MARGIN, rows)
     s = 2j * np.pi * sines.f
     x, v, a = (sines(rms * s**n) for n in range(3))
@@ -78,6 +80,8 @@ def recorded(
     for j in "wz":  # the density of white noise that is drawn 100 times a second
         size = float(task[f"noise_K_{j}"]) * float(task[f"k_{j}"]) * float(task[f"x_ref_{j}"]) ** 2 / np.sqrt(100 * DT)
         noise.append(size * scipy.signal.sosfilt(low, rng.standard_normal(x.shape), axis=0))
+        beat = line * np.sin(2 * np.pi * 4.25 * DT * np.arange(len(x)))[:, None]
+        noise[-1] += float(task[f"k_{j}"]) * float(task[f"x_ref_{j}"]) ** 2 * beat
     drive = np.zeros_like(x) if reflex is None else -sines(rms * reflex(s))
     pull = (force(task, x, v, a, drive, *noise) - mass * a[::2])[::EVERY]
     window = (MARGIN, MARGIN + seconds)

@@ -46,7 +46,7 @@ A parameter has the name of this table wherever you write it:
 ## Values
 
 *Bounds* say which values are physically possible. A name with a dot (●) is free in a default fit: the fit looks for its
-value.
+value. Where a motor moved the insertion, `m_w` and `m_z` are free, too.
 
 | name | symbol | unit | default | bounds | meaning |
 |---|---|---|---|---|---|

@@ -390,6 +390,7 @@ BAD_TOML = {
     "no reason": (dict(provenance='"reconstructed"'), "a reconstructed target needs a reason"),
     "settings": (dict(settings="3"), "settings must be a table"),
     "unknown setting": (dict(settings="{windw = 'hann'}"), "did you mean 'window'?"),
+    "among the settings": (dict(settings="{mean = [12.0]}"), "[settings]: mean: of the target, not of its settings"),
     "above half the rate": (
         dict(frequency_hz="[0.390625, 0.78125, 50.390625]", settings="{rate = 100.0}"),
         "entry 3: frequency 50.3906 Hz is above 50 Hz, half of the rate in [settings]",

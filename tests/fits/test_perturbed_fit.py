@@ -23,12 +23,16 @@ X_REF, RATE, SECONDS = 0.02, 500, 64
 WHOLE = {"K_w0": TRUE["k_w"] * X_REF**2, "K_z0": TRUE["k_z"] * X_REF**2, "C_w0": TRUE["c_w"], "C_z0": TRUE["c_z"]}
 
 
-def muscle_force(x, generator, noise=True):
-    """F_ext of the nonlinear muscle, x_z prescribed: Runge-Kutta steps of 2 ms, noise by scipy's Butterworth filter."""
+def muscle_force(x, generator, noise=True, line=0.0):
+    """F_ext of the nonlinear muscle, x_z prescribed: Runge-Kutta steps of 2 ms, noise by scipy's Butterworth filter.
+
+    `line`, of which amplitude, relative to K_z0, a sine of 4.25 Hz is added to K_z.
+    """
     count, step = len(x), 1 / RATE
     shaping = scipy.signal.butter(2, 50 / (RATE / 2))
     kicks = generator.normal(size=(2, count + 1000)) * np.array([[NOISE["K_w"]], [NOISE["K_z"]]]) * np.sqrt(RATE / 100)
     dk = scipy.signal.lfilter(*shaping, kicks)[:, 1000:] * noise * np.array([[WHOLE["K_w0"]], [WHOLE["K_z0"]]])
+    dk[1] += line * WHOLE["K_z0"] * np.sin(2 * np.pi * 4.25 * np.arange(count) * step)
     half = np.arange(2 * count - 1) * step / 2
     motion = make_interp_spline(np.arange(count) * step, x, k=5)
     x, v, a = (motion(half, order).tolist() for order in (0, 1, 2))
@@ -56,13 +60,15 @@ def muscle_force(x, generator, noise=True):
     return force
 
 
-def recorded(seed, rms=1e-3, top=5.0):
+def recorded(seed, rms=1e-3, top=5.0, line=0.0):
     """A minute with the insertion moved by noise up to `top` Hz; lengthening is -x_z."""
     generator = np.random.default_rng(seed)
     low = scipy.signal.butter(4, top / (RATE / 2), output="sos")
     x = scipy.signal.sosfiltfilt(low, generator.normal(size=SECONDS * RATE + 4000))[2000:-2000]
     x *= rms / np.std(x)
-    return jm.PerturbedRecording.from_array(muscle_force(x, generator), -x, RATE, positive="lengthening", name="minute")
+    return jm.PerturbedRecording.from_array(
+        muscle_force(x, generator, line=line), -x, RATE, positive="lengthening", name="minute"
+    )
 
 
 @pytest.fixture(scope="module")
@@ -86,14 +92,16 @@ def test_stiffness_and_damping_are_known(result):
         low, high = found.interval
         assert low < found.value < high
     assert abs(result["m_z"].value - TRUE["m_z"]) < 3 * result["m_z"].stderr
-    assert result["m_w"].value == TRUE["m_w"]  # a fact, not carried with the mean force
+    active = result["m_w"]  # no record tells it: it is free, so that its doubt is in the errors of the others
+    assert active.free and active.stderr is None and 0.2 < active.value / TRUE["m_w"] < 5
+    assert result.settings["prior_centre"]["m_w"] == TRUE["m_w"]  # not carried with the mean force
 
 
 @pytest.mark.slow
 def test_what_a_fit_says_and_keeps(result, tmp_path):
     text = str(result)
     assert "The model describes the data: chi2 per datum" in text and "PrescribedLength" in text
-    assert "held fixed: m_w = 0.5 kg. The data do not tell it" in text
+    assert "held fixed" not in text
     result.save(tmp_path / "fit.json")
     again = jm.load_result(tmp_path / "fit.json")
     assert str(again) == text
@@ -108,7 +116,7 @@ def test_further_questions_take_it(result):
     stderr = {n: result[n].stderr / result[n].value for n in ("k_w", "k_z", "c_w")}
     text = str(known)
     assert all(name in text for name in stderr)
-    profile = jm.profile(result, "k_z")
+    profile = jm.profile(result, "k_z", with_priors=True)  # that of m_w counts in the interval
     low, high = result["k_z"].interval
     np.testing.assert_allclose((profile.low, profile.high), (low, high), rtol=0.02)
     assert jm.goodness(result, replicates=99).p_value > 0.001
@@ -195,7 +203,9 @@ def test_a_displacement_that_moved_nothing(minute, tmp_path):
         jm.fit(jm.PrescribedLength(), [minute, wrong])
     time = np.arange(force.size) / RATE
     path = tmp_path / "wrong.csv"
-    np.savetxt(path, np.stack([time, force, 1e3 * moved], 1), delimiter=",", header="time_s,force_N,displacement_mm", comments="")
+    np.savetxt(
+        path, np.stack([time, force, 1e3 * moved], 1), delimiter=",", header="time_s,force_N,displacement_mm", comments=""
+    )
     with pytest.raises(ValueError, match=r"does not follow"):
         jm.fit(jm.PrescribedLength(), path)
 
@@ -278,8 +288,40 @@ def test_points_of_no_use_are_left_out(published):
 
 @pytest.mark.slow
 def test_two_minutes_know_more(minute, result):
-    both = jm.fit(jm.PrescribedLength(), [minute, recorded(6)])
+    """Of a muscle whose active mass is known: with a free one its doubt, which no record lessens, is in the errors."""
+    one, both = (jm.fit(jm.PrescribedLength(), trials, fix={"m_w": TRUE["m_w"]}, check_seeds=0)
+                 for trials in (minute, [minute, recorded(6)]))  # fmt: skip
     assert both.success and both.adequate
     for name, true in WHOLE.items():
         assert abs(both[name].value - true) < 3.9 * both[name].stderr
-        assert 0.5 < both[name].stderr / result[name].stderr < 0.95  # 1 / √2 is expected
+        assert 0.5 < both[name].stderr / one[name].stderr < 0.95  # 1 / √2 is expected
+        assert one[name].stderr < 1.1 * result[name].stderr, name
+    assert one["K_z0"].stderr < 0.9 * result["K_z0"].stderr
+    assert both["m_w"].value == TRUE["m_w"] and "held fixed: m_w = 0.5 kg. The data do not tell it" in str(both)
+
+
+@pytest.mark.slow
+def test_a_line_in_the_fluctuations_is_fitted_though_noise_alone_passes():
+    """Left out, it would move C_w0 and K_z0 by about one stated error. (Without one none is fitted: `minute`.)"""
+    result = jm.fit(jm.PrescribedLength(), recorded(5, line=0.003), check_seeds=0)
+    before, after = result.ladder[:2]
+    assert (before.model, after.number) == ("noise alone", 0) and before.p >= 0.01
+    assert after.aic < before.aic - 2 and result.adequate
+    assert abs(result.only.task["harmonic_frequency"] - 4.25) < 0.2
+    for name, true in WHOLE.items():
+        assert abs(result[name].value - true) < 3 * result[name].stderr, name
+
+
+@pytest.mark.slow
+def test_a_hold_beside_it_is_of_the_same_masses(minute, result):
+    """Both tasks share the masses, which are not carried with the mean force; a hold more leaves no larger errors."""
+    force = muscle_force(np.zeros(SECONDS * RATE), np.random.default_rng(8))
+    hold = jm.Recording(force, RATE, unit="N", name="held").steady((2.0, 62.0)).target()
+    both = jm.fit_joint({"moved": minute, "held": hold}, starts=16, seeds=0)
+    assert both.success and both.adequate
+    assert both["m_w"].free and both["m_z"].free and not any("m_w@" in name or "m_z@" in name for name in both.parameters)
+    assert both.settings["prior_centre"]["m_w"] == both.settings["prior_centre"]["m_z"] == 0.5
+    assert both.settings["carried"] > 1.1
+    for name, true in WHOLE.items():
+        assert abs(both[name].value - true) < 3.9 * both[name].stderr, name
+        assert both[name].stderr < 1.1 * result[name].stderr, name

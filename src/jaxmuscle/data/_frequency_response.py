@@ -253,8 +253,8 @@ class FrequencyResponse(Printed, eqx.Module):
             median = np.median(self.coherence)
             lines.append(f"  coherence {median:.2f} (median), lowest {self.coherence[low]:.2f} at {f[low]:.3g} Hz")
         if self.p_none > UNSEEN:
-            lines.append("  notice    the force does not follow the displacement: no gain is larger than chance makes it. Is this "
-                         "the channel that moved the insertion?")  # fmt: skip
+            lines.append("  notice    the force does not follow the displacement: no gain is larger than chance makes it. "
+                         "Is this the channel that moved the insertion?")  # fmt: skip
         return folded(lines + [f"  notice    {notice}" for notice in self.notices])
 
 

@@ -6,6 +6,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple, get_args
 
+import msgspec
 import numpy as np
 from msgspec import Meta
 
@@ -220,6 +221,10 @@ def settings_of(table: Any, where: str, needed: Iterable[str] = ()) -> SpectrumS
     """Spectrum settings of a target's table. Raises `TargetError`."""
     if not isinstance(table, dict):
         raise TargetError(f"{where}: settings must be a table: a line [settings], then one setting per line")
+    own = {field.encode_name for field in msgspec.structs.fields(TargetFile)}
+    if misplaced := [key for key in table if key in own]:
+        said = f"{where}: {', '.join(misplaced)}: of the target, not of its settings"
+        raise TargetError(f"{said}. Move this above the line [settings]: below it everything counts as a setting")
     try:
         return SpectrumSettings.from_dict(table, needed=needed)
     except ValueError as error:

@@ -4,15 +4,14 @@ from typing import NamedTuple
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from jaxmuscle.model._parameters import HARMONIC
-from jaxmuscle.objective._consequences import consequences
 from jaxmuscle.objective._least_squares import Minima, least_squares
 from jaxmuscle.objective._problem import FitProblem
 from jaxmuscle.objective._residuals import Residuals
 
-from ._adequacy import drawn_log_residuals, generator_of
+from ._adequacy import Endpoint, drawn_log_residuals, generator_of
 from ._checks import seen_best
 from ._refit import lines_of, over_band, without_fitted
 
@@ -83,15 +82,27 @@ def p_value(problem: FitProblem, objective: Residuals, final: Minima) -> float:
     theta[:, columns[0]] = problem.coordinates.theta_of("harmonic_amplitude", ABSENT)
     objective = _pinned(objective, columns)
     without = least_squares(objective, problem.coordinates.from_theta(theta), STEPS)
-    here = seen_best(objective, without)
-    found = consequences(objective, here)
+    ended = Endpoint(problem, objective, seen_best(objective, without))
+    return _p_of_line(ended, np.delete(np.arange(len(names)), columns))
+
+
+def p_of_line_left_out(ended: Endpoint) -> float:
+    """The same for a fit of a model without harmonic, of one target; 1 where that has no spectrum."""
+    if not len(ended.problem.parts[0].target.bins):
+        return 1.0
+    return _p_of_line(ended, np.arange(len(ended.problem.coordinates.names)))
+
+
+def _p_of_line(ended: Endpoint, kept: Int[np.ndarray, " kept"]) -> float:
+    """`p_value` at the fit without a harmonic; `kept`, the coordinates that are free in it."""
+    problem, objective, here, found = ended.problem, ended.objective, ended.seen, ended.found
     null, own = here.moments[0], objective.parts[0]
     n, sd = len(problem.parts[0].target.bins), np.asarray(own.statistics.sd)
-    kept = np.delete(np.arange(len(names)), columns)
     residual = np.concatenate([found.residuals, np.sqrt(problem.prior[kept]) * here.theta[kept]])
     jacobian = np.concatenate([found.jacobian[:, kept], np.diag(np.sqrt(problem.prior[kept]))])
     (part,) = problem.parts
-    tried = lines_of(part, part.task_at(here.theta), np.asarray(null.power), float(part.target.frequency[-1]))
+    task = part.task_at(here.theta).replace(harmonic_amplitude=ABSENT)
+    tried = lines_of(part, task, np.asarray(null.power), float(part.target.frequency[-1]))
     added = np.zeros((len(tried.square), len(residual)))
     logs = np.log1p(tried.square[:, None] * tried.each / null.power)
     added[:, :n] = -(logs - logs.mean(axis=1, keepdims=True)) / sd

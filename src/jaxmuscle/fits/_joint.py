@@ -14,6 +14,7 @@ from jaxmuscle.model._noises import with_noise
 from jaxmuscle.model._parameters import proper, proper_values, unknown_parameter
 from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.objective._arguments import (
+    MASSES,
     FitOptions,
     Plan,
     base_of,
@@ -77,7 +78,7 @@ def fit_joint(
     response times the correction); `bounds`, `priors`, `key`, `residual`, `coefficient_of_variation`, `max_steps`,
     `increments`, `progress` as in `fit`; `mean_force` {target: (value, sd)}, by default what the
     targets state in newtons, if no `tasks` are given: all tasks are then scaled by one number to the first, with a free
-    P_w each.
+    P_w each. Where one target is of a moved insertion, the masses are not scaled, and are free in all tasks.
 
     **Returns:** a `FitResult` with a part for each target; a fit that fails is one, too, and says why.
 
@@ -180,7 +181,7 @@ def _local_free(
     tasks: Tasks, targets: dict[str, Target], free: Iterable[str] | None, fix: Iterable[str], carried: Iterable[str]
 ) -> dict[str, tuple[str, ...]]:
     """The free parameters of every target's task."""
-    found = {}
+    found, moved = {}, any(target.stiffness is not None for target in targets.values())
     fixed, wanted = ({n: _holders(argument, n, tasks) for n in names or ()} for argument, names in
                      (("fix", fix), ("free", free)))  # fmt: skip
     for t, task in tasks.items():
@@ -188,7 +189,7 @@ def _local_free(
         if free is not None and not here:
             raise ValueError(f"free: none of these belongs to the task of target {t!r}: free one, or leave the target out")
         held = {base_of(n): 0.0 for n, holders in fixed.items() if t in holders}
-        found[t] = free_names(task, None if free is None else here, held, targets[t])
+        found[t] = free_names(task, None if free is None else here, held, targets[t], moved=moved)
         found[t] += ("P_w",) if t in carried and "P_w" not in found[t] else ()
     return found
 
@@ -202,9 +203,11 @@ def _at_means(tasks: Tasks, targets: dict[str, Target]) -> tuple[Tasks, dict[str
         return tasks, {}, None
     first, (mean, _) = next(iter(stated.items()))
     factor = float(at_force(tasks[first], mean)["P_w"]) / float(tasks[first]["P_w"])
-    moved = {name: times_force(task, factor) for name, task in tasks.items()}
-    own = {name: moved[name].replace(P_w=float(moved[name]["P_w"]) * value / mean) for name, (value, _) in stated.items()}
-    return moved | own, stated, factor
+    scaled = {name: times_force(task, factor) for name, task in tasks.items()}
+    if any(target.stiffness is not None for target in targets.values()):  # displacements are known: masses are no scale
+        scaled = {name: task.replace(**{m: tasks[name][m] for m in MASSES}) for name, task in scaled.items()}
+    own = {name: scaled[name].replace(P_w=float(scaled[name]["P_w"]) * value / mean) for name, (value, _) in stated.items()}
+    return scaled | own, stated, factor
 
 
 def _check_known(argument: str, given: Mapping[str, Any], known: list[str]) -> None:

@@ -23,7 +23,7 @@ from jaxmuscle.objective._starts import continued, starting_points
 
 from ._adequacy import ADEQUATE, Endpoint
 from ._checks import Stage
-from ._harmonic_evidence import SIGNIFICANT, p_value
+from ._harmonic_evidence import SIGNIFICANT, p_of_line_left_out, p_value
 
 STARTS = 32
 ALIKE = 2.0
@@ -123,15 +123,17 @@ class Models(NamedTuple):
 def climb(first: Plan, models: Models, descend: Descend, keep: Callable[[Climbed], None]) -> tuple[Rung, ...]:
     """Fit the first model and the next ones until one is adequate; `keep` gets each that is the best so far.
 
-    The best has the lowest AIC. A rung that gains nothing is left out, and the next one is tried. Where an adequate model
-    has a significant harmonic, the tremor instead is tried, too, and taken if its AIC is lower by more than 2.
+    The best has the lowest AIC. A rung that gains nothing is left out, and the next one is tried. An adequate model is no
+    end in two cases, and a further one is then taken if its AIC is lower by more than 2: noise alone beside which the
+    spectrum shows a significant line, for which the harmonic is tried; and a significant harmonic, for which the tremor is.
     """
     tried: list[Climbed] = []
     best: Climbed | None = None
+    line = False  # seen beside noise alone
     numbers = range(models.lowest, models.top + 1)
     for place, number in enumerate(numbers):
         described = best is not None and best.rung.p >= ADEQUATE
-        if described and number < TREMOR:
+        if described and number < TREMOR and not (line and number == QUIET + 1):
             continue
         plan = models.plan_of(on_rung(models.base, number)) if number > models.lowest else first
         points = starting_points(plan.problem, plan.starts) if best is None else _warm(plan, best)
@@ -149,7 +151,12 @@ def climb(first: Plan, models: Models, descend: Descend, keep: Callable[[Climbed
         if best is None or found.rung.aic < best.rung.aic - ALIKE * described:
             best = found
             keep(found)
-        if described or (best.rung.p >= ADEQUATE and not (number < TREMOR <= models.top and _has_line(best))):
+        if number == QUIET and best.rung.p >= ADEQUATE:
+            line = p_of_line_left_out(best.ended) < SIGNIFICANT
+            if line:
+                continue
+        last = described and not (line and number == QUIET + 1)
+        if last or (best.rung.p >= ADEQUATE and not (number < TREMOR <= models.top and _has_line(best))):
             break
     return tuple(each.rung._replace(chosen=each is best) for each in tried)
 

@@ -112,7 +112,7 @@ def _held(result: "FitResult") -> list[str]:
     told = [f"{name} = {1e3 * float(task[name]):.3g} mm" if name in LENGTHS else f"{name} = {float(task[name]):.3g} kg"
             for name in held]  # fmt: skip
     means = ("The data do not tell it, and the verdict notices no wrong one. Where it is wrong, C_w0 and K_w0 are, too "
-             "(docs/perturbed.md has by how much). To have that in the errors fit it: free=(*result.free, 'm_w')"
+             "(docs/perturbed.md has by how much). To have that in the errors do not fix it"
              if moved else
              "A held force tells no length and no mass: with half of both x_ref, stiffness, damping and masses would be "
              "twice as large, and the fit the same")  # fmt: skip

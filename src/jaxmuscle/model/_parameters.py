@@ -76,7 +76,7 @@ class Parameter(NamedTuple):
 PARAMETERS: dict[str, Parameter] = {
     row.name: row
     for row in (
-        _row("m_w", "m_w", "kg", 0.5, "active mass", _HAND),
+        _row("m_w", "m_w", "kg", 0.5, "active mass", _HAND, sd=0.5),  # no data tell it: its prior goes into all errors
         _row("m_z", "m_z", "kg", 0.5, "passive mass", _HAND),
         _row("k_w", "k_w", "N/m^3", 5e5, "active stiffness factor", _STIFF),
         _row("k_z", "k_z", "N/m^3", 5e5, "passive stiffness factor", _STIFF),

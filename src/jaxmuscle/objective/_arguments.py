@@ -47,7 +47,7 @@ DT = 2.5e-3
 # muscle, which swings at 8 Hz, would pass for tremor.
 COEFFICIENTS = ("k_w", "k_z", "c_w", "c_z")
 NARROW = 0.5
-MOVED_MASS = "m_z"  # which a perturbation makes known
+MASSES = ("m_w", "m_z")  # free where the insertion moves: a perturbation tells m_z, and m_w widens the errors
 
 
 def task_for(
@@ -97,18 +97,22 @@ def no_response(whose: str, p: float) -> ValueError:
                       "(--task isometric)")  # fmt: skip
 
 
-def free_names(task: AbstractTask, free: Iterable[str] | None, fix: Mapping[str, float], target: Target) -> tuple[str, ...]:
+def free_names(
+    task: AbstractTask, free: Iterable[str] | None, fix: Mapping[str, float], target: Target, *, moved: bool | None = None
+) -> tuple[str, ...]:
     """The parameters to fit, checked against the task, the fixed ones and the number of data.
 
-    By default those of muscle, noise and rhythms; where the target has no spectrum those of the muscle alone.
+    By default those of muscle, noise and rhythms; where the target has no spectrum those of the muscle alone. Where the
+    insertion is moved, here or in another target of the same person, the masses, too.
     """
+    moved = target.stiffness is not None if moved is None else moved
     known, bins = task.parameter_names, len(target.bins)
     if free is None and not bins:
-        free = [n for n in (*COEFFICIENTS, MOVED_MASS) if n in known and n not in fix]
+        free = [n for n in (*COEFFICIENTS, *MASSES) if n in known and n not in fix]
     if target.stiffness is not None:
         bins += 2 * len(target.stiffness.known.frequency)
     if free is None:
-        usual = USUALLY_FREE if target.stiffness is None else (*USUALLY_FREE, MOVED_MASS)
+        usual = (*USUALLY_FREE, *MASSES) if moved else USUALLY_FREE
         names = [name for name in usually_free(task, usual) if name not in fix]
     else:
         names = list(dict.fromkeys(free))
@@ -204,7 +208,7 @@ def at_mean(task: AbstractTask, target: Target, options: FitOptions) -> tuple[Ab
     moved = at_force(task, stated[0])
     factor = float(moved["m_w"]) / float(task["m_w"])
     if target.stiffness is not None:  # masses are not in ratio to forces where displacements are known
-        moved = moved.replace(m_w=task["m_w"], m_z=task["m_z"])
+        moved = moved.replace(**{name: task[name] for name in MASSES})
     return moved, dataclasses.replace(options, mean_force=stated, also_free=free, carried=factor)
 
 

@@ -102,9 +102,9 @@ def _moved(part: Any, title: str) -> list[tuple[float, tuple[Panel, ...]]]:
 
 
 def _gain(ax: Axes, response: Any, curve: Any, title: str) -> None:
-    """Half as wide as `gain` expects: its key stands inside."""
+    """Half as wide as `gain` expects: what it shows is named in the key of the figure."""
     gain(ax, response, curve, title)
-    ax.legend(loc="upper left", frameon=False)
+    without_legend(ax)
     ax.set_xlabel("Frequency (Hz)")
 
 

@@ -42,9 +42,9 @@ def phase(ax: Axes, response: Any, curve: Curve | None = None) -> None:
     if curve is not None:
         fine, smooth = _smooth(f, curve[1])
         turned = np.degrees(np.unwrap(np.angle(smooth)))
-        ax.plot(fine, turned, color=BLUE, lw=1.2, zorder=2)
+        ax.plot(fine, turned, color=BLUE, lw=1.2, label=curve[0], zorder=2)
         values = values + 360 * np.rint((np.interp(f, fine, turned) - values) / 360)  # the turn nearest to the curve
-    ax.errorbar(f[shown], values[shown], bars[shown], color=ink(), **POINTS)
+    ax.errorbar(f[shown], values[shown], bars[shown], label="± 2 SE", color=ink(), **POINTS)
     ax.axhline(0, color=GREY, lw=0.6)
     ax.set_ylabel("Phase (deg)")
     low, high = ax.get_ylim()

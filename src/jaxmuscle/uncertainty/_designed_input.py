@@ -26,7 +26,7 @@ FEWER_LINES = 1.6  # times as long as a part of a longer motion
 SHOWN = 2.0  # times the even density: where a design moves the most
 DOUBTFUL = 0.3  # relative standard error
 ASSUMED = (
-    "  assumed: no reflex. A reflex can change K_w0 by 10 to 45 %, and the fit does not notice: call it muscle plus reflex",
+    "  assumed: no reflex. A reflex can change K_w0 by 10 to 55 %, and the fit does not notice: call it muscle plus reflex",
     "  assumed: no fatigue. Split a long or strong hold into trials with rests between, and give all trials to one fit",
 )
 OF_MUSCLE = tuple(BASE.values())
@@ -42,7 +42,8 @@ class DesignedInput(Printed, Result, eqx.Module):
     record; `flat`, with the flat motion; `stderr`, with this one; `by_seconds`, with records of it that have other lengths
     [s]; `needed`, the relative error that was asked for and the length [s] of the record that reaches it, or None;
     `notices`, what to know before; `elsewhere`, of each quantity that is hardly known so far: its value one standard error
-    below and above, and the error that this motion gives there, both in its unit; `active_mass` m_w [kg], which is assumed.
+    below and above, and the error that this motion gives there, both in its unit; `masses` [kg] of the muscle, and which of
+    them are `held`: the others are fitted with the record, so their errors are in those of the rest.
     """
 
     quantity: tuple[str, ...] = eqx.field(static=True)
@@ -59,7 +60,8 @@ class DesignedInput(Printed, Result, eqx.Module):
     needed: tuple[float, float] | None
     notices: tuple[str, ...] = eqx.field(static=True, default=())
     elsewhere: dict[str, tuple[tuple[float, float], ...]] = eqx.field(default_factory=dict)
-    active_mass: float | None = None
+    masses: dict[str, float] = eqx.field(default_factory=dict)
+    held: tuple[str, ...] = eqx.field(static=True, default=())
 
     @property
     def time(self) -> Float[np.ndarray, " samples"]:
@@ -136,7 +138,8 @@ class DesignedInput(Printed, Result, eqx.Module):
             "frequency_hz": self.frequency.tolist(), "density": self.density.tolist(), "quantities": known,
             "elsewhere": {n: [{"value": with_nulls(value), "stderr": with_nulls(error)} for value, error in sides]
                           for n, sides in self.elsewhere.items()},
-            "active_mass": self.active_mass, "notices": list(self.notices),
+            "masses": {n: {"value": value, "fitted": n not in self.held} for n, value in self.masses.items()},
+            "notices": list(self.notices),
         }  # fmt: skip
 
     def save(self, path: str | Path) -> None:
@@ -215,12 +218,14 @@ class DesignedInput(Printed, Result, eqx.Module):
         lines = ["  assumed: the muscle is the one given here" + f", with a mean force of {mean[0]:.3g} N" * bool(mean)]
         if mean:
             lines[0] += ". If you measured another one, fit with it first (mean and unit of the target)"
-        if self.active_mass is not None:
-            held = f"{self.active_mass:.3g}"
-            lines += [f"  assumed: the active mass m_w is {held} kg, as here. No record tells it. Where it is "
-                      "wrong, C_w0 and K_w0 are, too (docs/perturbed.md has by how much)"]  # fmt: skip
-            if float(held) != USUAL:
-                lines[-1] += f". The fit of a record takes {USUAL:g} kg; to compare with this design say --fix m_w={held}"
+        values = " and ".join(f"{name} = {value:.3g} kg" for name, value in self.masses.items())
+        if "m_w" in self.held:
+            lines += ["  assumed: the active mass m_w is right, as in the fit. No record tells it. Where it is wrong, C_w0 "
+                      "and K_w0 are, too (docs/perturbed.md has by how much)"]  # fmt: skip
+        elif any(value != USUAL for value in self.masses.values()):
+            lines += [f"  assumed: {values}, as here. A held force tells no mass. If you know roughly what moves, fit with "
+                      f"that (--fix m_w={USUAL:g} --fix m_z={USUAL:g}, say) and design again. The fit of a record lets both "
+                      f"free, and begins with {USUAL:g} kg"]  # fmt: skip
         return lines
 
     def _vague(self) -> list[str]:

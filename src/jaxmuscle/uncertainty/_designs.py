@@ -5,13 +5,13 @@ from typing import Any
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from jaxmuscle._common.text import choices
 from jaxmuscle.data._target import Target
 from jaxmuscle.model._parameters import PARAMETERS
 from jaxmuscle.model._tasks import AbstractTask, Isometric, PrescribedForce, PrescribedLength
-from jaxmuscle.objective._arguments import INPUTS, MOVED_MASS
+from jaxmuscle.objective._arguments import INPUTS, MASSES
 from jaxmuscle.objective._consequences import Expansion, expand
 from jaxmuscle.objective._coordinates import Coordinates
 from jaxmuscle.objective._likelihood import Likelihood, require_spread, without_offsets
@@ -98,7 +98,8 @@ class Design(eqx.Module):
         data += [] if self.mean is None else [f"mean to {100 * self.mean:.2g} %"]
         if self.lengthening is not None:
             task = like.task if self.task is None else self.task
-            data.append(f"response to a {self.lengthening}" + f" ({MOVED_MASS} fitted with it)" * _mass_is_open(like, task))
+            masses = " and ".join(_open_masses(like, task))
+            data.append(f"response to a {self.lengthening}" + f" ({masses} fitted with it)" * bool(masses))
         kind = None if self.lengthening is None else PrescribedLength
         return _task_in_words(like.task if self.task is None else self.task, kind), ", ".join(data)
 
@@ -240,14 +241,37 @@ def design_information(
 ) -> Float[np.ndarray, "free free"]:
     """Fisher information about a fit's θ in a design; what is separate in it is eliminated, without a prior of its own.
 
+    So are the masses where the insertion is moved and the fit says nothing of them, with their prior (`with_masses`).
+
     Raises `ValueError` for a task without linear response or whose insertion cannot be moved as the design says, unknown
     names in `separate`, and a coefficient of variation or mean of an output that is zero.
     """
-    names, like = problem.coordinates.names, design.like(problem)
-    given = like.task if design.task is None else design.task
+    names = problem.coordinates.names
     for name in design.separate:
         if name not in names:
             raise ValueError(f"{design.name}: separate: {name!r} is not free in the fit; free are {', '.join(names)}")
+    own, _, found = information_with_masses(problem, theta, design, masses=design.lengthening is not None)
+    own, more = own[own < len(names)], int(np.sum(own >= len(names)))
+    kept = np.append([names[i] not in design.separate for i in own], np.zeros(more, bool))
+    whole = np.zeros((len(names), len(names)))
+    if not np.all(kept):
+        prior = np.append(np.full(len(own), VAGUE), np.ones(more))[~kept]
+        loose, tied = found[np.ix_(~kept, ~kept)] + np.diag(prior), found[np.ix_(kept, ~kept)]
+        found = found[np.ix_(kept, kept)] - tied @ np.linalg.pinv(loose, hermitian=True) @ tied.T
+    shared = own[kept[: len(own)]]
+    whole[np.ix_(shared, shared)] = found
+    return whole
+
+
+def information_with_masses(
+    problem: FitProblem, theta: Float[np.ndarray, " free"], design: Design, *, masses: bool
+) -> tuple[Int[np.ndarray, " own"], Coordinates, Float[np.ndarray, "own own"]]:
+    """Fisher information in a design of what its task has of the fit's θ, and, where asked for, of `masses` beside them.
+
+    **Returns:** the places of these coordinates in θ, those of masses after its end; the coordinates; the information.
+    """
+    like = design.like(problem)
+    given = like.task if design.task is None else design.task
     if design.lengthening is not None and not isinstance(given, PrescribedLength):
         raise ValueError(f"{design.name}: lengthening: in {type(given).__name__} no motor moves the insertion; give "
                          "task=jaxmuscle.PrescribedLength(...)")  # fmt: skip
@@ -255,20 +279,17 @@ def design_information(
     task: Any = given.with_parts(settings=settings)
     has_response(task, required=True)
     own, coordinates = coordinates_of(like, theta, task)
-    local = _local(like, coordinates, task, design)
-    here = dataclasses.replace(problem, parts=(local,), coordinates=coordinates, prior=problem.prior[own])
-    seen = seen_here(here, theta[own])
+    wide = with_masses(like, coordinates, task) if masses else coordinates
+    more = len(wide.names) - len(own)
+    place, prior = np.append(theta[own], np.zeros(more)), np.append(problem.prior[own], np.ones(more))
+    local = _local(like, wide, task, design)
+    here = dataclasses.replace(problem, parts=(local,), coordinates=wide, prior=prior)
+    seen = seen_here(here, place)
     (moments,) = seen.moments
     found = _information(dataclasses.replace(here, parts=(_with_data(local, design, moments),)), design, seen)
     if design.lengthening is not None:
-        found = found + _response_information(design.lengthening, like, task, coordinates, theta[own])
-    kept = np.array([names[i] not in design.separate for i in own])
-    whole = np.zeros((len(names), len(names)))
-    if not np.all(kept):
-        loose, tied = found[np.ix_(~kept, ~kept)] + VAGUE * np.eye(np.sum(~kept)), found[np.ix_(kept, ~kept)]
-        found = found[np.ix_(kept, kept)] - tied @ np.linalg.pinv(loose, hermitian=True) @ tied.T
-    whole[np.ix_(own[kept], own[kept])] = found
-    return whole
+        found = found + design.lengthening.information(task, wide, place)
+    return np.append(own, len(theta) + np.arange(more)), wide, found
 
 
 def coordinates_of(like: Part, theta: np.ndarray, task: Any) -> tuple[np.ndarray, Coordinates]:
@@ -282,37 +303,23 @@ def coordinates_of(like: Part, theta: np.ndarray, task: Any) -> tuple[np.ndarray
     return own, Coordinates(tuple(c.names[i] for i in has), centre, sd, positive, -unbounded, unbounded)
 
 
-def with_moved_mass(like: Part, coordinates: Coordinates, task: Any) -> Coordinates:
-    """These, and m_z of the record with its usual prior: the fit of a moved record finds it, too, as a rig adds mass.
+def with_masses(like: Part, coordinates: Coordinates, task: Any) -> Coordinates:
+    """These, and the masses with their usual prior: the fit of a moved record finds m_z, too, and lets m_w be free.
 
-    As they are where the fit says what it knows of m_z: it has it free, or was one of a moved record and has it fixed.
+    Without those of which the fit says what it knows: it has them free, or was one of a moved record and has them fixed.
     """
-    if not _mass_is_open(like, task):
-        return coordinates
-    row, value, c = PARAMETERS[MOVED_MASS], float(task[MOVED_MASS]), coordinates
-    ends = np.append(c.low, -np.inf), np.append(c.high, np.inf)
-    return Coordinates((*c.names, MOVED_MASS), np.append(c.centre, value), np.append(c.sd, row.prior_sd),
-                       np.append(c.positive, row.positive), *ends)  # fmt: skip
+    c, rows = coordinates, [PARAMETERS[name] for name in _open_masses(like, task)]
+    more, unbounded = tuple(row.name for row in rows), np.full(len(rows), np.inf)
+    values, sd, positive = ([float(task[row.name]) for row in rows], [row.prior_sd for row in rows],
+                            np.array([row.positive for row in rows], bool))  # fmt: skip
+    return Coordinates((*c.names, *more), np.append(c.centre, values), np.append(c.sd, sd), np.append(c.positive, positive),
+                       np.append(c.low, -unbounded), np.append(c.high, unbounded))  # fmt: skip
 
 
-def _mass_is_open(like: Part, task: Any) -> bool:
-    told = MOVED_MASS in like.coordinates.names or like.target.stiffness is not None
-    return not told and MOVED_MASS in task.parameter_names
-
-
-def _response_information(
-    lengthening: Lengthening, like: Part, task: Any, coordinates: Coordinates, theta: Float[np.ndarray, " own"]
-) -> Float[np.ndarray, "own own"]:
-    """Information in the response to a motion; the mass that moves is eliminated, if it is not one of the coordinates.
-
-    The fluctuations of a held insertion do not depend on that mass.
-    """
-    own, wide = len(theta), with_moved_mass(like, coordinates, task)
-    whole = lengthening.information(task, wide, np.append(theta, 0.0)[: len(wide.names)])
-    if len(whole) == own:
-        return whole
-    tied = whole[:own, own]
-    return whole[:own, :own] - np.outer(tied, tied) / (1.0 + whole[own, own])
+def _open_masses(like: Part, task: Any) -> tuple[str, ...]:
+    if like.target.stiffness is not None:
+        return ()
+    return tuple(name for name in MASSES if name in task.parameter_names and name not in like.coordinates.names)
 
 
 def _local(like: Part, coordinates: Coordinates, task: Any, design: Design) -> Part:

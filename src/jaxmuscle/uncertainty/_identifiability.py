@@ -14,6 +14,7 @@ from jaxmuscle._common.errors import OperatingPointError
 from jaxmuscle.data._target import Target
 from jaxmuscle.fits._reopened import reopened
 from jaxmuscle.fits._result import FitResult
+from jaxmuscle.objective._arguments import MASSES
 from jaxmuscle.objective._consequences import Expansion, quantities, unit_of
 from jaxmuscle.objective._coordinates import Coordinates
 from jaxmuscle.objective._covariance import Identifiability, common_scales, known_products
@@ -23,7 +24,6 @@ from ._designs import Design, design_information, designs_for, information_of, s
 from ._identifiability_report import TOGETHER, UNDESCRIBED, IdentifiabilityReport, Known, Outlook
 
 LEAST_PRIOR = 1e-6
-MASSES = ("m_w", "m_z")
 
 
 def identifiability(

@@ -257,7 +257,7 @@ def _table(report: IdentifiabilityReport) -> list[str]:
                           f"force (that of the fitted muscle is {report.mean_force:.3g} N)", 4, "  ")  # fmt: skip
     elif report.masses:
         known = ", ".join(f"{name} = {value:.3g} kg" for name, value in report.masses.items())
-        lines += _wrapped(f"taken as known, as in the fit: {known}; but m_z is open where it says so above", 4, "  ")
+        lines += _wrapped(f"taken as known, as in the fit: {known}; but open where it says so above", 4, "  ")
     for start in range(0, max(len(possible), 1), COLUMNS):
         block = possible[start : start + COLUMNS]
         heads = ["prior", "now", *(label for label, _ in block)]

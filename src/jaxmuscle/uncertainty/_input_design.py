@@ -18,13 +18,13 @@ from jaxmuscle._common.types import Key
 from jaxmuscle.data._target import Target
 from jaxmuscle.fits._result import FitResult
 from jaxmuscle.model._tasks import AbstractTask, PrescribedLength
-from jaxmuscle.objective._arguments import FitOptions, planned
+from jaxmuscle.objective._arguments import MASSES, FitOptions, planned
 from jaxmuscle.objective._consequences import derived_names
 from jaxmuscle.objective._problem import FitProblem
 from jaxmuscle.response._expected_spectrum import expected_spectrum
 
 from ._designed_input import DOUBTFUL, DesignedInput
-from ._designs import coordinates_of, design_information, moved_insertion, seen_here, with_moved_mass
+from ._designs import information_with_masses, moved_insertion, seen_here
 from ._identifiability import Here, fitted_problem, missed
 from ._identifiability_report import BASE
 from ._lengthening import Lengthening, information_of_lines, lines_in, require_positive
@@ -64,9 +64,10 @@ def design_input(
         Σ_q g_qᵀ (I_0 + I[S_x])⁻¹ g_q / q²,    I[S_x] = 2T ∫ Re(∂H* ∂Hᵀ) S_x(f) / S(f) df,    ∫ S_x df <= rms²
 
     I_0 is the information that is there without the motion: the fit's data and prior, and the fluctuations of the new
-    record. H is the `dynamic_stiffness`, S the `noise_density`, T the length of the record. The problem is convex. S_x is
-    constant in steps 0.15 f wide, or of five lines. It is then realised as a multisine, periodic in T, with phases that keep
-    the peaks low. Everything reported is of this motion.
+    record. The masses are fitted with the record: their errors are in those of q. H is the `dynamic_stiffness`, S the
+    `noise_density`, T the length of the record. The problem is convex. S_x is constant in steps 0.15 f wide, or of five
+    lines. It is then realised as a multisine, periodic in T, with phases that keep the peaks low. Everything reported is
+    of this motion.
 
     **Arguments:** `result` of a fit, or a task, whose usual free parameters are then free with their prior; `quantity`, a
     free parameter or a derived quantity such as K_w0, K_z0, C_w0, C_z0, or several; `rms` [m], `peak` [m] and `speed` [m/s],
@@ -125,7 +126,7 @@ def design_input(
                   for n in vague}  # fmt: skip
     notices = missed(result) if isinstance(result, FitResult) else ()
     return DesignedInput(quantities, own, even, motion, float(rate), values, units, now, flat, best, longer, needed, notices,
-                         others, experiment.active_mass)  # fmt: skip
+                         others, experiment.masses, experiment.held)  # fmt: skip
 
 
 def _elsewhere(
@@ -144,7 +145,8 @@ class Experiment(NamedTuple):
 
     here: Here
     quantity: tuple[str, ...]
-    active_mass: float | None
+    masses: dict[str, float]
+    held: tuple[str, ...]
     start: Float[np.ndarray, "free free"]
     apart: Float[np.ndarray, "free free"]
     frequency: Float[np.ndarray, " lines"]
@@ -177,17 +179,17 @@ class Experiment(NamedTuple):
         task: Any = _moved(like.task).with_parts(settings=like.target.settings)
         start = np.diag(problem.prior) + (here.information if isinstance(given, FitResult) else 0.0)
         still = dataclasses.replace(design, task=task, lengthening=None)
-        own, coordinates = coordinates_of(like, theta, task)
-        wide = with_moved_mass(like, coordinates, task)
-        more = len(wide.names) - len(own)
-        own, place = np.append(own, len(theta))[: len(wide.names)], np.append(theta, 0.0)
-        apart = start + design_information(problem, theta, still)
-        start, apart = (np.asarray(block_diag(matrix, np.eye(more))) for matrix in (start, apart))
+        own, wide, fluctuations = information_with_masses(problem, theta, still, masses=True)
+        more = int(np.sum(own >= len(theta)))
+        start, apart = (np.asarray(block_diag(start, np.eye(more))) for _ in range(2))
+        apart[np.ix_(own, own)] += fluctuations
         here = here._replace(gradients={name: np.pad(g, (0, more)) for name, g in here.gradients.items()})
         lines = np.zeros((len(record.frequency), *start.shape))
-        lines[:, own[:, None], own] = information_of_lines(task, wide, place[own], record.frequency, record.seconds)
-        assumed = None if "m_w" in coordinates.names else float(task["m_w"])
-        return cls(here, tuple(quantity), assumed, start, apart, record.frequency, lines)
+        place = np.append(theta, np.zeros(more))[own]
+        lines[:, own[:, None], own] = information_of_lines(task, wide, place, record.frequency, record.seconds)
+        masses = {name: float(task[name]) for name in MASSES if name in task.parameter_names}
+        held = tuple(name for name in masses if name not in wide.names)
+        return cls(here, tuple(quantity), masses, held, start, apart, record.frequency, lines)
 
     @property
     def rows(self) -> Float[np.ndarray, "quantities free"]:
