@@ -1,6 +1,8 @@
 """Perturbation experiments, simulated with NumPy alone, and what is found in them; the tables of docs/perturbed.md.
 
-    python benchmarks/perturbed.py classical|amplitude|reflex|inertia|active|rhythm|seconds|coverage|time [--count N]
+    python benchmarks/perturbed.py PART [--count N]
+
+PART: classical, amplitude, reflex, inertia, active, reference, rhythm, seconds, coverage or time.
 
 Takes a minute to a quarter of an hour each.
 """
@@ -186,6 +188,24 @@ def active(count: int) -> None:
                 print(f"  {name}: 95 % intervals hold the truth: {100 * held:.0f} %", flush=True)
 
 
+def reference(count: int) -> None:
+    """Reference displacements in the fit that are not those of the muscle, which has 20 mm."""
+    runs = recorded(TASK, np.random.default_rng(11), count)
+    muscle = jm.response.equilibrium(TASK)
+    true = truth() | {
+        "K_w_tangent": float(TASK["k_w"]) * (float(TASK["x_ref_w"]) ** 2 + 3 * float(muscle[0]) ** 2),
+        "tangent_stiffness": stiffness(TASK, 1e-4).real,
+    }
+    for length in (0.010, 0.015, 0.020, 0.030, 0.040):
+        scale = (0.02 / length) ** 2
+        task = TASK.replace(x_ref_w=length, x_ref_z=length, **{k: scale * float(TASK[k]) for k in ("k_w", "k_z")})
+        fits = [jm.fit(task, run, **QUICK) for run in runs]
+        off = {name: 100 * (np.mean([fit[name].value for fit in fits]) / value - 1) for name, value in true.items()}
+        print(f"x_ref {1e3 * length:g} mm: " + ", ".join(f"{name} {change:+.0f} %" for name, change in off.items()))
+        print(f"  described: {sum(bool(fit.adequate) for fit in fits)}/{count}; p "
+              + " ".join(f"{fit.adequacy_p:.2g}" for fit in fits), flush=True)  # fmt: skip
+
+
 def rhythm(count: int) -> None:
     """A sine of 4.25 Hz in both stiffnesses, and none: fitted as by default, and by noise alone."""
     for line in (0.003, 0.0):
@@ -246,7 +266,8 @@ def time(count: int) -> None:
 
 
 PARTS: dict[str, Callable[[int], None]] = {
-    part.__name__: part for part in (classical, amplitude, reflex, inertia, active, rhythm, seconds, coverage, time)
+    part.__name__: part
+    for part in (classical, amplitude, reflex, inertia, active, reference, rhythm, seconds, coverage, time)
 }
 
 

@@ -201,6 +201,18 @@ def test_part_of_a_sample_is_taken_out():
         np.testing.assert_allclose(shifted.whole[inner], np.sin(2 * np.pi * 3 * at)[inner], atol=1e-6)
 
 
+@pytest.mark.parametrize(("seconds", "settings"), [(30, "standard"), (30, "slow"), (20, "standard")])
+def test_unrelated_channels_have_no_response(seconds, settings):
+    """Few averages and overlapping segments: of 40 pairs 2 are expected below 0.05, 9 hardly ever (p = 2e-4)."""
+    count = round(seconds * RATE)
+    moved, force, _ = drawn(40, 0.2)
+    found = [recorded(x[:count], y[-count:], positive="lengthening").frequency_response(settings).p_none
+             for x, y in zip(moved, force[::-1], strict=True)]  # fmt: skip
+    assert min(found) > 1e-3 and np.sum(np.array(found) < 0.05) < 9 and np.median(found) > 0.15
+    related = [recorded(x[:count], y[:count]).frequency_response(settings).p_none for x, y in zip(moved, force, strict=True)]
+    assert max(related) <= 1e-3
+
+
 def test_sign():
     moved, force, _ = drawn(1, 0.2)
     straight, turned = recorded(moved[0], force[0]), recorded(-moved[0], force[0])

@@ -98,10 +98,34 @@ def test_stiffness_and_damping_are_known(result):
 
 
 @pytest.mark.slow
+def test_tangents_do_not_hang_on_the_reference_displacement(minute, result, x64):
+    """With 30 mm instead of 20 the same data give another K_w0, foretold in the text, and the same slopes at the hold."""
+    task = result.task
+    x_w = float(jm.response.equilibrium(task)[0])
+    active = jax.grad(lambda x: task.muscle.active_force(x, 0.0, jax.numpy.zeros(5)))(x_w)
+    assert result["K_w_tangent"].value == pytest.approx(float(active), rel=1e-2)
+    still = np.asarray(jm.response.dynamic_stiffness(task, np.array([1e-5]))).real[0]
+    assert result["tangent_stiffness"].value == pytest.approx(still, rel=1e-2)
+    true_w = brentq(lambda w: (WHOLE["K_w0"] / X_REF**2 * (X_REF**2 + w**2) + WHOLE["K_z0"]) * w - TRUE["P_w"], 0.0, 0.1)
+    true = WHOLE["K_w0"] * (1 + 3 * (true_w / X_REF) ** 2)
+    for name, value in (("K_w_tangent", true), ("tangent_stiffness", 1 / (1 / true + 1 / WHOLE["K_z0"]))):
+        assert abs(result[name].value - value) < 3 * result[name].stderr, name
+    longer = {"x_ref_w": 0.03, "x_ref_z": 0.03, "k_w": 5e5 / 2.25, "k_z": 5e5 / 2.25}
+    other = jm.fit(jm.PrescribedLength().replace(**longer), minute, check_seeds=0)
+    assert other.adequate
+    ratio = float(active) / result["K_w0"].value
+    foretold = float(active) / (1 + (ratio - 1) / 2.25)
+    assert foretold > result["K_w0"].value + 2 * result["K_w0"].stderr
+    assert other["K_w0"].value == pytest.approx(foretold, rel=0.05)
+    for name in ("K_w_tangent", "tangent_stiffness", "K_z0", "C_w0", "C_z0"):
+        assert abs(other[name].value - result[name].value) < result[name].stderr, name
+
+
+@pytest.mark.slow
 def test_what_a_fit_says_and_keeps(result, tmp_path):
     text = str(result)
     assert "The model describes the data: chi2 per datum" in text and "PrescribedLength" in text
-    assert "held fixed" not in text
+    assert "m_w = " not in text and "held fixed: x_ref_w = 20 mm. No record tells it, and K_w0 hangs on it" in text
     result.save(tmp_path / "fit.json")
     again = jm.load_result(tmp_path / "fit.json")
     assert str(again) == text
@@ -199,8 +223,9 @@ def test_a_displacement_that_moved_nothing(minute, tmp_path):
         jm.fit(jm.PrescribedLength(), wrong)
     with pytest.raises(ValueError, match=r"does not follow"):
         jm.fit(jm.PrescribedLength(), wrong.frequency_response())
-    with pytest.raises(ValueError, match=r"trial 2 of 2 \(other\.csv\): the force does not follow"):
-        jm.fit(jm.PrescribedLength(), [minute, wrong])
+    for number, trials in ((2, [minute, wrong]), (1, [wrong, minute])):
+        with pytest.raises(ValueError, match=rf"trial {number} of 2 \(other\.csv\): the force does not follow"):
+            jm.fit(jm.PrescribedLength(), trials)
     time = np.arange(force.size) / RATE
     path = tmp_path / "wrong.csv"
     np.savetxt(
@@ -322,6 +347,7 @@ def test_a_hold_beside_it_is_of_the_same_masses(minute, result):
     assert both["m_w"].free and both["m_z"].free and not any("m_w@" in name or "m_z@" in name for name in both.parameters)
     assert both.settings["prior_centre"]["m_w"] == both.settings["prior_centre"]["m_z"] == 0.5
     assert both.settings["carried"] > 1.1
+    assert both["K_w_tangent@moved"].stderr < 1.1 * result["K_w_tangent"].stderr
     for name, true in WHOLE.items():
         assert abs(both[name].value - true) < 3.9 * both[name].stderr, name
         assert both[name].stderr < 1.1 * result[name].stderr, name

@@ -81,7 +81,9 @@ def design(
         begin, end = found.window
         out.print(f"Play the motion for {end:g} s and record force and displacement. Then fit both channels, without the "
                   f"first {begin:g} s: jaxmuscle fit RECORD.csv --task prescribed-length --window {begin:g}:{end:g} "
-                  "--out out/moved", highlight=False, soft_wrap=True)  # fmt: skip
+                  "--out out/moved. The errors above count what is known now. To reach them, fit with it what you have "
+                  "recorded so far (a moved record as a second file, a hold by jaxmuscle.fit_joint in Python)",
+                  highlight=False, soft_wrap=True)  # fmt: skip
 
 
 def _source(name: str) -> Any:

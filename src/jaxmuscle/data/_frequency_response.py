@@ -185,15 +185,24 @@ class FrequencyResponse(Printed, eqx.Module):
             chi² = Σ |H|² / stderr²   over the frequencies, and the part of it along (K + iωB - ω²I) / stderr
 
         have the chi² distribution with 2 · frequencies and with 3 degrees of freedom where H is 0. The smaller of both
-        probabilities is doubled, since two are looked at. Where neighbouring frequencies share errors it is a little too
-        small. Above 0.001 (`UNSEEN`) the displacement says nothing of the muscle, and a fit refuses it.
+        probabilities is doubled, since two are looked at. With a `coherence` the errors are estimated from few `averages` K,
+        and the frequencies are those of overlapping segments, neighbours being correlated by 0.45. Then |H|² / stderr² is
+        replaced by `2 (K - 1) ln(1 + |H|² / (2 (K - 1) stderr²))`, which has the chi² distribution that it should have, and
+        the sums are divided by 1.4 and 1.9 (their variance is so much larger). Above 0.001 (`UNSEEN`) the displacement says
+        nothing of the muscle, and a fit refuses it.
         """
-        one = self.known
-        weight = 1 / np.concatenate([one.stderr] * 2)
-        seen, shapes = parts(one.value) * weight, [second_order_shape(one.frequency, unit) for unit in np.eye(3)]
-        basis = np.linalg.qr(np.stack([parts(shape) * weight for shape in shapes], axis=1))[0]
-        both = (seen @ seen, seen.size), (np.sum((basis.T @ seen) ** 2), min(3, seen.size))
-        return float(min(1.0, 2 * min(scipy.stats.chi2.sf(size, count) for size, count in both)))
+        one, shared = self.known, (1.0, 1.0)
+        size = (np.abs(one.value) / one.stderr) ** 2
+        seen = size
+        if one.averages is not None:
+            spare, shared = np.maximum(2 * (one.averages - 1), 1e-3), (1.4, 1.9)
+            seen = spare * np.log1p(size / spare)
+        weight = np.tile(np.sqrt(seen / size) / one.stderr, 2)
+        shapes = [parts(second_order_shape(one.frequency, unit)) / np.tile(one.stderr, 2) for unit in np.eye(3)]
+        basis = np.linalg.qr(np.stack(shapes, axis=1))[0]
+        along = np.sum((basis.T @ (parts(one.value) * weight)) ** 2)
+        both = (seen.sum() / shared[0], 2 * seen.size / shared[0]), (along / shared[1], min(3, 2 * seen.size))
+        return float(min(1.0, 2 * min(scipy.stats.chi2.sf(value, count) for value, count in both)))
 
     def to_table(self) -> dict[str, Any]:
         """The response as plain lists, for TOML and JSON; an infinite error is the text "inf"."""

@@ -87,8 +87,9 @@ def p_value(problem: FitProblem, objective: Residuals, final: Minima) -> float:
 
 
 def p_of_line_left_out(ended: Endpoint) -> float:
-    """The same for a fit of a model without harmonic, of one target; 1 where that has no spectrum."""
-    if not len(ended.problem.parts[0].target.bins):
+    """The same for a fit of a model without harmonic, of one target; 1 where that has no spectrum in logarithms."""
+    (part,) = ended.problem.parts
+    if ended.problem.residual != "log" or not len(part.target.bins) or not ended.objective.parts[0].statistics.known:
         return 1.0
     return _p_of_line(ended, np.arange(len(ended.problem.coordinates.names)))
 

@@ -67,14 +67,14 @@ class Climbed(NamedTuple):
     rung: Rung
 
 
-def gains(ladder: tuple[Rung, ...], *, describes: bool | None) -> tuple[str, ...]:
+def gains(ladder: tuple[Rung, ...], *, describes: bool | None, datum: str = "bin") -> tuple[str, ...]:
     """What every part of the chosen model gains over the model before it, in sentences; and what such a number says.
 
-    `describes`: whether the chosen model describes the data.
+    `describes`: whether the chosen model describes the data; `datum`, what chi² is counted for.
     """
     number = next((rung.number for rung in ladder if rung.chosen), QUIET)
     climbed = [rung for rung in ladder if rung.number <= number]
-    said = tuple(_gain(before, after) for before, after in itertools.pairwise(climbed))
+    said = tuple(_gain(before, after, datum) for before, after in itertools.pairwise(climbed))
     if not said:
         return ()
     meaning = ("the AIC weighs the fit against the number of parameters; the lower, the better. A difference of "
@@ -93,11 +93,11 @@ def passed_over(ladder: tuple[Rung, ...]) -> tuple[str, ...]:
                  for number in range(before.number + 1, after.number))  # fmt: skip
 
 
-def _gain(before: Rung, after: Rung) -> str:
+def _gain(before: Rung, after: Rung, datum: str) -> str:
     """AIC and chi² of a model against those of a poorer one."""
     added = " and ".join("with a harmonic" if n == 0 else rung_name(n) for n in range(before.number + 1, after.number + 1))
     change = after.aic - before.aic
-    return (f"{added} the AIC {'falls' if change < 0 else 'rises'} by {abs(change):.1f} (chi2 per bin "
+    return (f"{added} the AIC {'falls' if change < 0 else 'rises'} by {abs(change):.1f} (chi2 per {datum} "
             f"{after.chi2_per_bin:.2f} instead of {before.chi2_per_bin:.2f})")  # fmt: skip
 
 
@@ -152,7 +152,7 @@ def climb(first: Plan, models: Models, descend: Descend, keep: Callable[[Climbed
             best = found
             keep(found)
         if number == QUIET and best.rung.p >= ADEQUATE:
-            line = p_of_line_left_out(best.ended) < SIGNIFICANT
+            line = float(models.base.harmonic.amplitude) > 0 and p_of_line_left_out(best.ended) < SIGNIFICANT
             if line:
                 continue
         last = described and not (line and number == QUIET + 1)

@@ -37,8 +37,8 @@ def aimed(given: Any, task: AbstractTask | None = None, options: FitOptions | No
 def without_rhythm(task: AbstractTask, options: FitOptions) -> AbstractTask:
     """The task without its harmonic, where the fit may leave that out: nobody asked for it, and the model is a base one.
 
-    A harmonic whose frequency is sought in the noise of the spectrum bends that. The errors of what the perturbation
-    determines hold without (docs/perturbed.md).
+    A harmonic whose frequency is sought in the noise of the spectrum bends that. It is fitted where the spectrum shows one
+    (docs/perturbed.md).
     """
     asked = options.free is not None or not set(HARMONIC).isdisjoint(options.fix or {})
     if asked or options.method != "linear" or not is_base(task):
@@ -69,8 +69,8 @@ def recordings_of(given: object, task: AbstractTask | None = None) -> tuple[Pert
 
 def analysed(recordings: Sequence[PerturbedRecording], task: AbstractTask, options: FitOptions) -> Target:
     """Their target, with the response by the muscle that fits it: found in a few rounds from the nonparametric one."""
+    _check_trials(recordings)
     target, points = perturbed_target(recordings), None
-    _check_trials(recordings, target)
     for _ in range(ROUNDS):
         carried, given = at_mean(task, target, options)
         problem = planned(carried, target, dataclasses.replace(given, method="linear")).problem
@@ -84,14 +84,20 @@ def analysed(recordings: Sequence[PerturbedRecording], task: AbstractTask, optio
     return target
 
 
-def _check_trials(recordings: Sequence[PerturbedRecording], target: Target) -> None:
-    """Refuse a trial whose force does not follow its displacement, though it would be seen to follow as in all trials."""
-    for number, recording in enumerate(recordings if len(recordings) > 1 else (), 1):
-        own = recording.frequency_response(target.settings).known
-        if own.p_none <= UNSEEN or target.stiffness is None:
+def _check_trials(recordings: Sequence[PerturbedRecording]) -> None:
+    """Refuse a trial whose force does not follow its displacement, though it would be seen to follow as in the others."""
+    if len(recordings) < 2:
+        return
+    each = [one for recording in recordings if (one := perturbed_target((recording,)).stiffness) is not None]
+    for number, own in enumerate(each):
+        if own.p_none <= UNSEEN:
             continue
-        f, value = target.stiffness.frequency, target.stiffness.value
-        usual = np.interp(own.frequency, f, np.real(value)) + 1j * np.interp(own.frequency, f, np.imag(value))
-        apart = dataclasses.replace(own, value=own.value - usual).p_none
-        if apart <= UNSEEN:
-            raise no_response(f"trial {number} of {len(recordings)} ({recording.source})", own.p_none)
+        others = [other for i, other in enumerate(each) if i != number]
+        weight = np.array([np.interp(own.frequency, other.frequency, other.stderr**-2.0) for other in others])
+        value = [np.interp(own.frequency, other.frequency, np.real(other.value)) +
+                 1j * np.interp(own.frequency, other.frequency, np.imag(other.value)) for other in others]  # fmt: skip
+        usual, error = np.average(value, axis=0, weights=weight), 1 / np.sqrt(weight.sum(axis=0))
+        apart = dataclasses.replace(own, value=own.value - usual, stderr=np.hypot(own.stderr, error))
+        if apart.p_none <= UNSEEN:
+            whose = f"trial {number + 1} of {len(recordings)} ({recordings[number].source})"
+            raise no_response(whose, own.p_none)

@@ -27,6 +27,7 @@ ALIASES = {
     "activation_time": "contraction_time",
 }
 LENGTHS = ("x_ref_w", "x_ref_z")
+OTHER_LENGTHS = (0.75, 1.5)  # times x_ref_w
 COLUMNS = ("name", "value", "95 % interval", "unit", "in the fit", "what it is")
 
 
@@ -61,7 +62,8 @@ def text_of(result: "FitResult") -> str:
     if not single:
         lines += [f"  {name}: {p.target.name}, {p.model}{_closeness(p, ', ')}" for name, p in result.parts.items()]
     lines += [f"  {'' if single else f'{name}: '}{words}" for name, p in result.parts.items() for words in _trials(p.target)]
-    lines += [f"  {HEAD}", *(f"  {rung}" for rung in result.ladder)] if len(result.ladder) > 1 else []
+    head = HEAD.replace("chi2/bin", "   chi2/n") if _datum(result) == "datum" else HEAD
+    lines += [f"  {head}", *(f"  {rung}" for rung in result.ladder)] if len(result.ladder) > 1 else []
     lines += [f"  {sentence}" for sentence in passed_over(result.ladder)]
     lines += [f"  {sentence}" for sentence in _gains(result)]
     lines += [f"  {sentence}" for sentence in result.advice]
@@ -83,9 +85,10 @@ def text_of(result: "FitResult") -> str:
     title = f"not determined: do not interpret these values{_per_newton(result, loose)}"
     lines += _table(title, loose) if loose else []
     if factor := result.settings.get("carried"):
-        what = "P_w, masses, stiffness" if single and result.only.stiffness is None else "P_w, stiffness"
+        moved = any(part.stiffness is not None for part in result.parts.values())
+        what = "P_w, stiffness" if moved else "P_w, masses, stiffness"
         lines += [f"  before the fit {what} and damping were multiplied by {factor:.3g}, so that the muscle has the "
-                  "measured mean force (mean_force=False leaves the mean out)"]  # fmt: skip
+                  "measured mean force" + " (mean_force=False leaves the mean out)" * (not moved)]  # fmt: skip
     lines += [f"  {sentence}" for sentence in _held(result)]
     if result.per_newton:
         lines += ["  no mean force in newtons was given, so the scale of force is unknown: forces, masses, stiffness and "
@@ -105,18 +108,29 @@ def _held(result: "FitResult") -> list[str]:
     task, moved = result.only.task, result.only.stiffness is not None
     if not moved and (task.output_unit != "N" or result.settings.get("mean_force") is None):
         return []
-    held = [name for name in ("m_w",) + ("m_z", *LENGTHS) * (not moved) if name in task.parameter_names]
-    held = [name for name in held if name not in result.parameters or not result.parameters[name].free]
-    if "m_w" not in held or (not moved and not set(LENGTHS) <= set(held)):
+    names = ("m_w", *(("m_z",) if not moved else ()), *LENGTHS)
+    if not set(names) <= set(task.parameter_names):
         return []
-    told = [f"{name} = {1e3 * float(task[name]):.3g} mm" if name in LENGTHS else f"{name} = {float(task[name]):.3g} kg"
-            for name in held]  # fmt: skip
-    means = ("The data do not tell it, and the verdict notices no wrong one. Where it is wrong, C_w0 and K_w0 are, too "
-             "(docs/perturbed.md has by how much). To have that in the errors do not fix it"
-             if moved else
-             "A held force tells no length and no mass: with half of both x_ref, stiffness, damping and masses would be "
-             "twice as large, and the fit the same")  # fmt: skip
-    return [f"held fixed: {', '.join(told)}. {means}"]
+    held = [name for name in names if name not in result.parameters or not result.parameters[name].free]
+    told = {name: f"{name} = {1e3 * float(task[name]):.3g} mm" if name in LENGTHS else f"{name} = {float(task[name]):.3g} kg"
+            for name in held}  # fmt: skip
+    if not moved:
+        means = ("A held force tells no length and no mass: with half of both x_ref, stiffness, damping and masses would be "
+                 "twice as large, and the fit the same")  # fmt: skip
+        return [f"held fixed: {', '.join(told.values())}. {means}"] if {"m_w", *LENGTHS} <= set(held) else []
+    said = []
+    if "m_w" in held:
+        said += [f"held fixed: {told['m_w']}. The data do not tell it, and the verdict notices no wrong one. Where it is "
+                 "wrong, C_w0 and K_w0 are, too (docs/perturbed.md has by how much). To have that in the errors let it be "
+                 "free, as by default"]  # fmt: skip
+    if "x_ref_w" in held and "K_w_tangent" in result.derived:
+        tangent, base = (result.derived[name].value for name in ("K_w_tangent", "K_w0"))
+        other = [f"{tangent / (1 + (tangent / base - 1) / times**2):.3g}" for times in OTHER_LENGTHS]
+        lengths = " or ".join(f"{1e3 * times * float(task['x_ref_w']):.3g}" for times in OTHER_LENGTHS)
+        said += [f"held fixed: {told['x_ref_w']}. No record tells it, and K_w0 hangs on it: with {lengths} mm it would be "
+                 f"{' or '.join(other)} N/m, and the fit as good. K_w_tangent, the stiffness of the active tissue as "
+                 "stretched in the hold, and tangent_stiffness, that of both tissues, stay: report these"]  # fmt: skip
+    return said
 
 
 def _per_newton(result: "FitResult", shown: Mapping[str, Estimate]) -> str:
@@ -190,7 +204,12 @@ def _closeness(part: FittedPart, before: str = "", *, verdict: str = "") -> str:
 
 def _gains(result: "FitResult") -> tuple[str, ...]:
     """What the parts of the chosen model gain, where several models were tried."""
-    return gains(result.ladder, describes=result.adequate)
+    return gains(result.ladder, describes=result.adequate, datum=_datum(result))
+
+
+def _datum(result: "FitResult") -> str:
+    """For what chi² of a model that was tried is counted: a bin, or also a point of the dynamic stiffness."""
+    return "bin" if all(part.stiffness is None for part in result.parts.values()) else "datum"
 
 
 def _trials(target: Target) -> list[str]:

@@ -95,16 +95,18 @@ def too_curved(problem: FitProblem, derived: Collection[str], known: Identifiabi
 
 
 def merged(problem: FitProblem, tables: list[dict[str, Estimate]], slopes: Any) -> dict[str, Estimate]:
-    """Derived quantities: one entry where all targets have the same number for the same reason, else one for each."""
+    """Derived quantities: one entry where all targets have the same number for the same reason, else one for each that has
+    it."""
     found: dict[str, Estimate] = {}
-    for name in tables[0]:
-        values = np.array([table[name].value for table in tables])
-        rows = np.stack([g[name] for g in slopes])
+    for name in dict.fromkeys(name for table in tables for name in table):
+        having = [i for i, table in enumerate(tables) if name in table]
+        values = np.array([tables[i][name].value for i in having])
+        rows = np.stack([slopes[i][name] for i in having])
         same = np.allclose(values, values[0], rtol=SAME, atol=0) and np.allclose(rows, rows[0], rtol=SAME, atol=1e-300)
-        if len(tables) == 1 or (same and name not in OUTPUTS):
+        if len(tables) == 1 or (same and name not in OUTPUTS and len(having) == len(tables)):
             found[name] = tables[0][name]
         else:
-            found |= {f"{name}@{part.name}": table[name] for part, table in zip(problem.parts, tables, strict=True)}
+            found |= {f"{name}@{problem.parts[i].name}": tables[i][name] for i in having}
     # About a mean of zero the variation is infinite, and so is its prior: no measure of what the data determine.
     vague = [n for n, p in found.items() if base_of(n) == OUTPUTS[0] and p.stderr is not None and p.stderr > p.value]
     return without_errors(vague, found)

@@ -9,9 +9,12 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxmuscle._common.programs import kept
+from jaxmuscle.model._muscle import Muscle
 from jaxmuscle.model._parameters import PARAMETERS, USUALLY_FREE
 from jaxmuscle.model._resonant_noise import ResonantNoise
-from jaxmuscle.model._tasks import AbstractTask
+from jaxmuscle.model._signals import AbstractSignal
+from jaxmuscle.model._tasks import AbstractTask, PrescribedLength
+from jaxmuscle.response._equilibrium import HOLD
 from jaxmuscle.response._expected import Moments
 from jaxmuscle.spectra._fluctuations import BANDS, EDGES, in_bands
 
@@ -21,7 +24,8 @@ from ._residuals import PartResiduals, Residuals
 
 DERIVED = ("corner_frequency", "half_power_frequency", "contraction_time", "tremor_frequency", "tremor_width",
            "tremor_share", "resonance_2_share", "harmonic_share", "harmonic_frequency", "high_frequency_floor",
-           "K_w0", "K_z0", "C_w0", "C_z0", "coefficient_of_variation", "mean", *BANDS)  # fmt: skip
+           "K_w0", "K_z0", "C_w0", "C_z0", "K_w_tangent", "tangent_stiffness", "coefficient_of_variation", "mean",
+           *BANDS)  # fmt: skip
 UNITS = {
     "corner_frequency": "Hz",
     "half_power_frequency": "Hz",
@@ -33,6 +37,8 @@ UNITS = {
     "K_z0": "N/m",
     "C_w0": "N s/m",
     "C_z0": "N s/m",
+    "K_w_tangent": "N/m",
+    "tangent_stiffness": "N/m",
 }
 
 
@@ -50,6 +56,8 @@ MEANINGS = {
     "K_z0": "passive stiffness at rest",
     "C_w0": "active damping at rest",
     "C_z0": "passive damping at rest",
+    "K_w_tangent": "active stiffness as stretched in the hold",
+    "tangent_stiffness": "stiffness of both tissues in series, H(0)",
     "coefficient_of_variation": "standard deviation over mean of the output",
     "mean": "mean of the output",
     **{name: f"share of the power from {low:g} to {high:g} Hz" for name, (low, high) in BANDS.items()},
@@ -67,11 +75,32 @@ def derived_names(task: Any, spectrum: bool = True) -> tuple[str, ...]:
     bands = {name for name, there, width in zip(BANDS, covered, np.diff(EDGES), strict=True) if there >= 0.5 * width}
     missing = set(BANDS) - bands | (set() if spectrum else OF_SPECTRUM)
     missing |= set() if task.activation is not None else {"contraction_time"}
+    missing |= set() if _moved(task) else {"K_w_tangent", "tangent_stiffness"}
     missing |= {"tremor_frequency", "tremor_width", "tremor_share"} if resonances < 1 else set()
     missing |= {"resonance_2_share"} if resonances < 2 else set()
     # About a mean of zero, and where the response begins with f².
     missing |= {"coefficient_of_variation", "mean", "half_power_frequency"} if task.quantity == "acceleration" else set()
     return tuple(name for name in DERIVED if name not in missing)
+
+
+def _moved(task: Any) -> bool:
+    """Whether a motor moves the insertion of the paper's muscle."""
+    return type(task) is PrescribedLength and type(task.muscle) is Muscle
+
+
+def tangents(task: Any, mean: Float[Array, ""]) -> dict[str, Float[Array, ""]]:
+    """Stiffness of the active tissue [N/m] where the mean force stretches it, and of both tissues, slowly pulled.
+
+    K_w_tangent = d(K_w x_w)/dx_w = k_w (x_ref² + 3 x_w²),   x_w = x_z + mean / K_z(x_z)
+    tangent_stiffness = H(0) = a T / (T + K_z(x_z)),   T = K_w_tangent,   a = K_z(x_z) + 2 k_z x_z (x_z - x_w)
+    """
+    x_z = task.x_z(jnp.asarray(HOLD)) if isinstance(task.x_z, AbstractSignal) else task.x_z
+    k_w, k_z, x_ref_w, x_ref_z = (task[name] for name in ("k_w", "k_z", "x_ref_w", "x_ref_z"))
+    passive = k_z * (x_ref_z**2 + x_z**2)
+    x_w = x_z + mean / passive
+    active = k_w * (x_ref_w**2 + 3 * x_w**2)
+    slope = passive + 2 * k_z * x_z * (x_z - x_w)
+    return {"K_w_tangent": active, "tangent_stiffness": slope * active / (active + passive)}
 
 
 def derived(task: Any, moments: Moments, frequency: Float[Array | np.ndarray, " bins"] | None = None) -> dict[str, Any]:
@@ -82,8 +111,9 @@ def derived(task: Any, moments: Moments, frequency: Float[Array | np.ndarray, " 
     `tremor_width` and `tremor_share` of the compared power, and `resonance_2_share` of a second one, both from half the
     resonance's frequency on (what activation and muscle let through below is no peak and can hardly be told from the rest);
     `harmonic_share` of the compared power; `harmonic_frequency`; `high_frequency_floor`, mean proportional power per bin
-    over the highest third of the bins; the base coefficients; `coefficient_of_variation` and `mean` of the output (not of
-    an acceleration, whose mean is zero, and which has no `half_power_frequency`);
+    over the highest third of the bins; the base coefficients; where the insertion is moved `tangents`;
+    `coefficient_of_variation` and `mean` of the output (not of an acceleration, whose mean is zero, and which has no
+    `half_power_frequency`);
     `band_4_8` and so on, the proportional power from 4 to 8 Hz, of bins at the edges the part that lies inside, where the
     bins cover half of the band.
     """
@@ -116,6 +146,7 @@ def derived(task: Any, moments: Moments, frequency: Float[Array | np.ndarray, " 
         "coefficient_of_variation": seen["coefficient_of_variation"],
         "mean": seen["mean"],
     }
+    found |= tangents(task, seen["mean"]) if _moved(task) else {}
     return {name: value for name, value in found.items() if name in derived_names(task)}
 
 

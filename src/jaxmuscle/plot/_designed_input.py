@@ -11,7 +11,7 @@ from ._style import BLUE, COLUMN, GREY, ORANGE, canvas, fitted_to, key, log_axis
 SHOWN = 20.0  # s
 HEIGHTS, ROW = (1.7, 1.5), 0.2  # inches
 LEAST = 2.0  # densities that differ by less are shown as even
-NOW, FLAT, DESIGNED = "now, without a motion", "flat motion", "designed motion"
+NOW, FLAT, DESIGNED = "now, without this record", "flat motion", "designed motion"
 
 
 @styled

@@ -42,8 +42,8 @@ class DesignedInput(Printed, Result, eqx.Module):
     record; `flat`, with the flat motion; `stderr`, with this one; `by_seconds`, with records of it that have other lengths
     [s]; `needed`, the relative error that was asked for and the length [s] of the record that reaches it, or None;
     `notices`, what to know before; `elsewhere`, of each quantity that is hardly known so far: its value one standard error
-    below and above, and the error that this motion gives there, both in its unit; `masses` [kg] of the muscle, and which of
-    them are `held`: the others are fitted with the record, so their errors are in those of the rest.
+    below and above, and the error that this motion gives there, both in its unit; `masses` [kg] that the fit
+    does not have free, and which of them are `held`: the others are fitted with the record, their errors are in the rest.
     """
 
     quantity: tuple[str, ...] = eqx.field(static=True)
@@ -170,7 +170,7 @@ class DesignedInput(Printed, Result, eqx.Module):
             f"relative variance of {names}" if len(self.quantity) == 1 else f"sum of the relative variances of {names}"
         )
         return folded([
-            f"designed input: one record of {self.lengthening.seconds:g} s would tell {best}",
+            f"designed input: one more record of {self.lengthening.seconds:g} s would tell {best}",
             *self._vague(),
             *self._elsewhere(),
             *(f"  note: {notice}" for notice in self.notices),
@@ -218,11 +218,14 @@ class DesignedInput(Printed, Result, eqx.Module):
         lines = ["  assumed: the muscle is the one given here" + f", with a mean force of {mean[0]:.3g} N" * bool(mean)]
         if mean:
             lines[0] += ". If you measured another one, fit with it first (mean and unit of the target)"
+        if "K_w0" in {name.partition("@")[0] for name in self.quantity}:
+            lines += ["  assumed: the reference displacement x_ref_w. No record tells it, and the value of K_w0 hangs on it "
+                      "(docs/perturbed.md, limits)"]  # fmt: skip
         values = " and ".join(f"{name} = {value:.3g} kg" for name, value in self.masses.items())
         if "m_w" in self.held:
             lines += ["  assumed: the active mass m_w is right, as in the fit. No record tells it. Where it is wrong, C_w0 "
                       "and K_w0 are, too (docs/perturbed.md has by how much)"]  # fmt: skip
-        elif any(value != USUAL for value in self.masses.values()):
+        elif not self.held and any(value != USUAL for value in self.masses.values()):
             lines += [f"  assumed: {values}, as here. A held force tells no mass. If you know roughly what moves, fit with "
                       f"that (--fix m_w={USUAL:g} --fix m_z={USUAL:g}, say) and design again. The fit of a record lets both "
                       f"free, and begins with {USUAL:g} kg"]  # fmt: skip

@@ -93,7 +93,8 @@ class Design(eqx.Module):
         """Task and data in words."""
         data, like = [], self.like(problem)
         if self.spectral:
-            data.append(_spectrum_in_words(self.counts or segments_of(like.target)))
+            settings = like.target.settings if self.settings is None else self.settings
+            data.append(_spectrum_in_words(self.counts or segments_of(like.target), settings))
         data += ["coefficient of variation"] if self.coefficient_of_variation else []
         data += [] if self.mean is None else [f"mean to {100 * self.mean:.2g} %"]
         if self.lengthening is not None:
@@ -116,7 +117,8 @@ def told_data(problem: FitProblem) -> tuple[str, str]:
     tasks, told = [], []
     for part in problem.parts:
         segments = part.target.segments
-        data = [f"{len(part.target.bins)} bins with a stated sigma" if segments is None else _spectrum_in_words(segments)]
+        data = [f"{len(part.target.bins)} bins with a stated sigma" if segments is None else
+                _spectrum_in_words(segments, part.target.settings)]  # fmt: skip
         data += ["coefficient of variation"] * (part.variation is not None) + ["mean"] * (part.mean is not None)
         whose = f"{part.name}: " if len(problem.parts) > 1 else ""
         tasks.append(whose + _task_in_words(part.task))
@@ -131,10 +133,11 @@ def _task_in_words(task: AbstractTask, kind: type[AbstractTask] | None = None) -
     return ", ".join([kind.__name__ + (f" ({HELD[kind]})" if kind in HELD else ""), *inputs])
 
 
-def _spectrum_in_words(counts: tuple[int, ...]) -> str:
+def _spectrum_in_words(counts: tuple[int, ...], settings: SpectrumSettings) -> str:
+    seconds = sum(settings.length + (count - 1) * settings.step for count in counts if count) / settings.rate
     alike = f"{len(counts)} x {max(counts)}"
     listed = " + ".join(map(str, counts))
-    return f"spectrum of {alike if len(counts) > 2 and min(counts) == max(counts) else listed} segments"
+    return f"spectrum of {alike if len(counts) > 2 and min(counts) == max(counts) else listed} segments ({seconds:.3g} s)"
 
 
 def segments_of(target: Target) -> tuple[int, ...]:

@@ -31,6 +31,7 @@ TIRING = (
     "no design knows fatigue: split a long or strong hold into short trials with rests between, and give all trials "
     "to one fit"
 )
+OPENED = "; but open where it says so above"
 BASE = {"k_w": "K_w0", "k_z": "K_z0", "c_w": "C_w0", "c_z": "C_z0"}
 
 
@@ -219,7 +220,7 @@ def _present(report: IdentifiabilityReport) -> list[str]:
     values = [f"{v:.3g}" for v in now.singular_values]
     lines += _wrapped("  ".join([*values[: now.determined], "|", *values[now.determined :]]), 4)
     if now.products:
-        lines += _wrapped(f"known are: {_products(now)}", 4, "  ")
+        lines += _wrapped(f"known to a third of the prior's error or better: {_products(now)}", 4, "  ")
     if doubted := [name for name in told(now.quantities) if name in report.open_in_fit]:
         lines += _wrapped(f"known here, but not determined in the fit: {', '.join(doubted)}. {STRICTER}", 4, "  ")
     if now.undetermined:
@@ -257,7 +258,11 @@ def _table(report: IdentifiabilityReport) -> list[str]:
                           f"force (that of the fitted muscle is {report.mean_force:.3g} N)", 4, "  ")  # fmt: skip
     elif report.masses:
         known = ", ".join(f"{name} = {value:.3g} kg" for name, value in report.masses.items())
-        lines += _wrapped(f"taken as known, as in the fit: {known}; but open where it says so above", 4, "  ")
+        lines += _wrapped(
+            f"taken as known, as in the fit: {known}" + OPENED * any("fitted with it" in o.data for o in report.designs),
+            4,
+            "  ",
+        )
     for start in range(0, max(len(possible), 1), COLUMNS):
         block = possible[start : start + COLUMNS]
         heads = ["prior", "now", *(label for label, _ in block)]

@@ -187,7 +187,8 @@ class Experiment(NamedTuple):
         lines = np.zeros((len(record.frequency), *start.shape))
         place = np.append(theta, np.zeros(more))[own]
         lines[:, own[:, None], own] = information_of_lines(task, wide, place, record.frequency, record.seconds)
-        masses = {name: float(task[name]) for name in MASSES if name in task.parameter_names}
+        unfitted = [name for name in MASSES if name not in like.coordinates.names]
+        masses = {name: float(task[name]) for name in unfitted if name in task.parameter_names}
         held = tuple(name for name in masses if name not in wide.names)
         return cls(here, tuple(quantity), masses, held, start, apart, record.frequency, lines)
 
@@ -263,10 +264,10 @@ def steps_of(frequency: Float[np.ndarray, " lines"]) -> Float[np.ndarray, "steps
 
 
 def _moved(task: Any) -> AbstractTask:
-    """The experiment with the muscle of a task, at the same P_w."""
-    if isinstance(task, PrescribedLength):
+    """The experiment with the muscle of a task, at the same P_w and x_z."""
+    if type(task) is PrescribedLength:
         return task
-    return task.as_task(PrescribedLength, **({"P_w": task.P_w} if hasattr(task, "P_w") else {}))
+    return task.as_task(PrescribedLength, **{name: getattr(task, name) for name in ("P_w", "x_z") if hasattr(task, name)})
 
 
 def _problem(given: FitResult | AbstractTask) -> tuple[FitProblem, Float[np.ndarray, " free"], Iterable[str]]:
