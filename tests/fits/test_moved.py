@@ -35,6 +35,16 @@ def fitted(tmp_path_factory):
     return folder / "out", found.output
 
 
+@pytest.mark.slow
+def test_a_response_alone_knows_no_noise_that_would_limit_a_further_measurement(fitted):
+    result = jm.load_result(fitted[0] / "fit.json")
+    report = jm.identifiability(result)
+    assert not report.designs and f"dynamic stiffness at {F.size} frequencies" in " ".join(str(report).split())
+    assert "no further measurement is tried, since the fit has no spectrum" in " ".join(str(report).split())
+    with pytest.raises(ValueError, match=r"result: no further measurement is tried.*fit_joint"):
+        jm.design_input(result)
+
+
 def read(path):
     with path.open() as file:
         rows = list(csv.DictReader(file))

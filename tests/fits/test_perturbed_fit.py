@@ -12,7 +12,8 @@ from scipy.optimize import brentq
 
 import jaxmuscle as jm
 from jaxmuscle.fits._adequacy import Endpoint
-from jaxmuscle.fits._perturbed import seen_with
+from jaxmuscle.fits._perturbed import seen_with, without_rhythm
+from jaxmuscle.objective._arguments import FitOptions
 from jaxmuscle.objective._consequences import expand
 from jaxmuscle.uncertainty._identifiability import fitted_problem
 
@@ -335,6 +336,22 @@ def test_a_line_in_the_fluctuations_is_fitted_though_noise_alone_passes():
     assert abs(result.only.task["harmonic_frequency"] - 4.25) < 0.2
     for name, true in WHOLE.items():
         assert abs(result[name].value - true) < 3 * result[name].stderr, name
+
+
+def test_a_harmonic_that_is_asked_for_is_not_left_out():
+    task = jm.PrescribedLength()
+    assert float(without_rhythm(task, FitOptions()).harmonic.amplitude) == 0
+    for asked in ({"priors": {"harmonic_amplitude": 0.5}}, {"bounds": {"harmonic_frequency": (3.0, 6.0)}}):
+        assert without_rhythm(task, FitOptions(**asked)) is task
+
+
+@pytest.mark.slow
+def test_without_scatter_there_is_no_verdict(minute):
+    seen = minute.target()
+    silent = jm.Target("silent", seen.proportional_power, bins=seen.bins, quantity="force", settings=seen.settings)
+    quick = {"starts": 8, "seeds": 0, "check_seeds": 0}
+    result = jm.fit(jm.PrescribedLength(), silent.with_stiffness(seen.stiffness), **quick)
+    assert result.success and result.adequate is None and "cannot be judged" in result.verdict
 
 
 @pytest.mark.slow

@@ -12,6 +12,8 @@ from .recordings import perturbed, read_perturbed, read_trials, reads_perturbed,
 if TYPE_CHECKING:
     from jaxmuscle import PerturbedRecording, Trials
 
+VAGUE, MISSED = 0.05, 2.0  # s, standard error of a delay that is none; chi² over its expectation
+
 
 @reads_perturbed
 def analyse(
@@ -139,7 +141,7 @@ def _write_perturbed(recording: "PerturbedRecording", settings: str, folder: Pat
 
     response, delay = recording.frequency_response(settings), recording.delay(settings)
     classical = {name: (m.value, float(m.stderr or 0.0), m.unit) for name, m in recording.second_order(settings).items()}
-    classical["delay"] = (*delay, "s")
+    classical["delay"], misfit = (*delay, "s"), recording._second_order(settings, False).chi2
     figures = write_figure(recording.plot(settings), folder, "analysis", formats)
     response.save(folder / "response.csv")
     names = ("name", "source", "rate", "window", "notices")
@@ -155,7 +157,12 @@ def _write_perturbed(recording: "PerturbedRecording", settings: str, folder: Pat
             out.print(plain(line), highlight=False)
     table = Table(title="H = K + iωB - ω²I, and a delay", title_justify="left", show_header=False)
     for name, (value, error, unit) in classical.items():
-        table.add_row(name, " ± ".join(rounded(value, error)), unit)
+        told = name != "delay" or error < VAGUE
+        table.add_row(name, *((" ± ".join(rounded(value, error)), unit) if told else ("not told by this response", "")))
     out.print(table)
+    if misfit > MISSED:
+        out.print(f"This line misses the points: its chi2 is {misfit:.2g} times what it should be. The muscle is more than "
+                  "a spring, a damper and a mass, so do not interpret K, B and I. Fit it: jaxmuscle fit FILE --task "
+                  "prescribed-length", highlight=False)  # fmt: skip
     record(found)
     out.print(f"Written: {folder}/{', '.join(['analysis.json', 'response.csv', *figures])}", highlight=False)

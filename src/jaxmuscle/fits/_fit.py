@@ -65,7 +65,7 @@ def fit(
     settings replace the task's: a `Target`, a `Recording`, the recordings of one condition (a list, `Trials`), a
     `PerturbedRecording` or several, a `FrequencyResponse`, or names and paths of these (with a `PrescribedLength` a file of
     force and displacement is a perturbed recording, see `jaxmuscle.data.two_channels`); `free`,
-    names to fit (default: `DEFAULT_FREE`, those of them that the task has);
+    names to fit (default: `DEFAULT_FREE`, those of them that the task has; where a motor moves the insertion m_w, m_z, too);
     `fix`, values to set, which are then not free; `noise`, a name or an object; `residual`, "log", "linear" or
     "cumulative"; `starts` (100, or 8 for a task without linear response); `seeds` (32, or 48 then; 0: no nonlinear
     correction); `key`, a `jax.random` key or a seed number; `bounds` {name: (low, high)}; `priors` {name: sd in log, or None
@@ -101,7 +101,8 @@ def fit(
             target = analysed(recordings, without_rhythm(task, options), options)
         top = _top(task, target, options, chosen=noise is not None)
         task, options = at_mean(task, target, options)
-        first = task if target.stiffness is None else without_rhythm(task, options)
+        unknown = len(target.bins) > 0 and target.segments is None and target.sigma is None  # no verdict
+        first = task if target.stiffness is None or unknown else without_rhythm(task, options)
         lowest = 0 if first is task else QUIET
         plan = planned(first, target, options_for(first, options))
         models = Models(task, top, lambda task: planned(task, target, options_for(task, options)), lowest)

@@ -40,7 +40,8 @@ def without_rhythm(task: AbstractTask, options: FitOptions) -> AbstractTask:
     A harmonic whose frequency is sought in the noise of the spectrum bends that. It is fitted where the spectrum shows one
     (docs/perturbed.md).
     """
-    asked = options.free is not None or not set(HARMONIC).isdisjoint(options.fix or {})
+    named = {*(options.fix or ()), *(options.priors or ()), *(options.bounds or ())}
+    asked = options.free is not None or not named.isdisjoint(HARMONIC)
     if asked or options.method != "linear" or not is_base(task):
         return task
     return task.replace(harmonic_amplitude=0.0)

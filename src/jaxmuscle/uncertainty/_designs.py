@@ -119,7 +119,10 @@ def told_data(problem: FitProblem) -> tuple[str, str]:
         segments = part.target.segments
         data = [f"{len(part.target.bins)} bins with a stated sigma" if segments is None else
                 _spectrum_in_words(segments, part.target.settings)]  # fmt: skip
+        data *= len(part.target.bins) > 0
         data += ["coefficient of variation"] * (part.variation is not None) + ["mean"] * (part.mean is not None)
+        if part.points is not None:
+            data.append(f"dynamic stiffness at {len(part.points)} frequencies")
         whose = f"{part.name}: " if len(problem.parts) > 1 else ""
         tasks.append(whose + _task_in_words(part.task))
         told.append(whose + ", ".join(data))
@@ -158,6 +161,8 @@ def designs_for(problem: FitProblem, seen: Expansion) -> tuple[Design, ...]:
     displacement is that under the load which the sensor had held, so that the operating point stays, and the perturbations
     with it.
     """
+    if without_noise(problem):
+        return ()
     levels = [_level_of(part.task) for part in problem.parts]
     factors = [
         tuple(f for f, extreme in zip(LEVELS, (max, min), strict=True) if level == extreme(levels)) for level in levels
@@ -169,6 +174,11 @@ def designs_for(problem: FitProblem, seen: Expansion) -> tuple[Design, ...]:
             made = [dataclasses.replace(d, name=f"{d.name} ({part.name})", target=part.name) for d in made]
         designs += made
     return tuple(designs)
+
+
+def without_noise(problem: FitProblem) -> bool:
+    """Whether a target has no spectrum, so that nothing is known of the noise that would limit a further measurement."""
+    return any(len(part.target.bins) == 0 for part in problem.parts)
 
 
 def _level_of(task: AbstractTask) -> float:
@@ -187,6 +197,7 @@ def _designs_for(part: Part, moments: Moments, factors: tuple[float, ...], separ
     task, mean = part.task, float(moments.mean)
     steady = float(np.sqrt(moments.variance)) < MOST_VARIATION * abs(mean)
     varying = part.variation is not None
+    still = "" if part.points is None else ", without motion"
     designs = []
     if not varying and steady:
         designs.append(Design("the coefficient of variation", segments=0, coefficient_of_variation=True))
@@ -204,11 +215,11 @@ def _designs_for(part: Part, moments: Moments, factors: tuple[float, ...], separ
     forces = {n: float(task[n]) for n in FORCES if n in task.parameter_names and float(task[n]) != 0}
     if forces:
         for factor in (f for f in factors if f * (part.target.mvc_fraction or 0.0) <= 1.0):
-            name = f"a second force level {factor:g} times as high"
+            name = f"a second force level {factor:g} times as high{still}"
             moved = task.replace(**{n: factor * v for n, v in forces.items()})
             designs.append(Design(name, moved, coefficient_of_variation=varying, separate=separate))
     more = tuple((LONGER - 1) * k for k in segments_of(part.target))
-    designs.append(Design(f"a recording {LONGER} times as long", segments=more, coefficient_of_variation=varying))
+    designs.append(Design(f"a recording {LONGER} times as long{still}", segments=more, coefficient_of_variation=varying))
     return designs
 
 

@@ -20,8 +20,17 @@ from jaxmuscle.objective._coordinates import Coordinates
 from jaxmuscle.objective._covariance import Identifiability, common_scales, known_products
 from jaxmuscle.objective._problem import FitProblem
 
-from ._designs import Design, design_information, designs_for, information_of, seen_here, told_data, without_further
-from ._identifiability_report import TOGETHER, UNDESCRIBED, IdentifiabilityReport, Known, Outlook
+from ._designs import (
+    Design,
+    design_information,
+    designs_for,
+    information_of,
+    seen_here,
+    told_data,
+    without_further,
+    without_noise,
+)
+from ._identifiability_report import NO_NOISE, TOGETHER, UNDESCRIBED, IdentifiabilityReport, Known, Outlook
 
 LEAST_PRIOR = 1e-6
 
@@ -65,6 +74,8 @@ def identifiability(
              for (a, x), (b, y) in itertools.combinations(possible, 2)]  # fmt: skip
     pairs.sort(key=lambda pair: (-len(pair.gained), pair.log_left))
     notices = tuple(n for n in result.notices if " ambiguous: " in n)
+    if designs is None and without_noise(problem):
+        notices += (NO_NOISE,)
     if target is None:
         notices = missed(result) + notices
     mean_force = result.derived["mean"].value if result.per_newton else None

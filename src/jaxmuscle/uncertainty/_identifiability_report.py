@@ -31,6 +31,8 @@ TIRING = (
     "no design knows fatigue: split a long or strong hold into short trials with rests between, and give all trials "
     "to one fit"
 )
+NO_NOISE = ("no further measurement is tried, since the fit has no spectrum: nothing is known of the noise that would limit "
+            "it. Fit the recording of both channels, or a spectrum beside the response (fit_joint)")  # fmt: skip
 OPENED = "; but open where it says so above"
 BASE = {"k_w": "K_w0", "k_z": "K_z0", "c_w": "C_w0", "c_z": "C_z0"}
 

@@ -24,9 +24,9 @@ from jaxmuscle.objective._problem import FitProblem
 from jaxmuscle.response._expected_spectrum import expected_spectrum
 
 from ._designed_input import DOUBTFUL, DesignedInput
-from ._designs import information_with_masses, moved_insertion, seen_here
+from ._designs import information_with_masses, moved_insertion, seen_here, without_noise
 from ._identifiability import Here, fitted_problem, missed
-from ._identifiability_report import BASE
+from ._identifiability_report import BASE, NO_NOISE
 from ._lengthening import Lengthening, information_of_lines, lines_in, require_positive
 from ._multisine import multisine, speed_of
 
@@ -163,6 +163,8 @@ class Experiment(NamedTuple):
     ) -> "Experiment":
         """Of a record, at the values of a fit or task, or a step of its θ away from them. Needs double precision."""
         problem, theta, derived = _problem(given)
+        if without_noise(problem):
+            raise ValueError(f"result: {NO_NOISE}")
         if step is not None:
             theta = theta + step
             parts = (dataclasses.replace(part, task=part.task_at(theta)) for part in problem.parts)
