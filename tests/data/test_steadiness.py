@@ -20,7 +20,7 @@ import jaxmuscle as jm
 from jaxmuscle.data import Measure, _steadiness
 from jaxmuscle.data._measure import log_interval, logit_interval, student_interval
 from jaxmuscle.data._steadiness import RANGES, _error, _interval, _own, _peak, _segments, _stated, _together
-from jaxmuscle.objective._consequences import derived_names
+from jaxmuscle.objective._derived import derived_names
 from jaxmuscle.spectra._bin_law import student
 from jaxmuscle.spectra._fluctuations import dfa
 from jaxmuscle.spectra._measures import approximate_entropy, sample_entropy

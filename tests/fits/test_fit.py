@@ -24,9 +24,10 @@ from jaxmuscle.model._noises import with_noise
 from jaxmuscle.model._parameters import DEFAULT_FREE, PARAMETERS
 from jaxmuscle.model._stream import Draws
 from jaxmuscle.objective._arguments import DT, RESIDUALS, FitOptions, free_names, planned
-from jaxmuscle.objective._consequences import BATCH, _of_rows, consequences, derived, expand
+from jaxmuscle.objective._consequences import BATCH, _of_rows, consequences, expand
 from jaxmuscle.objective._coordinates import Coordinates
 from jaxmuscle.objective._covariance import common_scales, identifiability
+from jaxmuscle.objective._derived import derived
 from jaxmuscle.objective._least_squares import Minima, _residuals, _Standing, least_squares
 from jaxmuscle.objective._moment_models import MonteCarlo, welch_operator
 from jaxmuscle.objective._problem import FitProblem, Part, target_variation

@@ -16,9 +16,10 @@ from jaxmuscle._common.arrays import as_arrays
 from jaxmuscle.fits._joint import planned_jointly
 from jaxmuscle.model._parameters import DEFAULT_FREE
 from jaxmuscle.objective._arguments import FitOptions, joint_names, task_for
-from jaxmuscle.objective._consequences import derived, expand
+from jaxmuscle.objective._consequences import expand
 from jaxmuscle.objective._coordinates import task_at
 from jaxmuscle.objective._covariance import common_scales, identifiability
+from jaxmuscle.objective._derived import derived
 from jaxmuscle.objective._residuals import Residuals
 from jaxmuscle.objective._starts import starting_points
 

@@ -126,7 +126,7 @@ def test_tangents_do_not_hang_on_the_reference_displacement(minute, result, x64)
 def test_what_a_fit_says_and_keeps(result, tmp_path):
     text = str(result)
     assert "The model describes the data: chi2 per datum" in text and "PrescribedLength" in text
-    assert "m_w = " not in text and "held fixed: x_ref_w = 20 mm. No record tells it, and K_w0 hangs on it" in text
+    assert "m_w = " not in text and "held fixed: x_ref_w = 20 mm. No record tells it, and K_w0 depends on it" in text
     result.save(tmp_path / "fit.json")
     again = jm.load_result(tmp_path / "fit.json")
     assert str(again) == text

@@ -17,7 +17,8 @@ from jaxmuscle.fits._ladder import Rung, _fewer, criterion, gains, passed_over, 
 from jaxmuscle.fits._part import Estimate
 from jaxmuscle.model._rungs import RUNGS
 from jaxmuscle.objective._arguments import COEFFICIENTS, FitOptions, planned
-from jaxmuscle.objective._consequences import derived_names, expand
+from jaxmuscle.objective._consequences import expand
+from jaxmuscle.objective._derived import derived_names
 from jaxmuscle.response._expected import expected_moments
 from jaxmuscle.spectra._bin_law import bin_statistics
 from jaxmuscle.spectra._settings import WINDOW

@@ -31,7 +31,7 @@ from jaxmuscle.response._equilibrium import equilibrium
 from jaxmuscle.response._expected import expected_moments
 from jaxmuscle.spectra._bin_law import samples_of, welch_law
 from jaxmuscle.spectra._settings import WINDOW
-from jaxmuscle.uncertainty._designs import design_information, information_of, seen_here, without_further
+from jaxmuscle.uncertainty._design_information import design_information, information_of, seen_here, without_further
 
 TRUTH = jm.Isometric().replace(harmonic_amplitude=0.012, harmonic_frequency=5.0)
 LOADED = TRUTH.as_task(jm.PrescribedForce, P_w=0.0)

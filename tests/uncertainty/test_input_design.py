@@ -19,7 +19,7 @@ from jaxmuscle.commands.design import design
 from jaxmuscle.data import FrequencyResponse
 from jaxmuscle.objective._coordinates import Coordinates
 from jaxmuscle.uncertainty import Lengthening
-from jaxmuscle.uncertainty._designs import design_information, information_of, seen_here
+from jaxmuscle.uncertainty._design_information import design_information, information_of, seen_here
 from jaxmuscle.uncertainty._identifiability import fitted_problem
 from jaxmuscle.uncertainty._input_design import Experiment, steps_of
 

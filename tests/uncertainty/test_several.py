@@ -13,7 +13,7 @@ import jaxmuscle as jm
 from jaxmuscle.fits._reopened import reopened
 from jaxmuscle.objective._consequences import expand
 from jaxmuscle.objective._likelihood import Likelihood
-from jaxmuscle.uncertainty._designs import information_of, seen_here
+from jaxmuscle.uncertainty._design_information import information_of, seen_here
 from jaxmuscle.uncertainty._posterior_density import density_about
 
 TRUTH = jm.Isometric().replace(c_w=80.0, noise_K_w=0.2, harmonic_amplitude=0.012, harmonic_frequency=5.0)

@@ -18,7 +18,7 @@ from jaxmuscle._common.files import write_text
 from jaxmuscle._common.tables import frame
 from jaxmuscle._common.text import folded
 from jaxmuscle.objective._arguments import base_of
-from jaxmuscle.objective._consequences import BANDS
+from jaxmuscle.spectra._fluctuations import BANDS
 
 if TYPE_CHECKING:
     import pandas

@@ -141,7 +141,7 @@ def _write_perturbed(recording: "PerturbedRecording", settings: str, folder: Pat
 
     response, delay = recording.frequency_response(settings), recording.delay(settings)
     classical = {name: (m.value, float(m.stderr or 0.0), m.unit) for name, m in recording.second_order(settings).items()}
-    classical["delay"], misfit = (*delay, "s"), recording._second_order(settings, False).chi2
+    classical["delay"], misfit = (*delay, "s"), recording.second_order_misfit(settings)
     figures = write_figure(recording.plot(settings), folder, "analysis", formats)
     response.save(folder / "response.csv")
     names = ("name", "source", "rate", "window", "notices")

@@ -15,7 +15,7 @@ from jaxmuscle import plot
 from jaxmuscle._common.cards import Printed
 from jaxmuscle._common.documents import Table, checked
 from jaxmuscle._common.files import write_text
-from jaxmuscle._common.text import folded
+from jaxmuscle._common.text import folded, probability
 from jaxmuscle.spectra._settings import require
 
 from ._second_order import parts, second_order_shape
@@ -265,6 +265,17 @@ class FrequencyResponse(Printed, eqx.Module):
             lines.append("  notice    the force does not follow the displacement: no gain is larger than chance makes it. "
                          "Is this the channel that moved the insertion?")  # fmt: skip
         return folded(lines + [f"  notice    {notice}" for notice in self.notices])
+
+
+def check_seen(response: FrequencyResponse, whose: str) -> None:
+    """Raise a `ValueError` if chance alone explains a response: the force does not follow the displacement."""
+    if response.p_none <= UNSEEN:
+        return
+    raise ValueError(f"{whose}: the force does not follow the displacement at any frequency: chance alone makes a response "
+                     f"this large with {probability(response.p_none)}. So it tells nothing of stiffness and damping. Check "
+                     "that the displacement is the channel that moved the insertion, and that one clock timed both. If they "
+                     "are right, move more or record longer. The force alone is fitted with jaxmuscle.Isometric() "
+                     "(--task isometric)")  # fmt: skip
 
 
 def _column(name: str, given: Any, size: int | None, kind: type = float) -> Any:

@@ -201,6 +201,10 @@ class PerturbedRecording(Printed, eqx.Module):
         return {name: Measure(float(value), float(error), unit, "spectrum", normal_interval(float(value), float(error)))
                 for name, value, error, unit in rows}  # fmt: skip
 
+    def second_order_misfit(self, settings: SpectrumSettings | str | None = None) -> float:
+        """How many times as large as expected chi² of `second_order` is: about 1 where that is the shape of the response."""
+        return self._second_order(settings, False).chi2
+
     def _second_order(self, settings: SpectrumSettings | str | None, delayed: bool) -> SecondOrder:
         return second_order_fit(self._response(settings), delayed)
 

@@ -29,7 +29,7 @@ STARTS = 32
 ALIKE = 2.0
 TREMOR = 2  # the rung whose rhythm is no line
 DESCENDED = 0.6  # a fit's progress when its descents have ended
-HEAD = f"{'models tried (-> result), before simulation':<47}{'chi2/bin':>9}{'p':>9}{'AIC':>9}"
+HEAD = "models tried (-> result), before simulation"
 
 
 class Rung(NamedTuple):
@@ -65,6 +65,11 @@ class Climbed(NamedTuple):
     known: Any
     ended: Endpoint
     rung: Rung
+
+
+def heading(datum: str) -> str:
+    """The head of the table of models; `datum`, what chi² is counted for: a bin, or else any number of the data."""
+    return f"{HEAD:<47}{'chi2/bin' if datum == 'bin' else 'chi2/n':>9}{'p':>9}{'AIC':>9}"
 
 
 def gains(ladder: tuple[Rung, ...], *, describes: bool | None, datum: str = "bin") -> tuple[str, ...]:
@@ -129,11 +134,11 @@ def climb(first: Plan, models: Models, descend: Descend, keep: Callable[[Climbed
     """
     tried: list[Climbed] = []
     best: Climbed | None = None
-    line = False  # seen beside noise alone
+    due: int | None = None  # the model to be tried although the best one describes the data
     numbers = range(models.lowest, models.top + 1)
     for place, number in enumerate(numbers):
         described = best is not None and best.rung.p >= ADEQUATE
-        if described and number < TREMOR and not (line and number == QUIET + 1):
+        if described and number != due:
             continue
         plan = models.plan_of(on_rung(models.base, number)) if number > models.lowest else first
         points = starting_points(plan.problem, plan.starts) if best is None else _warm(plan, best)
@@ -151,14 +156,19 @@ def climb(first: Plan, models: Models, descend: Descend, keep: Callable[[Climbed
         if best is None or found.rung.aic < best.rung.aic - ALIKE * described:
             best = found
             keep(found)
-        if number == QUIET and best.rung.p >= ADEQUATE:
-            line = float(models.base.harmonic.amplitude) > 0 and p_of_line_left_out(best.ended) < SIGNIFICANT
-            if line:
-                continue
-        last = described and not (line and number == QUIET + 1)
-        if last or (best.rung.p >= ADEQUATE and not (number < TREMOR <= models.top and _has_line(best))):
-            break
+        if best.rung.p >= ADEQUATE:
+            due = _due(best, number, models)
+            if due is None:
+                break
     return tuple(each.rung._replace(chosen=each is best) for each in tried)
+
+
+def _due(best: Climbed, number: int, models: Models) -> int | None:
+    """Which model is tried after this one, where the best one describes the data."""
+    if number == QUIET:
+        line = float(models.base.harmonic.amplitude) > 0 and p_of_line_left_out(best.ended) < SIGNIFICANT
+        return number + 1 if line else None
+    return TREMOR if number < TREMOR <= models.top and _has_line(best) else None
 
 
 def _telling(plan: Plan, which: str, begin: float, end: float) -> Plan:

@@ -8,7 +8,7 @@ import jax
 import numpy as np
 
 from jaxmuscle.data._as_target import as_target
-from jaxmuscle.data._frequency_response import UNSEEN
+from jaxmuscle.data._frequency_response import UNSEEN, check_seen
 from jaxmuscle.data._perturbed import PerturbedRecording
 from jaxmuscle.data._perturbed_target import perturbed_target
 from jaxmuscle.data._target import Target
@@ -16,7 +16,7 @@ from jaxmuscle.data._two_channels import perturbed_recordings
 from jaxmuscle.model._parameters import HARMONIC
 from jaxmuscle.model._rungs import is_base
 from jaxmuscle.model._tasks import AbstractTask, PrescribedLength
-from jaxmuscle.objective._arguments import FitOptions, at_mean, no_response, planned
+from jaxmuscle.objective._arguments import FitOptions, at_mean, planned
 from jaxmuscle.objective._least_squares import least_squares
 from jaxmuscle.objective._starts import starting_points
 from jaxmuscle.response._input_response import dynamic_stiffness
@@ -100,5 +100,4 @@ def _check_trials(recordings: Sequence[PerturbedRecording]) -> None:
         usual, error = np.average(value, axis=0, weights=weight), 1 / np.sqrt(weight.sum(axis=0))
         apart = dataclasses.replace(own, value=own.value - usual, stderr=np.hypot(own.stderr, error))
         if apart.p_none <= UNSEEN:
-            whose = f"trial {number + 1} of {len(recordings)} ({recordings[number].source})"
-            raise no_response(whose, own.p_none)
+            check_seen(own, f"trial {number + 1} of {len(recordings)} ({recordings[number].source})")

@@ -13,8 +13,8 @@ from jaxmuscle.ensembles._ensemble import runs_for_means
 from jaxmuscle.model._noises import with_active_noise
 from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.objective._arguments import Plan, base_of
-from jaxmuscle.objective._consequences import jackknife, observed
 from jaxmuscle.objective._covariance import Identifiability, common_scales, known_products
+from jaxmuscle.objective._derived import jackknife, observed
 from jaxmuscle.objective._moment_models import Linear
 from jaxmuscle.objective._problem import FitProblem, Part
 from jaxmuscle.response._expected import Moments, check_power, expected_moments

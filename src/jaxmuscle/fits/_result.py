@@ -22,7 +22,7 @@ from jaxmuscle._common.tables import frame
 from jaxmuscle._common.text import choices, probability
 from jaxmuscle.data._target import Target
 from jaxmuscle.model._tasks import AbstractTask
-from jaxmuscle.objective._consequences import derived_names
+from jaxmuscle.objective._derived import derived_names
 
 from ._adequacy import Adequacy
 from ._fit_file import FORMAT, FORMATS, FitTable, PartTable, disagreement

@@ -10,11 +10,11 @@ from jaxmuscle._common.text import folded
 from jaxmuscle.data._target import Target
 from jaxmuscle.model._parameters import PARAMETERS
 from jaxmuscle.objective._arguments import base_of
-from jaxmuscle.objective._consequences import MEANINGS
 from jaxmuscle.objective._covariance import spelt
+from jaxmuscle.objective._derived import MEANINGS
 from jaxmuscle.spectra._fluctuations import BANDS, in_bands
 
-from ._ladder import HEAD, gains, passed_over
+from ._ladder import gains, heading, passed_over
 from ._part import Estimate, FittedPart
 
 if TYPE_CHECKING:
@@ -62,8 +62,7 @@ def text_of(result: "FitResult") -> str:
     if not single:
         lines += [f"  {name}: {p.target.name}, {p.model}{_closeness(p, ', ')}" for name, p in result.parts.items()]
     lines += [f"  {'' if single else f'{name}: '}{words}" for name, p in result.parts.items() for words in _trials(p.target)]
-    head = HEAD.replace("chi2/bin", "   chi2/n") if _datum(result) == "datum" else HEAD
-    lines += [f"  {head}", *(f"  {rung}" for rung in result.ladder)] if len(result.ladder) > 1 else []
+    lines += [f"  {heading(_datum(result))}", *(f"  {rung}" for rung in result.ladder)] if len(result.ladder) > 1 else []
     lines += [f"  {sentence}" for sentence in passed_over(result.ladder)]
     lines += [f"  {sentence}" for sentence in _gains(result)]
     lines += [f"  {sentence}" for sentence in result.advice]
@@ -102,7 +101,7 @@ def text_of(result: "FitResult") -> str:
 
 
 def _held(result: "FitResult") -> list[str]:
-    """The masses and lengths that a fit takes as given, where its stiffness in newtons hangs on them."""
+    """The masses and lengths that a fit takes as given, where its stiffness in newtons depends on them."""
     if len(result.parts) > 1 or not result.derived:
         return []
     task, moved = result.only.task, result.only.stiffness is not None
@@ -125,11 +124,11 @@ def _held(result: "FitResult") -> list[str]:
                  "free, as by default"]  # fmt: skip
     if "x_ref_w" in held and "K_w_tangent" in result.derived:
         tangent, base = (result.derived[name].value for name in ("K_w_tangent", "K_w0"))
-        other = [f"{tangent / (1 + (tangent / base - 1) / times**2):.3g}" for times in OTHER_LENGTHS]
+        other = [f"{tangent / (1 + (tangent / base - 1) / times**2):.4g}" for times in OTHER_LENGTHS]
         lengths = " or ".join(f"{1e3 * times * float(task['x_ref_w']):.3g}" for times in OTHER_LENGTHS)
-        said += [f"held fixed: {told['x_ref_w']}. No record tells it, and K_w0 hangs on it: with {lengths} mm it would be "
-                 f"{' or '.join(other)} N/m, and the fit as good. K_w_tangent, the stiffness of the active tissue as "
-                 "stretched in the hold, and tangent_stiffness, that of both tissues, stay: report these"]  # fmt: skip
+        said += [f"held fixed: {told['x_ref_w']}. No record tells it, and K_w0 depends on it: with {lengths} mm it would be "
+                 f"{' or '.join(other)} N/m, and the fit as good. Report K_w_tangent, the stiffness of the active tissue "
+                 "as stretched in the hold, and tangent_stiffness, that of both tissues: they hardly change"]  # fmt: skip
     return said
 
 

@@ -27,7 +27,7 @@ from jaxmuscle._common.types import Key
 from jaxmuscle.data._study_table import READING, Cell, cells_of_study, read_study
 from jaxmuscle.model._parameters import PARAMETERS
 from jaxmuscle.model._rungs import RUNGS
-from jaxmuscle.objective._consequences import DERIVED
+from jaxmuscle.objective._derived import DERIVED
 
 from ._cohort import CohortResult, fit_cohort
 from ._differences import CORRECTIONS, Difference, change, corrected, difference, paired

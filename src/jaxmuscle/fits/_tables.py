@@ -8,8 +8,8 @@ import numpy as np
 
 from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.objective._arguments import SAME, base_of
-from jaxmuscle.objective._consequences import derived_names, unit_of
 from jaxmuscle.objective._covariance import Identifiability, common_scales
+from jaxmuscle.objective._derived import derived_names, unit_of
 from jaxmuscle.objective._problem import FitProblem, Part
 
 from ._intervals import Interval

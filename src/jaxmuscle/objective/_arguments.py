@@ -12,9 +12,9 @@ from jaxmuscle._common.arguments import count, positive
 from jaxmuscle._common.arrays import as_numbers, with_nulls
 from jaxmuscle._common.keys import check_key, key_of, number_of
 from jaxmuscle._common.progress import Tell, nothing
-from jaxmuscle._common.text import choices, probability
+from jaxmuscle._common.text import choices
 from jaxmuscle._common.types import Key
-from jaxmuscle.data._frequency_response import UNSEEN
+from jaxmuscle.data._frequency_response import check_seen
 from jaxmuscle.data._target import Target
 from jaxmuscle.model._muscle import Muscle
 from jaxmuscle.model._noise import AbstractNoise
@@ -84,17 +84,7 @@ def check_stiffness(task: AbstractTask, target: Target) -> None:
     if not isinstance(task, PrescribedLength):
         raise ValueError(f"target {target.name!r} has a dynamic stiffness, which {type(task).__name__} cannot give: fit "
                          "jaxmuscle.PrescribedLength()")  # fmt: skip
-    if target.stiffness.p_none > UNSEEN:
-        raise no_response(f"target {target.name!r}", target.stiffness.p_none)
-
-
-def no_response(whose: str, p: float) -> ValueError:
-    """The error for a displacement that the force does not follow."""
-    return ValueError(f"{whose}: the force does not follow the displacement at any frequency: chance alone makes a response "
-                      f"this large with {probability(p)}. So it tells nothing of stiffness and damping. Check that the "
-                      "displacement is the channel that moved the insertion, and that one clock timed both. If they are "
-                      "right, move more or record longer. The force alone is fitted with jaxmuscle.Isometric() "
-                      "(--task isometric)")  # fmt: skip
+    check_seen(target.stiffness, f"target {target.name!r}")
 
 
 def free_names(

@@ -219,8 +219,8 @@ class DesignedInput(Printed, Result, eqx.Module):
         if mean:
             lines[0] += ". If you measured another one, fit with it first (mean and unit of the target)"
         if "K_w0" in {name.partition("@")[0] for name in self.quantity}:
-            lines += ["  assumed: the reference displacement x_ref_w. No record tells it, and the value of K_w0 hangs on it "
-                      "(docs/perturbed.md, limits)"]  # fmt: skip
+            lines += ["  assumed: the reference displacement x_ref_w. No record tells it, and the value of K_w0 depends on "
+                      "it (docs/perturbed.md, limits)"]  # fmt: skip
         values = " and ".join(f"{name} = {value:.3g} kg" for name, value in self.masses.items())
         if "m_w" in self.held:
             lines += ["  assumed: the active mass m_w is right, as in the fit. No record tells it. Where it is wrong, C_w0 "

@@ -15,21 +15,14 @@ from jaxmuscle.data._target import Target
 from jaxmuscle.fits._reopened import reopened
 from jaxmuscle.fits._result import FitResult
 from jaxmuscle.objective._arguments import MASSES
-from jaxmuscle.objective._consequences import Expansion, quantities, unit_of
+from jaxmuscle.objective._consequences import Expansion, quantities
 from jaxmuscle.objective._coordinates import Coordinates
 from jaxmuscle.objective._covariance import Identifiability, common_scales, known_products
+from jaxmuscle.objective._derived import unit_of
 from jaxmuscle.objective._problem import FitProblem
 
-from ._designs import (
-    Design,
-    design_information,
-    designs_for,
-    information_of,
-    seen_here,
-    told_data,
-    without_further,
-    without_noise,
-)
+from ._design_information import design_information, information_of, seen_here, without_further
+from ._designs import Design, designs_for, told_data, without_noise
 from ._identifiability_report import NO_NOISE, TOGETHER, UNDESCRIBED, IdentifiabilityReport, Known, Outlook
 
 LEAST_PRIOR = 1e-6

@@ -33,6 +33,7 @@ TIRING = (
 )
 NO_NOISE = ("no further measurement is tried, since the fit has no spectrum: nothing is known of the noise that would limit "
             "it. Fit the recording of both channels, or a spectrum beside the response (fit_joint)")  # fmt: skip
+FITTED_TOO = "fitted with it"
 OPENED = "; but open where it says so above"
 BASE = {"k_w": "K_w0", "k_z": "K_z0", "c_w": "C_w0", "c_z": "C_z0"}
 
@@ -260,11 +261,8 @@ def _table(report: IdentifiabilityReport) -> list[str]:
                           f"force (that of the fitted muscle is {report.mean_force:.3g} N)", 4, "  ")  # fmt: skip
     elif report.masses:
         known = ", ".join(f"{name} = {value:.3g} kg" for name, value in report.masses.items())
-        lines += _wrapped(
-            f"taken as known, as in the fit: {known}" + OPENED * any("fitted with it" in o.data for o in report.designs),
-            4,
-            "  ",
-        )
+        opened = OPENED * any(FITTED_TOO in outlook.data for outlook in report.designs)
+        lines += _wrapped(f"taken as known, as in the fit: {known}{opened}", 4, "  ")
     for start in range(0, max(len(possible), 1), COLUMNS):
         block = possible[start : start + COLUMNS]
         heads = ["prior", "now", *(label for label, _ in block)]

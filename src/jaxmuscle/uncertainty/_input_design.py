@@ -19,12 +19,13 @@ from jaxmuscle.data._target import Target
 from jaxmuscle.fits._result import FitResult
 from jaxmuscle.model._tasks import AbstractTask, PrescribedLength
 from jaxmuscle.objective._arguments import MASSES, FitOptions, planned
-from jaxmuscle.objective._consequences import derived_names
+from jaxmuscle.objective._derived import derived_names
 from jaxmuscle.objective._problem import FitProblem
 from jaxmuscle.response._expected_spectrum import expected_spectrum
 
+from ._design_information import information_with_masses, seen_here
 from ._designed_input import DOUBTFUL, DesignedInput
-from ._designs import information_with_masses, moved_insertion, seen_here, without_noise
+from ._designs import moved_insertion, without_noise
 from ._identifiability import Here, fitted_problem, missed
 from ._identifiability_report import BASE, NO_NOISE
 from ._lengthening import Lengthening, information_of_lines, lines_in, require_positive
@@ -183,7 +184,8 @@ class Experiment(NamedTuple):
         still = dataclasses.replace(design, task=task, lengthening=None)
         own, wide, fluctuations = information_with_masses(problem, theta, still, masses=True)
         more = int(np.sum(own >= len(theta)))
-        start, apart = (np.asarray(block_diag(start, np.eye(more))) for _ in range(2))
+        start = np.asarray(block_diag(start, np.eye(more)))
+        apart = start.copy()
         apart[np.ix_(own, own)] += fluctuations
         here = here._replace(gradients={name: np.pad(g, (0, more)) for name, g in here.gradients.items()})
         lines = np.zeros((len(record.frequency), *start.shape))

@@ -17,8 +17,9 @@ from jaxmuscle.data._target import Target
 from jaxmuscle.fits._reopened import reopened
 from jaxmuscle.fits._result import FitResult
 from jaxmuscle.objective._arguments import settings_of
-from jaxmuscle.objective._consequences import Tables, derived, frequency_of
+from jaxmuscle.objective._consequences import Tables, frequency_of
 from jaxmuscle.objective._coordinates import task_at
+from jaxmuscle.objective._derived import derived
 from jaxmuscle.objective._likelihood import Likelihood
 from jaxmuscle.objective._problem import FitProblem
 from jaxmuscle.objective._residuals import PartResiduals, Residuals

@@ -16,7 +16,7 @@ from jaxmuscle._common.tables import frame
 from jaxmuscle._common.text import choices, folded
 from jaxmuscle.data._target import Target
 from jaxmuscle.model._tasks import AbstractTask
-from jaxmuscle.objective._consequences import unit_of
+from jaxmuscle.objective._derived import unit_of
 
 from ._chains import Chains
 from ._posterior_checks import Replicates

@@ -16,7 +16,8 @@ from jaxmuscle._common.text import choices, folded
 from jaxmuscle.data._target import Target
 from jaxmuscle.fits._reopened import reopened
 from jaxmuscle.fits._result import FitResult
-from jaxmuscle.objective._consequences import expand, quantities, unit_of
+from jaxmuscle.objective._consequences import expand, quantities
+from jaxmuscle.objective._derived import unit_of
 from jaxmuscle.objective._likelihood import Likelihood
 from jaxmuscle.objective._problem import FitProblem
 from jaxmuscle.objective._scoring import Maximum, Pin, highest, maximise
