@@ -26,8 +26,7 @@ FREE = (*COEFFICIENTS, *MASSES)
 def beside(result, made):
     """Information of ln of what is free, without the motion; noise and harmonic, which are not in the response, left out."""
     experiment = Experiment.of(result, made.quantity, made.even, None)
-    names = [*experiment.here.coordinates.names, *MASSES]
-    sd = np.append(experiment.here.coordinates.sd, [jm.model.PARAMETERS[name].prior_sd for name in MASSES])
+    names, sd = list(experiment.here.coordinates.names), experiment.here.coordinates.sd
     own = [names.index(name) for name in FREE]
     covariance = np.linalg.inv(experiment.apart)[np.ix_(own, own)] * np.outer(sd[own], sd[own])
     return np.linalg.inv(covariance)

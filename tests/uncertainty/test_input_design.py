@@ -13,14 +13,17 @@ import pytest
 import scipy.optimize
 import scipy.stats
 from test_identify import MOVED, SEGMENTS, STEP, TRUTH, fitted
+from test_identify import slopes as by_differences
 
 import jaxmuscle as jm
 from jaxmuscle.commands.design import design
 from jaxmuscle.data import FrequencyResponse
 from jaxmuscle.objective._coordinates import Coordinates
+from jaxmuscle.objective._problem import FitProblem
 from jaxmuscle.uncertainty import Lengthening
-from jaxmuscle.uncertainty._design_information import design_information, information_of, seen_here
+from jaxmuscle.uncertainty._design_information import design_information, information_of, opened, seen_here
 from jaxmuscle.uncertainty._identifiability import fitted_problem
+from jaxmuscle.uncertainty._identifiability_report import TOGETHER
 from jaxmuscle.uncertainty._input_design import Experiment, steps_of
 
 BASE = ("k_w", "k_z", "c_w", "c_z")
@@ -95,6 +98,7 @@ def test_the_information_is_that_of_the_closed_form(x64):
 def test_the_masses_are_open_as_in_the_fit_of_a_record(x64):
     """By hand: H also has m_z s², and slopes by m_w; of both ln masses the prior is known, and then they are left out."""
     problem, theta = fitted_problem(fitted(), None)
+    told, problem, theta = problem, opened(problem), np.append(theta, [0.0, 0.0])
     lengthening = Lengthening.flat(1e-3, BAND, SECONDS)
     moved = TRUTH if isinstance(TRUTH, jm.PrescribedLength) else TRUTH.as_task(jm.PrescribedLength, P_w=TRUTH.P_w)
     design = jm.Design("moved", moved, segments=0, lengthening=lengthening)
@@ -110,11 +114,58 @@ def test_the_masses_are_open_as_in_the_fit_of_a_record(x64):
     whole *= np.outer(sd, sd)
     whole[[4, 5], [4, 5]] += 1.0
     expected = np.linalg.inv(np.linalg.inv(whole)[:4, :4])
-    own = [problem.coordinates.names.index(n) for n in BASE]
+    own = [problem.coordinates.names.index(n) for n in (*BASE, "m_w", "m_z")]
+    found = found[np.ix_(own, own)] + np.diag(problem.prior[own] * [0, 0, 0, 0, 1, 1])
+    found = np.linalg.inv(np.linalg.inv(found)[:4, :4])
     size = np.sqrt(np.diag(whole))[:4]
-    np.testing.assert_allclose(found[np.ix_(own, own)] / np.outer(size, size), expected / np.outer(size, size), atol=1e-5)
+    np.testing.assert_allclose(found / np.outer(size, size), expected / np.outer(size, size), atol=1e-5)
     assert expected[1, 1] < 0.9 * whole[1, 1]  # known masses would tell more of K_z0
-    assert "m_w and m_z fitted with it" in design.told(problem)[1]
+    assert "m_w and m_z fitted with it" in design.told(told)[1]
+
+
+@pytest.mark.slow
+def test_two_moved_records_know_of_the_masses_once():
+    """A record twice is one of twice the mean square: the prior of the masses counts once in both."""
+    once = Lengthening.flat(1e-3, BAND, SECONDS)
+    twice = Lengthening(once.frequency, 2 * once.power, SECONDS)
+    moved = {name: jm.Design(name, TRUTH, segments=0, lengthening=given)
+             for name, given in (("a", once), ("b", once), ("both", twice))}  # fmt: skip
+    report = jm.identifiability(fitted(), designs=moved.values())
+    pair = next(pair for pair in report.pairs if pair.name == "a" + TOGETHER + "b")
+    single = report.designs[-1]
+    for name, known in single.quantities.items():
+        assert pair.quantities[name].stderr == pytest.approx(known.stderr, rel=1e-3), name
+    assert single.singular_values == pytest.approx(pair.singular_values, rel=1e-3, abs=1e-2)
+
+
+@pytest.mark.slow
+def test_what_follows_from_the_spectrum_depends_on_the_masses_too(x64):
+    """Slopes of the coefficient of variation and the highest bins by differences; a record of the motion measures both."""
+    made = Experiment.of(fitted(), ("K_w0",), Lengthening.flat(1e-3, (0.5, 5.0), SECONDS), None)
+    names = made.here.coordinates.names
+    for name, read in {
+        "coefficient_of_variation": lambda m: np.sqrt(m.variance) / m.mean,
+        "high_frequency_floor": lambda m: m.proportional[-10:].mean(),
+    }.items():
+        expected = by_differences(TRUTH, read, free=("m_w", "m_z"))
+        sd = [jm.model.PARAMETERS[n].prior_sd for n in ("m_w", "m_z")]
+        found = made.here.gradients[name][[names.index("m_w"), names.index("m_z")]]
+        np.testing.assert_allclose(found, expected * sd, rtol=1e-3, atol=1e-5 * np.linalg.norm(made.here.gradients[name]))
+        assert abs(found[0]) > 0
+
+
+def test_a_mass_that_a_moved_record_was_fitted_with_is_known(x64):
+    """The hold of a joint fit: m_w stays as fixed there, and m_z, which was free, is none that is fitted anew."""
+    moved = Lengthening.flat(1e-3, BAND, SECONDS)
+    measured = FrequencyResponse(moved.frequency, stiffness(VALUES, moved.frequency), np.full(len(moved.frequency), 10.0))
+    problem, _ = fitted_problem(fitted(), None)
+    other, _ = fitted_problem(fitted(stiffness=measured, free=("k_w", "m_z")), None)
+    both = FitProblem.shared({"hold": problem, "pull": other}, {"hold": {n: n for n in problem.coordinates.names},
+                                                                "pull": {"k_w": "k_w", "m_z": "m_z"}})  # fmt: skip
+    assert opened(both) is both and opened(other) is other
+    assert opened(problem).coordinates.names == (*problem.coordinates.names, "m_w", "m_z")
+    design = jm.Design("pulled", TRUTH, segments=0, lengthening=moved, target="hold")
+    assert "fitted with it" not in design.told(both)[1]
 
 
 @pytest.mark.slow
@@ -392,7 +443,7 @@ def test_the_figure():
     ("given", "message"),
     [
         ({"quantity": "K_w"}, "quantity 'K_w' is unknown: did you mean 'k_w'"),
-        ({"quantity": "m_w"}, "quantity 'm_w' is fixed: leave its parameter free"),
+        ({"quantity": "x_ref_w"}, "quantity 'x_ref_w' is fixed: leave its parameter free"),
         ({"rms": 0.0}, r"rms = 0.0 m must be a positive number"),
         ({"peak": -1e-3}, r"peak = -0.001 m must be a positive number"),
         ({"speed": 0.0}, "speed = 0.0 m/s must be a positive number"),

@@ -4,7 +4,7 @@ import dataclasses
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from jaxmuscle.data._target import Target
 from jaxmuscle.model._parameters import PARAMETERS
@@ -37,12 +37,38 @@ def information_of(problem: FitProblem, seen: Expansion) -> Float[np.ndarray, "f
     return without_offsets(np.asarray(Likelihood.of(problem).information(seen)), len(seen.theta))
 
 
+def opened(problem: FitProblem) -> FitProblem:
+    """The problem with the `open_masses` free, too, after all else and with their usual prior: θ = 0 are those of the tasks.
+
+    The fit of a moved record finds m_z and lets m_w be free, and what else is known of the person helps with that.
+    """
+    c, masses = problem.coordinates, open_masses(problem)
+    if not masses:
+        return problem
+    rows, size = [PARAMETERS[name] for name in masses], len(c.names)
+
+    def widened(c: Coordinates, task: Any, names: tuple[str, ...]) -> Coordinates:
+        """These, and the masses of a task."""
+        more, unbounded = [rows[masses.index(name)] for name in names], np.full(len(names), np.inf)
+        return Coordinates((*c.names, *names), np.append(c.centre, [float(task[name]) for name in names]),
+                           np.append(c.sd, [row.prior_sd for row in more]),
+                           np.append(c.positive, np.array([row.positive for row in more], bool)),
+                           np.append(c.low, -unbounded), np.append(c.high, unbounded))  # fmt: skip
+
+    parts = []
+    for part in problem.parts:
+        own = tuple(name for name in masses if name in part.task.parameter_names)
+        columns = (*part.columns, *(size + masses.index(name) for name in own))
+        parts.append(dataclasses.replace(part, coordinates=widened(part.coordinates, part.task, own), columns=columns))
+    values = {row.name: next(p.task[row.name] for p in parts if row.name in p.task.parameter_names) for row in rows}
+    return dataclasses.replace(problem, parts=tuple(parts), coordinates=widened(c, values, masses),
+                               prior=np.append(problem.prior, np.ones(len(masses))))  # fmt: skip
+
+
 def design_information(
     problem: FitProblem, theta: Float[np.ndarray, " free"], design: Design
 ) -> Float[np.ndarray, "free free"]:
     """Fisher information about a fit's θ in a design; what is separate in it is eliminated, without a prior of its own.
-
-    So are the masses where the insertion is moved and the fit says nothing of them, with their prior (`with_masses`).
 
     Raises `ValueError` for a task without linear response or whose insertion cannot be moved as the design says, unknown
     names in `separate`, and a coefficient of variation or mean of an output that is zero.
@@ -51,26 +77,6 @@ def design_information(
     for name in design.separate:
         if name not in names:
             raise ValueError(f"{design.name}: separate: {name!r} is not free in the fit; free are {', '.join(names)}")
-    own, _, found = information_with_masses(problem, theta, design, masses=design.lengthening is not None)
-    own, more = own[own < len(names)], int(np.sum(own >= len(names)))
-    kept = np.append([names[i] not in design.separate for i in own], np.zeros(more, bool))
-    whole = np.zeros((len(names), len(names)))
-    if not np.all(kept):
-        prior = np.append(np.full(len(own), VAGUE), np.ones(more))[~kept]
-        loose, tied = found[np.ix_(~kept, ~kept)] + np.diag(prior), found[np.ix_(kept, ~kept)]
-        found = found[np.ix_(kept, kept)] - tied @ np.linalg.pinv(loose, hermitian=True) @ tied.T
-    shared = own[kept[: len(own)]]
-    whole[np.ix_(shared, shared)] = found
-    return whole
-
-
-def information_with_masses(
-    problem: FitProblem, theta: Float[np.ndarray, " free"], design: Design, *, masses: bool
-) -> tuple[Int[np.ndarray, " own"], Coordinates, Float[np.ndarray, "own own"]]:
-    """Fisher information in a design of what its task has of the fit's θ, and, where asked for, of `masses` beside them.
-
-    **Returns:** the places of these coordinates in θ, those of masses after its end; the coordinates; the information.
-    """
     like = design.like(problem)
     given = like.task if design.task is None else design.task
     if design.lengthening is not None and not isinstance(given, PrescribedLength):
@@ -80,17 +86,22 @@ def information_with_masses(
     task: Any = given.with_parts(settings=settings)
     has_response(task, required=True)
     own, coordinates = coordinates_of(like, theta, task)
-    wide = with_masses(like, coordinates, task) if masses else coordinates
-    more = len(wide.names) - len(own)
-    place, prior = np.append(theta[own], np.zeros(more)), np.append(problem.prior[own], np.ones(more))
-    local = _local(like, wide, task, design)
-    here = dataclasses.replace(problem, parts=(local,), coordinates=wide, prior=prior)
-    seen = seen_here(here, place)
+    local = _local(like, coordinates, task, design)
+    here = dataclasses.replace(problem, parts=(local,), coordinates=coordinates, prior=problem.prior[own])
+    seen = seen_here(here, theta[own])
     (moments,) = seen.moments
     found = _information(dataclasses.replace(here, parts=(_with_data(local, design, moments),)), design, seen)
     if design.lengthening is not None:
-        found = found + design.lengthening.information(task, wide, place)
-    return np.append(own, len(theta) + np.arange(more)), wide, found
+        found = found + design.lengthening.information(task, coordinates, theta[own])
+    whole = np.zeros((len(names), len(names)))
+    whole[np.ix_(own, own)] = found
+    loose = np.array([name in design.separate for name in names])
+    if np.any(loose):
+        inside = whole[np.ix_(loose, loose)] + VAGUE * np.eye(np.sum(loose))
+        tied = whole[np.ix_(~loose, loose)]
+        whole[np.ix_(~loose, ~loose)] -= tied @ np.linalg.pinv(inside, hermitian=True) @ tied.T
+        whole[loose] = whole[:, loose] = 0.0
+    return whole
 
 
 def coordinates_of(like: Part, theta: np.ndarray, task: Any) -> tuple[np.ndarray, Coordinates]:
@@ -102,19 +113,6 @@ def coordinates_of(like: Part, theta: np.ndarray, task: Any) -> tuple[np.ndarray
     centre = np.where(positive, values * np.exp(-step), values - step)
     unbounded = np.full(len(own), np.inf)
     return own, Coordinates(tuple(c.names[i] for i in has), centre, sd, positive, -unbounded, unbounded)
-
-
-def with_masses(like: Part, coordinates: Coordinates, task: Any) -> Coordinates:
-    """These, and the masses with their usual prior: the fit of a moved record finds m_z, too, and lets m_w be free.
-
-    Without those of which the fit says what it knows: it has them free, or was one of a moved record and has them fixed.
-    """
-    c, rows = coordinates, [PARAMETERS[name] for name in open_masses(like, task)]
-    more, unbounded = tuple(row.name for row in rows), np.full(len(rows), np.inf)
-    values, sd, positive = ([float(task[row.name]) for row in rows], [row.prior_sd for row in rows],
-                            np.array([row.positive for row in rows], bool))  # fmt: skip
-    return Coordinates((*c.names, *more), np.append(c.centre, values), np.append(c.sd, sd), np.append(c.positive, positive),
-                       np.append(c.low, -unbounded), np.append(c.high, unbounded))  # fmt: skip
 
 
 def _local(like: Part, coordinates: Coordinates, task: Any, design: Design) -> Part:

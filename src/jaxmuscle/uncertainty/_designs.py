@@ -1,7 +1,6 @@
 """Measurements that could be made in addition to a fit's, and what they would tell of its parameters."""
 
 import dataclasses
-from typing import Any
 
 import equinox as eqx
 import numpy as np
@@ -95,7 +94,7 @@ class Design(eqx.Module):
         data += [] if self.mean is None else [f"mean to {100 * self.mean:.2g} %"]
         if self.lengthening is not None:
             task = like.task if self.task is None else self.task
-            masses = " and ".join(open_masses(like, task))
+            masses = " and ".join(name for name in open_masses(problem) if name in task.parameter_names)
             data.append(f"response to a {self.lengthening}" + f" ({masses} {FITTED_TOO})" * bool(masses))
         kind = None if self.lengthening is None else PrescribedLength
         return _task_in_words(like.task if self.task is None else self.task, kind), ", ".join(data)
@@ -230,8 +229,12 @@ def moved_insertion(
                   lengthening=lengthening, target=target)  # fmt: skip
 
 
-def open_masses(like: Part, task: Any) -> tuple[str, ...]:
-    """The masses that the fit of a moved record would find, and of which the fit at hand says nothing."""
-    if like.target.stiffness is not None:
-        return ()
-    return tuple(name for name in MASSES if name in task.parameter_names and name not in like.coordinates.names)
+def open_masses(problem: FitProblem) -> tuple[str, ...]:
+    """The masses that the fit of a further, moved record would find, and of which the fit at hand says nothing.
+
+    Where a moved record was fitted with a mass fixed, that mass is known.
+    """
+    free = {name.partition("@")[0] for name in problem.coordinates.names}
+    known = {name for part in problem.parts if part.target.stiffness is not None for name in part.task.parameter_names}
+    has = {name for part in problem.parts for name in part.task.parameter_names}
+    return tuple(name for name in MASSES if name in has - free - known)

@@ -14,6 +14,7 @@ from jaxmuscle._common.errors import OperatingPointError
 from jaxmuscle.data._target import Target
 from jaxmuscle.fits._reopened import reopened
 from jaxmuscle.fits._result import FitResult
+from jaxmuscle.model._tasks import PrescribedLength
 from jaxmuscle.objective._arguments import MASSES
 from jaxmuscle.objective._consequences import Expansion, quantities
 from jaxmuscle.objective._coordinates import Coordinates
@@ -21,7 +22,7 @@ from jaxmuscle.objective._covariance import Identifiability, common_scales, know
 from jaxmuscle.objective._derived import unit_of
 from jaxmuscle.objective._problem import FitProblem
 
-from ._design_information import design_information, information_of, seen_here, without_further
+from ._design_information import design_information, information_of, opened, seen_here, without_further
 from ._designs import Design, designs_for, told_data, without_noise
 from ._identifiability_report import NO_NOISE, TOGETHER, UNDESCRIBED, IdentifiabilityReport, Known, Outlook
 
@@ -49,37 +50,44 @@ def identifiability(
     a design that names unknown parameters. A design without stable equilibrium is reported as impossible.
     """
     with fitting():
-        problem, theta = fitted_problem(result, target)
+        fitted, at = fitted_problem(result, target)
+        tried = None if designs is None else tuple(designs)
+        moves = any(isinstance(p.task, PrescribedLength) for p in fitted.parts) if tried is None else any(map(_moved, tried))
+        problem = opened(fitted) if moves else fitted
+        theta = np.append(at, np.zeros(len(problem.prior) - len(at)))
         seen = seen_here(problem, theta)
-        tried = designs_for(problem, seen) if designs is None else tuple(designs)
+        tried = designs_for(fitted, seen) if tried is None else tried
         names = [design.name for design in tried]
         if len(set(names)) < len(names):
             raise ValueError(f"designs: two are called {next(n for n in names if names.count(n) > 1)!r}: rename one")
-        here = Here.of(problem, seen, result.derived_names)
+        here = Here.of(problem, seen, result.derived_names, len(at))
         added = [_added(problem, theta, design) for design in tried]
-    present = here.outlook("the present data", here.information, *told_data(problem))
+    present = here.outlook("the present data", here.information, *told_data(fitted))
     alone = tuple(
-        here.outlook(d.name, here.information + more, *d.told(problem), d.separate, failed, present)
+        here.outlook(d.name, here.information + more, *d.told(fitted), d.separate, failed, present, masses=_moved(d))
         for d, (more, failed) in zip(tried, added, strict=True)
     )
-    possible = [(d.name, more) for d, (more, failed) in zip(tried, added, strict=True) if failed is None]
-    pairs = [here.outlook(a + TOGETHER + b, here.information + x + y, present=present)
-             for (a, x), (b, y) in itertools.combinations(possible, 2)]  # fmt: skip
+    possible = [(d.name, _moved(d), more) for d, (more, failed) in zip(tried, added, strict=True) if failed is None]
+    pairs = [here.outlook(a + TOGETHER + b, here.information + x + y, present=present, masses=m or n)
+             for (a, m, x), (b, n, y) in itertools.combinations(possible, 2)]  # fmt: skip
     pairs.sort(key=lambda pair: (-len(pair.gained), pair.log_left))
     notices = tuple(n for n in result.notices if " ambiguous: " in n)
-    if designs is None and without_noise(problem):
+    if designs is None and without_noise(fitted):
         notices += (NO_NOISE,)
     if target is None:
         notices = missed(result) + notices
     mean_force = result.derived["mean"].value if result.per_newton else None
     # Of another target the fit has said nothing.
-    fitted = {} if target is not None else result.found
+    found = {} if target is not None else result.found
     known = {n for n, k in present.quantities.items() if k.determined}
-    doubted = tuple(n for n, p in fitted.items() if n in known and p.stderr is None)
-    first = problem.parts[0].task
-    masses = {n: float(first[n]) for n in MASSES if n in first.parameter_names and n not in problem.coordinates.names}
-    return IdentifiabilityReport(problem.title, problem.coordinates.names, present, alone, tuple(pairs), notices, mean_force,
-                                 doubted, masses)  # fmt: skip
+    doubted = tuple(n for n, p in found.items() if n in known and p.stderr is None)
+    first, names = fitted.parts[0].task, fitted.coordinates.names
+    masses = {n: float(first[n]) for n in MASSES if n in first.parameter_names and n not in names}
+    return IdentifiabilityReport(fitted.title, names, present, alone, tuple(pairs), notices, mean_force, doubted, masses)
+
+
+def _moved(design: Design) -> bool:
+    return design.lengthening is not None
 
 
 def missed(result: FitResult) -> tuple[str, ...]:
@@ -126,16 +134,20 @@ def _added(problem: FitProblem, theta: np.ndarray, design: Design) -> tuple[np.n
 
 
 class Here(NamedTuple):
-    """The fit: information of its data, its prior, values and gradients of what can be known."""
+    """The fit: information of its data, its prior, values and gradients of what can be known.
+
+    The first `free` of the coordinates are those that the fit has free; the others are masses, see `opened`.
+    """
 
     coordinates: Coordinates
     information: np.ndarray
     prior: np.ndarray
     values: dict[str, tuple[float, str]]
     gradients: dict[str, np.ndarray]
+    free: int
 
     @classmethod
-    def of(cls, problem: FitProblem, seen: Expansion, derived: Iterable[str]) -> "Here":
+    def of(cls, problem: FitProblem, seen: Expansion, derived: Iterable[str], free: int | None = None) -> "Here":
         """At the θ where the model was seen, with these derived quantities."""
         c = problem.coordinates
         natural = c.values_of(np.asarray(seen.theta)[None])[0]
@@ -148,7 +160,8 @@ class Here(NamedTuple):
             if name not in values and np.all(np.isfinite(g)) and np.any(g != 0) and np.isfinite(value):
                 unit = unit_of(name, problem.parts[part].task.output_unit)
                 values[name], gradients[name] = (float(value), unit), g
-        return cls(c, information_of(problem, seen), problem.prior, values, gradients)
+        information = information_of(problem, seen)
+        return cls(c, information, problem.prior, values, gradients, len(c.names) if free is None else free)
 
     def outlook(
         self,
@@ -159,20 +172,24 @@ class Here(NamedTuple):
         separate: tuple[str, ...] = (),
         failed: str | None = None,
         present: Outlook | None = None,
+        *,
+        masses: bool = False,
     ) -> Outlook:
-        """What is known with that information."""
-        after = np.linalg.pinv(information + np.diag(self.prior), hermitian=True)
-        found = Identifiability.of_covariance(after)
-        before = np.diag(1 / np.maximum(self.prior, LEAST_PRIOR))
-        known = {}
-        for n, g in self.gradients.items():
+        """What is known with that information; the further masses are known, too, unless they are asked to be open."""
+        size = len(self.prior) if masses else self.free
+        after = np.linalg.pinv(information[:size, :size] + np.diag(self.prior[:size]), hermitian=True)
+        every, found = (Identifiability.of_covariance(after[:n, :n]) for n in (size, self.free))
+        before = np.diag(1 / np.maximum(self.prior[:size], LEAST_PRIOR))
+        c, known = self.coordinates, {}
+        for n in (n for n in self.gradients if n not in c.names[self.free :]):
+            g = self.gradients[n][:size]
             left, had = g @ after @ g, g @ before @ g
-            known[n] = Known(*self.values[n], float(np.sqrt(left)), float(np.sqrt(had)), found.determines(g))
+            known[n] = Known(*self.values[n], float(np.sqrt(left)), float(np.sqrt(had)), every.determines(g))
         gained = () if present is None else tuple(
             n for n, k in known.items() if k.determined and not present.quantities[n].determined
         )  # fmt: skip
-        c = self.coordinates
-        products = {n: float(np.sqrt(g @ after @ g)) for n, g in known_products(c.names, c.positive, c.sd, found).items()}
-        free_scales = common_scales(c.names, found)
-        return Outlook(name, task, data, separate, found.singular_values, int(found.determined.sum()), free_scales, products,
-                       known, gained, failed)  # fmt: skip
+        names, after = c.names[: self.free], after[: self.free, : self.free]
+        products = known_products(names, c.positive[: self.free], c.sd[: self.free], found)
+        errors = {n: float(np.sqrt(g @ after @ g)) for n, g in products.items()}
+        return Outlook(name, task, data, separate, found.singular_values, int(found.determined.sum()),
+                       common_scales(names, found), errors, known, gained, failed)  # fmt: skip

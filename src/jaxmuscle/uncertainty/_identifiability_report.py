@@ -301,7 +301,7 @@ def _sentences(report: IdentifiabilityReport) -> list[str]:
     best = _most(report)
     if best is not None:
         count = len(report.free) - best.determined
-        rest = f"{count} of {len(report.free)} combinations stay open" if count else "nothing stays open"
+        rest = f"{count} of {len(report.free)} combinations stay{'s' * (count == 1)} open" if count else "nothing stays open"
         lines += _wrapped(f"most would be learnt from {best.name}: {rest}", 4, "  - ")
         lines += _wrapped(TIRING, 4, "  - ")
     return lines

@@ -8,7 +8,6 @@ import jax
 import numpy as np
 import scipy
 from jaxtyping import Float
-from scipy.linalg import block_diag
 
 from jaxmuscle._common.arrays import as_numbers, require
 from jaxmuscle._common.errors import OperatingPointError
@@ -23,7 +22,7 @@ from jaxmuscle.objective._derived import derived_names
 from jaxmuscle.objective._problem import FitProblem
 from jaxmuscle.response._expected_spectrum import expected_spectrum
 
-from ._design_information import information_with_masses, seen_here
+from ._design_information import coordinates_of, design_information, opened, seen_here
 from ._designed_input import DOUBTFUL, DesignedInput
 from ._designs import moved_insertion, without_noise
 from ._identifiability import Here, fitted_problem, missed
@@ -163,15 +162,16 @@ class Experiment(NamedTuple):
         step: Float[np.ndarray, " free"] | None = None,
     ) -> "Experiment":
         """Of a record, at the values of a fit or task, or a step of its θ away from them. Needs double precision."""
-        problem, theta, derived = _problem(given)
-        if without_noise(problem):
+        fitted, theta, derived = _problem(given)
+        if without_noise(fitted):
             raise ValueError(f"result: {NO_NOISE}")
+        problem = opened(fitted)
+        theta = np.append(theta, np.zeros(len(problem.prior) - len(theta)))
         if step is not None:
             theta = theta + step
             parts = (dataclasses.replace(part, task=part.task_at(theta)) for part in problem.parts)
             problem = dataclasses.replace(problem, parts=tuple(parts))
-        seen = seen_here(problem, theta)
-        here = Here.of(problem, seen, derived)
+        here = Here.of(problem, seen_here(problem, theta), derived)
         for name in quantity:
             if name not in here.gradients:
                 fixed = name.partition("@")[0] in (*problem.parts[0].task.parameter_names, *BASE.values())
@@ -181,19 +181,13 @@ class Experiment(NamedTuple):
         like = design.like(problem)
         task: Any = _moved(like.task).with_parts(settings=like.target.settings)
         start = np.diag(problem.prior) + (here.information if isinstance(given, FitResult) else 0.0)
-        still = dataclasses.replace(design, task=task, lengthening=None)
-        own, wide, fluctuations = information_with_masses(problem, theta, still, masses=True)
-        more = int(np.sum(own >= len(theta)))
-        start = np.asarray(block_diag(start, np.eye(more)))
-        apart = start.copy()
-        apart[np.ix_(own, own)] += fluctuations
-        here = here._replace(gradients={name: np.pad(g, (0, more)) for name, g in here.gradients.items()})
+        apart = start + design_information(problem, theta, dataclasses.replace(design, task=task, lengthening=None))
+        own, coordinates = coordinates_of(like, theta, task)
         lines = np.zeros((len(record.frequency), *start.shape))
-        place = np.append(theta, np.zeros(more))[own]
-        lines[:, own[:, None], own] = information_of_lines(task, wide, place, record.frequency, record.seconds)
-        unfitted = [name for name in MASSES if name not in like.coordinates.names]
+        lines[:, own[:, None], own] = information_of_lines(task, coordinates, theta[own], record.frequency, record.seconds)
+        unfitted = [name for name in MASSES if name not in design.like(fitted).coordinates.names]
         masses = {name: float(task[name]) for name in unfitted if name in task.parameter_names}
-        held = tuple(name for name in masses if name not in wide.names)
+        held = tuple(name for name in masses if name not in coordinates.names)
         return cls(here, tuple(quantity), masses, held, start, apart, record.frequency, lines)
 
     @property
@@ -240,7 +234,7 @@ class Experiment(NamedTuple):
         """
         g = self.here.gradients[name]
         far = np.linalg.pinv(self.start, hermitian=True) @ g
-        return (far / np.sqrt(g @ far))[: len(self.here.coordinates.names)]
+        return far / np.sqrt(g @ far)
 
     def times_for(self, power: Float[np.ndarray, " lines"], error: float) -> float:
         """How many times as long a record must be for a relative error of every quantity; infinite where none is."""
