@@ -154,14 +154,14 @@ class Here(NamedTuple):
         values = {n: (float(v), unit_of(n)) for n, v in zip(c.names, natural, strict=True)}
         gradients = dict(zip(c.names, np.diag(c.slope(natural)), strict=True))
         tables = quantities(without_further(problem).linear(), jax.tree.map(lambda x: np.asarray(x)[None], seen))
+        free = len(c.names) if free is None else free
         for name in derived:
             part, quantity = problem.where(name)
             value, g = (table[part][quantity][0] for table in tables)
-            if name not in values and np.all(np.isfinite(g)) and np.any(g != 0) and np.isfinite(value):
+            if name not in values and np.all(np.isfinite(g)) and np.any(g[:free] != 0) and np.isfinite(value):
                 unit = unit_of(name, problem.parts[part].task.output_unit)
                 values[name], gradients[name] = (float(value), unit), g
-        information = information_of(problem, seen)
-        return cls(c, information, problem.prior, values, gradients, len(c.names) if free is None else free)
+        return cls(c, information_of(problem, seen), problem.prior, values, gradients, free)
 
     def outlook(
         self,
