@@ -841,9 +841,11 @@ def test_steadiness_of_trials(tmp_path):
         rows = "".join(f"{k / 100:.2f},{x:.6f}\n" for k, x in enumerate(held))
         files.append(tmp_path / f"trial{i}.csv")
         files[-1].write_text(f"time (s),force (N)\n{rows}")
-    result = run("steadiness", *files[:3], "--window", "0:8", "--out", tmp_path / "out")
-    assert result.exit_code == 0 and "Steadiness of 3 trials: force [N], 8 s" in result.stdout
-    found = jm.steadiness([jm.load_recording(str(file)).steady((0, 8)) for file in files[:3]])
+    result = run("steadiness", *files[:3], "--window", "0:8,1:8,0:8", "--out", tmp_path / "out")
+    assert result.exit_code == 0 and "Steadiness of 3 trials: force [N], 7 s to 8 s each" in result.stdout
+    windows = ((0, 8), (1, 8), (0, 8))
+    each = zip(files, windows, strict=False)
+    found = jm.steadiness([jm.load_recording(str(file)).steady(window) for file, window in each])
     with open(tmp_path / "out" / "steadiness.csv", newline="") as file:
         rows = list(csv.DictReader(file))
     assert [row["trial"] for row in rows[:: len(found.measures)]] == ["trial0", "trial1", "trial2", "all"]
@@ -858,6 +860,7 @@ def test_steadiness_of_trials(tmp_path):
     assert (tmp_path / "out" / "steadiness.png").stat().st_size > 10_000
     for arguments, message in (
         ((files[0], "--window", "0-8"), "--window 0-8: give start and end in s"),
+        ((*files[:2], "--window", "0:8,1:8,2:8"), "--window 0:8,1:8,2:8: 3 windows for 2 recordings. Give one for all"),
         ((files[0], files[3], "--window", "all"), "trial3 lasts 3 s; give at least 3.84 s"),
         ((files[0], tmp_path / "none.csv"), "none.csv"),
     ):

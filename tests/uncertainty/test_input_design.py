@@ -27,6 +27,7 @@ from jaxmuscle.uncertainty._identifiability_report import TOGETHER
 from jaxmuscle.uncertainty._input_design import Experiment, steps_of
 
 BASE = ("k_w", "k_z", "c_w", "c_z")
+BASES, TANGENTS = ("K_w0", "K_z0", "C_w0", "C_z0"), ("K_w_tangent", "tangent_stiffness")
 SECONDS, BAND = 60.0, (0.1, 5.0)
 REPEATS, DOUBTFUL = 300, 1e-4  # chance of a test to fail by scatter alone
 
@@ -152,6 +153,27 @@ def test_what_follows_from_the_spectrum_depends_on_the_masses_too(x64):
         found = made.here.gradients[name][[names.index("m_w"), names.index("m_z")]]
         np.testing.assert_allclose(found, expected * sd, rtol=1e-3, atol=1e-5 * np.linalg.norm(made.here.gradients[name]))
         assert abs(found[0]) > 0
+
+
+@pytest.mark.slow
+def test_a_motion_for_the_stiffness_as_stretched_in_the_hold(x64):
+    """It can be asked for although the fit of a hold does not state it; value and slopes by hand."""
+    made = Experiment.of(fitted(), ("K_w_tangent",), Lengthening.flat(1e-3, BAND, SECONDS), None)
+
+    def tangent(p):
+        return p["k_w"] * (p["x_ref_w"] ** 2 + 3 * point(p) ** 2)
+
+    assert made.here.values["K_w_tangent"][0] == pytest.approx(tangent(VALUES), rel=1e-6)
+    names, sd = made.here.coordinates.names, jm.model.PARAMETERS
+    for i, name in enumerate(BASE):
+        up, down = (tangent(changed(side * STEP * np.eye(4)[i])) for side in (1, -1))
+        expected = (up - down) / (2 * STEP) * sd[name].prior_sd
+        assert made.here.gradients["K_w_tangent"][names.index(name)] == pytest.approx(expected, rel=1e-4, abs=1e-3)
+    rest = made.here.values["tangent_stiffness"][0]
+    assert rest == pytest.approx(stiffness(VALUES, np.array([1e-6]))[0].real, rel=1e-6)
+    errors = made.errors(Lengthening.flat(1e-3, BAND, SECONDS).power)
+    relative = {n: errors[n] / made.here.values[n][0] for n in ("K_w_tangent", "K_w0")}
+    assert relative["K_w_tangent"] < relative["K_w0"]  # K_w0 also needs the stretch
 
 
 def test_a_mass_that_a_moved_record_was_fitted_with_is_known(x64):
@@ -431,7 +453,7 @@ def test_the_figure():
     figure = designed().plot()
     try:
         density_axes, motion, errors = figure.axes
-        assert [label.get_text() for label in errors.get_yticklabels()] == ["K_w0", "K_z0", "C_w0", "C_z0"]
+        assert [label.get_text() for label in errors.get_yticklabels()] == [*BASES, *TANGENTS]
         assert np.max(np.abs(motion.lines[0].get_ydata())) <= 1e3 * designed().peak
         assert density_axes.get_yscale() == "log"
     finally:

@@ -1,8 +1,9 @@
 """Names out of data (targets, people, columns) as names of files and folders, which stay in the folder they are put into."""
 
+import itertools
 import re
 import unicodedata
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 LONGEST = 100  # bytes in UTF-8
 _FORBIDDEN = '/\\:*?"<>|'
@@ -39,3 +40,11 @@ def file_names(names: Iterable[str], taken: Iterable[str] = ()) -> dict[str, str
         used.add(free.casefold())
         found[name] = free
     return {name: found[name] for name in names}
+
+
+def name_of_all(names: Sequence[str]) -> str:
+    """What the names of trials have in common, without a number at the end, or how many trials there are."""
+    if len(names) == 1:
+        return names[0]
+    same = itertools.takewhile(lambda letters: len(set(letters)) == 1, zip(*names, strict=False))
+    return "".join(letters[0] for letters in same).rstrip("_- .0123456789") or f"{len(names)} trials"

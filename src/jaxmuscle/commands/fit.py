@@ -255,7 +255,12 @@ def _fit_one(target: Any, model: Any, folder: Path, options: dict[str, Any], for
            if sentence.removeprefix("note: ") not in told_before]  # fmt: skip
     for sentence in new:
         out.print(plain(sentence), highlight=False)
-    if new and printed[0].derived != result.derived:
+    if new and _numbers(printed[0]) != _numbers(result):
         out.print("The checks moved the last digits a little: the final numbers are in the files.", highlight=False)
     out.print(f"Written: {folder}/{', '.join(files)}", highlight=False, soft_wrap=True)
     return result.success
+
+
+def _numbers(result: Any) -> dict[str, tuple[str, str]]:
+    """The numbers of a fit as it prints them."""
+    return {n: (p.in_words(), p.interval_in_words()) for n, p in result.as_shown(result.found).items()}

@@ -97,7 +97,10 @@ Segments = Annotated[
 Quantity = Annotated[str | None, typer.Option(help="What was measured: force, torque, displacement or acceleration.")]
 Window = Annotated[
     str | None,
-    typer.Option(metavar="A:B", help="Analyse from A to B in s, or `all`; by default the steady part is found."),
+    typer.Option(
+        metavar="A:B",
+        help="Analyse from A to B in s, or `all`; one for each file: A:B,C:D. By default the steady part is found.",
+    ),
 ]
 Recordings = Annotated[
     list[str],

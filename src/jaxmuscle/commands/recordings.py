@@ -86,23 +86,23 @@ def read_perturbed(
     options = {name: value for name, value in reading.items() if name not in ("force_column", "displacement")}
     named = {"force": reading["force_column"], "displacement": reading["displacement"]}
     tables = [table_of(path, reading) for path in paths]
-    return [read(table, options | (channels(table, reading) or named), window) for table in tables]
+    each = zip(tables, windows_of(window, len(tables)), strict=True)
+    return [read(table, options | (channels(table, reading) or named), edges) for table, edges in each]
 
 
 def read_trials(paths: "Sequence[str | Table]", reading: dict[str, Any], window: str | None = None) -> "Trials":
     """The recordings of one condition, each with its steady part: several files, or all columns of one (`--column all`)."""
     if len(paths) > 1 or reading["column"] != "all":
-        options = {name: reading[name] for name in READING}
-        return jm.Trials([read(table_of(path, reading), options, window) for path in paths])
-    edges = edges_of(window)
+        options, each = {name: reading[name] for name in READING}, windows_of(window, len(paths))
+        return jm.Trials([read(table_of(path, reading), options, e) for path, e in zip(paths, each, strict=True)])
+    (edges,) = windows_of(window, 1)
     options = {name: reading[name] for name in READING if name not in ("column", "reference")}
     trials = jm.load_recordings(table_of(paths[0], reading), **options)
     return trials if edges == "all" else trials.steady(edges)
 
 
-def read(table: "Table", reading: dict[str, Any], window: str | None) -> Any:
+def read(table: "Table", reading: dict[str, Any], edges: Any) -> Any:
     """A recording, its steady part as window: the one that is given, `all`, or None to find it."""
-    edges = edges_of(window)
     recording = jm.load_recording(table, **reading)
     return recording if edges == "all" else recording.steady(edges)
 
@@ -113,6 +113,16 @@ def table_of(path: "str | Table", reading: dict[str, Any]) -> "Table":
         return jm.data.read_table(path, reading["skip_rows"])
     except ImportError as error:
         raise ValueError(str(error)) from None
+
+
+def windows_of(window: str | None, recordings: int) -> list[Any]:
+    """The window of every recording: one of --window for all, or one for each, in their order."""
+    each = [None] if window is None else [edges_of(part.strip()) for part in window.split(",")]
+    if len(each) not in (1, recordings):
+        whose = "one recording" if recordings == 1 else f"{recordings} recordings"
+        raise ValueError(f"--window {window}: {len(each)} windows for {whose}. Give one for all, or one for each in the "
+                         "order of the files, as --window 8:25,4:21")  # fmt: skip
+    return each * recordings if len(each) == 1 else each
 
 
 def edges_of(window: str | None) -> Any:

@@ -10,6 +10,7 @@ import numpy as np
 import scipy
 from jaxtyping import Complex, Float
 
+from jaxmuscle._common.names import name_of_all
 from jaxmuscle.spectra._settings import SpectrumSettings, require
 
 from ._frequency_response import FrequencyResponse
@@ -73,7 +74,7 @@ def perturbed_target(
     each = [_measured(recording, settings) if stiffness is None else stiffness for recording in recordings]
     pieces = [_ordinates(recording, own, predicted, settings) for recording, own in zip(recordings, each, strict=True)]
     fluctuations = [piece.fluctuation for piece in pieces]
-    called = recordings[0].name if name is None else name
+    called = name_of_all([recording.name for recording in recordings]) if name is None else name
     target = pooled_target(fluctuations, called, "force", provenance, None, settings)
     return target.with_stiffness(_pooled(pieces, each[0], called, target.source, float(settings.frequency[-1])))
 

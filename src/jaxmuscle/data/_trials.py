@@ -1,6 +1,5 @@
 """Several recordings of one person in one condition: together they make one target."""
 
-import itertools
 import os
 from collections.abc import Iterable, Iterator, Sequence
 from typing import Any, overload
@@ -9,6 +8,7 @@ import numpy as np
 
 from jaxmuscle import plot
 from jaxmuscle._common.cards import Card, Shown
+from jaxmuscle._common.names import name_of_all
 from jaxmuscle._common.text import folded
 from jaxmuscle.spectra._settings import SpectrumSettings, require
 from jaxmuscle.spectra._welch import Spectrum
@@ -59,11 +59,7 @@ class Trials(Shown, Sequence[Recording]):
     @property
     def name(self) -> str:
         """What the names of the recordings have in common, or how many there are."""
-        names = [recording.name for recording in self.recordings]
-        if len(names) == 1:
-            return names[0]
-        same = itertools.takewhile(lambda letters: len(set(letters)) == 1, zip(*names, strict=False))
-        return "".join(letters[0] for letters in same).rstrip("_- .0123456789") or f"{len(names)} trials"
+        return name_of_all([recording.name for recording in self.recordings])
 
     def steady(self, window: Sequence[float | int] | None = None) -> "Trials":
         """Every recording with its steady part as window, see `Recording.steady`."""

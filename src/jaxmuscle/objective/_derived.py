@@ -16,10 +16,10 @@ from jaxmuscle.response._equilibrium import HOLD
 from jaxmuscle.response._expected import Moments
 from jaxmuscle.spectra._fluctuations import BANDS, EDGES, in_bands
 
+TANGENTS = ("K_w_tangent", "tangent_stiffness")
 DERIVED = ("corner_frequency", "half_power_frequency", "contraction_time", "tremor_frequency", "tremor_width",
            "tremor_share", "resonance_2_share", "harmonic_share", "harmonic_frequency", "high_frequency_floor",
-           "K_w0", "K_z0", "C_w0", "C_z0", "K_w_tangent", "tangent_stiffness", "coefficient_of_variation", "mean",
-           *BANDS)  # fmt: skip
+           "K_w0", "K_z0", "C_w0", "C_z0", *TANGENTS, "coefficient_of_variation", "mean", *BANDS)  # fmt: skip
 UNITS = {
     "corner_frequency": "Hz",
     "half_power_frequency": "Hz",
@@ -69,7 +69,7 @@ def derived_names(task: Any, spectrum: bool = True) -> tuple[str, ...]:
     bands = {name for name, there, width in zip(BANDS, covered, np.diff(EDGES), strict=True) if there >= 0.5 * width}
     missing = set(BANDS) - bands | (set() if spectrum else OF_SPECTRUM)
     missing |= set() if task.activation is not None else {"contraction_time"}
-    missing |= set() if has_tangents(task) else {"K_w_tangent", "tangent_stiffness"}
+    missing |= set() if has_tangents(task) else {*TANGENTS}
     missing |= {"tremor_frequency", "tremor_width", "tremor_share"} if resonances < 1 else set()
     missing |= {"resonance_2_share"} if resonances < 2 else set()
     # About a mean of zero, and where the response begins with f².

@@ -13,6 +13,7 @@ from jaxmuscle._common.cards import Printed, Result
 from jaxmuscle._common.files import replacing, write_json
 from jaxmuscle._common.text import folded
 from jaxmuscle.model._parameters import PARAMETERS
+from jaxmuscle.objective._derived import TANGENTS
 
 from ._identifiability_report import BASE
 from ._lengthening import Lengthening
@@ -29,7 +30,7 @@ ASSUMED = (
     "  assumed: no reflex. A reflex can change K_w0 by 10 to 55 %, and the fit does not notice: call it muscle plus reflex",
     "  assumed: no fatigue. Split a long or strong hold into trials with rests between, and give all trials to one fit",
 )
-OF_MUSCLE = tuple(BASE.values())
+OF_MUSCLE = (*BASE.values(), *TANGENTS)
 
 
 class DesignedInput(Printed, Result, eqx.Module):
@@ -220,7 +221,8 @@ class DesignedInput(Printed, Result, eqx.Module):
             lines[0] += ". If you measured another one, fit with it first (mean and unit of the target)"
         if "K_w0" in {name.partition("@")[0] for name in self.quantity}:
             lines += ["  assumed: the reference displacement x_ref_w. No record tells it, and the value of K_w0 depends on "
-                      "it (docs/perturbed.md, limits)"]  # fmt: skip
+                      "it. What does not is K_w_tangent, the stiffness as stretched in the hold (docs/perturbed.md, "
+                      "limits)"]  # fmt: skip
         values = " and ".join(f"{name} = {value:.3g} kg" for name, value in self.masses.items())
         if "m_w" in self.held:
             lines += ["  assumed: the active mass m_w is right, as in the fit. No record tells it. Where it is wrong, C_w0 "

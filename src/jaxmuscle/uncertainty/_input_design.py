@@ -16,10 +16,10 @@ from jaxmuscle._common.text import choices
 from jaxmuscle._common.types import Key
 from jaxmuscle.data._target import Target
 from jaxmuscle.fits._result import FitResult
-from jaxmuscle.model._tasks import AbstractTask, PrescribedLength
+from jaxmuscle.model._tasks import AbstractTask, Isometric, PrescribedLength
 from jaxmuscle.objective._arguments import MASSES, FitOptions, planned
-from jaxmuscle.objective._derived import derived_names
-from jaxmuscle.objective._problem import FitProblem
+from jaxmuscle.objective._derived import TANGENTS, derived_names, has_tangents
+from jaxmuscle.objective._problem import FitProblem, Part
 from jaxmuscle.response._expected_spectrum import expected_spectrum
 
 from ._design_information import coordinates_of, design_information, opened, seen_here
@@ -70,13 +70,13 @@ def design_input(
     of this motion.
 
     **Arguments:** `result` of a fit, or a task, whose usual free parameters are then free with their prior; `quantity`, a
-    free parameter or a derived quantity such as K_w0, K_z0, C_w0, C_z0, or several; `rms` [m], `peak` [m] and `speed` [m/s],
-    at most; where the motion would pass `peak` or `speed` it gets smaller or slower; `band` [Hz], from 0.5 Hz on, as drift
-    and slow movements of the person are not in the model; `seconds`, length of the record and period; `rate` [Hz] of the
-    motion; `key` of its phases; `spread`, the share of the mean square that is even over the band (a motion of few lines
-    could be foreseen, and would not test the model); `target`, which one of a fit with several; `durations` [s], lengths of
-    the record for which the errors are told, too, the motion being repeated; `error`, relative, 0.1 say: how long a record
-    takes until every quantity is known to that.
+    free parameter or a derived quantity such as K_w0, K_z0, C_w0, C_z0, K_w_tangent, or several; `rms` [m], `peak` [m] and
+    `speed` [m/s], at most; where the motion would pass `peak` or `speed` it gets smaller or slower; `band` [Hz], from 0.5 Hz
+    on, as drift and slow movements of the person are not in the model; `seconds`, length of the record and period; `rate`
+    [Hz] of the motion; `key` of its phases; `spread`, the share of the mean square that is even over the band (a motion of
+    few lines could be foreseen, and would not test the model); `target`, which one of a fit with several; `durations` [s],
+    lengths of the record for which the errors are told, too, the motion being repeated; `error`, relative, 0.1 say: how long
+    a record takes until every quantity is known to that.
 
     **Raises:** `ValueError` for an unknown quantity or one that is fixed, or of which no motion tells; for limits that are
     not positive, a band that holds no line or reaches beyond half the rate, seconds that are no whole number of samples;
@@ -165,13 +165,17 @@ class Experiment(NamedTuple):
         fitted, theta, derived = _problem(given)
         if without_noise(fitted):
             raise ValueError(f"result: {NO_NOISE}")
+        fitted = dataclasses.replace(fitted, parts=tuple(_as_moved(part) for part in fitted.parts))
         problem = opened(fitted)
         theta = np.append(theta, np.zeros(len(problem.prior) - len(theta)))
         if step is not None:
             theta = theta + step
             parts = (dataclasses.replace(part, task=part.task_at(theta)) for part in problem.parts)
             problem = dataclasses.replace(problem, parts=tuple(parts))
-        here = Here.of(problem, seen_here(problem, theta), derived)
+        whole = len(problem.parts) == 1
+        tangents = [f"{name}@{part.name}" for part in problem.parts if has_tangents(part.task) for name in TANGENTS]
+        tangents = [name.partition("@")[0] for name in tangents] if whole else tangents
+        here = Here.of(problem, seen_here(problem, theta), dict.fromkeys([*derived, *tangents]))
         for name in quantity:
             if name not in here.gradients:
                 fixed = name.partition("@")[0] in (*problem.parts[0].task.parameter_names, *BASE.values())
@@ -259,6 +263,11 @@ def steps_of(frequency: Float[np.ndarray, " lines"]) -> Float[np.ndarray, "steps
     ends = [*starts[1:], n]
     inside = [(np.arange(n) >= a) & (np.arange(n) < b) for a, b in zip(starts, ends, strict=True)]
     return np.stack([one / np.sum(one) for one in inside])
+
+
+def _as_moved(part: Part) -> Part:
+    """A part whose insertion is held as one in which a motor holds it: its stiffness as stretched there can be asked for."""
+    return dataclasses.replace(part, task=_moved(part.task)) if isinstance(part.task, Isometric) else part
 
 
 def _moved(task: Any) -> AbstractTask:
