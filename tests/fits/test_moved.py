@@ -9,6 +9,7 @@ import pytest
 from typer.testing import CliRunner
 
 import jaxmuscle as jm
+from jaxmuscle.commands.console import write_fit
 from jaxmuscle.commands.main import app
 
 TASK = jm.PrescribedLength()
@@ -124,13 +125,52 @@ def test_a_file_of_both_channels_is_fitted_from_the_command_line_alone_and_with_
     force = np.asarray(jm.simulate(jm.Isometric(), jax.random.key(2), duration=40.0, rate=100.0).output)
     table = np.stack([np.arange(force.size) / 100, force], axis=1)[300:]
     np.savetxt(hold, table, delimiter=",", header="time,force_N", comments="", fmt="%.8g")
-    joint = jm.fit_joint({"pull": str(path), "hold": str(hold)}, starts=8, seeds=0)
-    assert joint.parts["pull"].stiffness is not None and joint.parts["hold"].stiffness is None
-    assert "pull: dynamic stiffness: " in str(joint)
+    said = CliRunner().invoke(app, ["fit", str(path), "--hold", str(hold), *options[4:], "--force"], env={"COLUMNS": "1000"})
+    assert said.exit_code == 0, said.output
+    joint = jm.load_result(folder / "fit.json")
+    assert list(joint.parts) == ["moved", "held"] and joint.parts["held"].target.name == "hold"
+    assert joint.parts["moved"].stiffness is not None and joint.parts["held"].stiffness is None
+    for name, true in {"K_w0": 200.0, "K_z0": 200.0, "C_w0": 60.0, "C_z0": 5.0}.items():
+        assert abs(joint[name].value - true) < 4.5 * joint[name].stderr
+        assert joint[name].stderr < 1.02 * result[name].stderr  # more data; but each error is itself estimated
+    words = " ".join(str(joint).split())
+    assert "moved: dynamic stiffness: " in words and "Report K_w_tangent, the stiffness of the active tissue" in words
+    written = write_fit(joint, folder, ["png"], report=True)
+    tables = ["spectrum-moved.csv", "stiffness-moved.csv", "spectrum-held.csv"]
+    assert written == ["fit.json", "fit.png", *tables, "report.html"]
+    assert {file.name for file in folder.iterdir()} == set(written)  # the tables of the fit alone are gone
     figure = joint.plot()
     titles = [ax.get_title(loc="left") for ax in figure.axes]
-    assert {"pull: PrescribedLength", "hold: Isometric", "pull: dynamic stiffness"} <= set(titles)
+    assert {"moved: PrescribedLength", "held: Isometric", "moved: dynamic stiffness"} <= set(titles)
     plt.close(figure)
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        (["HOLD", "--hold", "HOLD"], "--hold belongs to records of a moved insertion"),
+        (["vastus-lateralis-26mvc", "--hold", "HOLD"], "--hold belongs to records of a moved insertion"),
+        (["PULL", "--hold", "HOLD", "--rungs", "1"], "with --hold all records get the base model"),
+        (["PULL", "--hold", "HOLD", "--method", "montecarlo"], "with --hold all records get the base model"),
+        (["PULL", "--hold", "HOLD", "--window", "1:9,2:9,3:9"], "3 windows for 2 recordings"),
+        (["PULL", "--hold", "TORQUE"], "--hold torque: is in N m, and a moved record is fitted in N"),
+        (["PULL", "--hold", "none.csv"], "none.csv"),
+    ],
+)
+def test_a_hold_that_cannot_be_fitted_with_a_moved_record(tmp_path, given, message):
+    force = np.random.default_rng(0).normal(5.0, 0.1, (3000, 1))
+    moving = np.concatenate([force, 1e-3 * np.random.default_rng(1).normal(size=(3000, 1))], axis=1)
+    time = np.arange(3000)[:, None] / 100
+    for name, columns, head in (("HOLD", force, "force_N"), ("TORQUE", force, "torque_Nm"), ("PULL", moving, "force_N,x_m")):
+        table = np.concatenate([time, columns], axis=1)
+        np.savetxt(tmp_path / f"{name.lower()}.csv", table, delimiter=",", header=f"time_s,{head}", comments="")
+    files = {name: str(tmp_path / f"{name.lower()}.csv") for name in ("HOLD", "TORQUE", "PULL")}
+    named = ["--force-column", "force_N", "--displacement", "x_m"] if given[0] == "PULL" else []
+    out = tmp_path / "out"
+    said = CliRunner().invoke(app, ["fit", *(files.get(x, x) for x in given), *named, "--out", str(out)],
+                              env={"COLUMNS": "1000"})  # fmt: skip
+    assert said.exit_code == 2 and message in said.stderr, said.output
+    assert not (out / "fit.json").exists()
 
 
 def test_a_hold_is_not_taken_for_a_moved_record(tmp_path):

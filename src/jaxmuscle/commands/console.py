@@ -15,6 +15,7 @@ import typer
 from rich.console import Console
 
 import jaxmuscle as jm
+from jaxmuscle._common.names import file_names
 from jaxmuscle._common.progress import told
 
 from .options import SAME_NAME, Observed, TaskName, fixed_values, names_in
@@ -224,6 +225,11 @@ def write_fit(result: "FitResult", folder: Path, formats: Iterable[str] = (), *,
 
 
 def fit_tables(result: "FitResult") -> dict[str, dict[str, Any]]:
-    """The tables of a fit of one target by file, those without rows being empty."""
-    part = result.only
-    return {"spectrum.csv": part.columns() if part.fitted.size else {}, "stiffness.csv": part.stiffness_columns()}
+    """The tables of a fit by file, those without rows being empty: spectrum.csv, or spectrum-TARGET.csv of several."""
+    tables: dict[str, dict[str, Any]] = {"spectrum.csv": {}, "stiffness.csv": {}}
+    called = file_names(result.parts)
+    for name, part in result.parts.items():
+        which = f"-{called[name]}" * (len(result.parts) > 1)
+        tables[f"spectrum{which}.csv"] = part.columns() if part.fitted.size else {}
+        tables[f"stiffness{which}.csv"] = part.stiffness_columns()
+    return tables

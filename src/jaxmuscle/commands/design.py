@@ -82,7 +82,7 @@ def design(
         out.print(f"Play the motion for {end:g} s and record force and displacement. Then fit both channels, without the "
                   f"first {begin:g} s: jaxmuscle fit RECORD.csv --task prescribed-length --window {begin:g}:{end:g} "
                   "--out out/moved. The errors above count what is known now. To reach them, fit with it what you have "
-                  "recorded so far (a moved record as a second file, a hold by jaxmuscle.fit_joint in Python)",
+                  "recorded so far: a moved record as a second file, a hold with --hold FILE",
                   highlight=False, soft_wrap=True)  # fmt: skip
 
 

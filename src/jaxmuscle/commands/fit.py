@@ -1,5 +1,6 @@
 """`jaxmuscle fit`."""
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -28,6 +29,7 @@ from .options import (
     Force,
     Formats,
     Free,
+    Holds,
     Increments,
     Json,
     MethodName,
@@ -43,7 +45,7 @@ from .options import (
     formats_of,
     names_in,
 )
-from .recordings import read_recordings, reads_perturbed, unused
+from .recordings import NO_MOTION, read_recordings, read_with_holds, reads_perturbed, unused
 from .signals import STAYS, interrupted, stays
 
 NOTHING = "nothing was written, the fit had no table yet"
@@ -59,6 +61,7 @@ def fit(
     ],
     *,
     window: Window = None,
+    hold: Holds = None,
     task: TargetTask = None,
     method: Annotated[
         MethodName,
@@ -133,7 +136,8 @@ def fit(
 
     If a motor moved the insertion, give recordings with a column of force (or torque) and one of displacement (or angle).
     Or give the frequency response: a CSV with the columns frequency, gain, phase, and coherence or stderr. Then
-    DIR/stiffness.csv holds the dynamic stiffness, measured and fitted.
+    DIR/stiffness.csv holds the dynamic stiffness, measured and fitted. With --hold a recording of the held insertion is
+    fitted together with it: same muscle, one P_w for each.
 
     Several spectra are taken as those of several people. They are fitted together, by the formula of the spectrum alone,
     without simulation.
@@ -156,6 +160,8 @@ def fit(
 
         jaxmuscle fit perturbed.csv --task prescribed-length
 
+        jaxmuscle fit pull1.csv pull2.csv --hold hold.csv --out out/both
+
         jaxmuscle fit people/*.toml --groups groups.csv --out out/cohort
 
         jaxmuscle fit figure.tar --dataset "95 MVC" --segments 6
@@ -172,6 +178,8 @@ def fit(
             raise ValueError(f"{target[recorded.index(True)]} is a recording, {target[recorded.index(False)]} a spectrum. "
                              "They cannot be fitted together: fit one at a time, or first make a spectrum of each recording "
                              "with `jaxmuscle analyse ... --save-target FILE.toml`")  # fmt: skip
+        if hold and not all(recorded):
+            raise ValueError(NO_MOTION)
         options = {
             "free": names,
             "fix": fixed,
@@ -194,6 +202,22 @@ def fit(
             raise ValueError(
                 "--groups compares several spectra; to compare recordings of several people use `jaxmuscle study`"
             )
+        if hold:
+            simulated = {} if increments is None else {"increments": str(increments)}
+            if method != MethodName.linear or rungs:
+                raise ValueError("with --hold all records get the base model, by the formula of the spectrum: leave out "
+                                 "--method and --rungs")  # fmt: skip
+            if task not in (None, "prescribed-length"):
+                raise ValueError(NO_MOTION)
+            moved, held = read_with_holds(target, hold, reading, window)
+            writable(output, "fit.json", force=force)
+            options |= simulated | {"starts": starts or 32, "seeds": 0 if quick else seeds or 32}
+
+            def joint(tell: Any, _: Any) -> Any:
+                return jm.fit_joint({"moved": moved, "held": held.target()}, progress=tell, **options)
+
+            converged = _fit_one(joint, "the moved and the held record", output, [] if quick else formats_of(formats))
+            raise typer.Exit(CONVERGED if converged else NOT_CONVERGED)
         options |= {"method": str(method), "seeds": seeds, "rungs": rungs}
         options |= {"check_seeds": 0} if quick else {}
         options |= {} if increments is None else {"increments": str(increments)}
@@ -212,11 +236,17 @@ def fit(
             unused(reading, "axis", window=window, what="recordings; this is a spectrum")
             aim = aim_of(target[0], task, read)
         writable(output, "fit.json", force=force)
-        converged = _fit_one(*aim, output, options, [] if quick else formats_of(formats))
+        seen, model = aim
+
+        def single(tell: Any, answer: Any) -> Any:
+            return jm.fit(model, seen, progress=tell, answer=answer, **options)
+
+        called = seen[0].name if isinstance(seen, list) else seen.name
+        converged = _fit_one(single, called, output, [] if quick else formats_of(formats))
     raise typer.Exit(CONVERGED if converged else NOT_CONVERGED)
 
 
-def _fit_one(target: Any, model: Any, folder: Path, options: dict[str, Any], formats: list[str]) -> bool:
+def _fit_one(fit: Callable[[Any, Any], Any], called: str, folder: Path, formats: list[str]) -> bool:
     """The table as soon as the search has ended, then what the checks add; the fit is written before these."""
     printed = []
 
@@ -231,8 +261,8 @@ def _fit_one(target: Any, model: Any, folder: Path, options: dict[str, Any], for
 
     stays(NOTHING)
     try:
-        with told(True, f"fitting {target[0].name if isinstance(target, list) else target.name}") as tell:
-            result = jm.fit(model, target, progress=tell, answer=answer, **options)
+        with told(True, f"fitting {called}") as tell:
+            result = fit(tell, answer)
             tell("writing", 1.0)
             files = write_fit(result, folder, formats, report=True)
     except jm.fits.FitInterrupted as stop:

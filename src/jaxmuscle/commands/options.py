@@ -102,6 +102,14 @@ Window = Annotated[
         help="Analyse from A to B in s, or `all`; one for each file: A:B,C:D. By default the steady part is found.",
     ),
 ]
+Holds = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="FILE",
+        help="For a moved insertion: a recording of the same person with the insertion held, fitted together with it. "
+        "Give the option again for a further trial.",
+    ),
+]
 Recordings = Annotated[
     list[str],
     typer.Argument(

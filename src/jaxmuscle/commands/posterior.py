@@ -87,7 +87,7 @@ def posterior(
         asked = {"task": task, "noise": None if noise is None else str(noise), "free": free, "fix": fix}
         result = fit_into(output, target, {"segments": segments, "quantity": quantity}, asked, seed)
         try:
-            with told(True, f"posterior of {result.target.name}") as tell:
+            with told(True, f"posterior of {result.title}") as tell:
                 found = jm.posterior(result, key=seed, chains=chains, draws=draws, warmup=warmup, progress=tell)
         except ImportError as error:
             raise ValueError(str(error)) from None
@@ -102,6 +102,7 @@ def posterior(
 
 def _write(found: "Posterior", folder: Path, formats: list[str]) -> None:
     from jaxmuscle._common.figures import pixels_of, remove_figures, write_figure
+    from jaxmuscle._common.names import file_names
 
     from .reports import posterior_report
 
@@ -110,7 +111,10 @@ def _write(found: "Posterior", folder: Path, formats: list[str]) -> None:
     found.save(folder / "posterior.json")
     figures: dict[str, Any] = {}
     if found.success:
-        figures |= {"corner": found.plot(), "predictive": found.plot_predictive().figure}
+        figures |= {"corner": found.plot()}
+        for name, called in file_names(found.parts).items():
+            which = f"-{called}" * (len(found.parts) > 1)
+            figures[f"predictive{which}"] = found.plot_predictive(target=name).figure
     figures["chains"] = found.plot_chains()
     drawn = {"chains": pixels_of(figures["chains"])}  # thousands of lines: they are drawn once
     posterior_report(found, figures, folder, drawn)

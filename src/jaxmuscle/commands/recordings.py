@@ -14,6 +14,10 @@ if TYPE_CHECKING:
     from jaxmuscle.data import Table
 
 
+NO_MOTION = ("--hold belongs to records of a moved insertion, with a column of force and one of displacement: fit a hold "
+             "alone as `jaxmuscle fit HOLD`")  # fmt: skip
+
+
 def reads_recordings(command: Callable[..., None], options: Mapping[str, tuple[Any, Any]] = READING) -> Callable[..., None]:
     """Give a command options, by default those of `READING`; it gets their values together, as its argument `reading`.
 
@@ -73,6 +77,32 @@ def read_recordings(
     return read_perturbed(tables, reading, window) if both else read_trials(tables, reading, window)
 
 
+def read_with_holds(
+    paths: Sequence[str], holds: Sequence[str], reading: dict[str, Any], window: str | None
+) -> "tuple[list[PerturbedRecording], Trials]":
+    """Records of a moved insertion and those of the same person with the insertion held, which have the force alone."""
+    windows = windows_of(window, len(paths) + len(holds))
+    tables = [table_of(path, reading) for path in paths]
+    if not perturbed(reading) and not all(channels(table, reading) for table in tables):
+        raise ValueError(NO_MOTION)
+    moved = read_perturbed(tables, reading, windows[: len(paths)])
+    held = jm.Trials([_hold(path, reading, edges) for path, edges in zip(holds, windows[len(paths) :], strict=True)])
+    for recording in held:
+        if recording.unit == "1":
+            raise ValueError(f"--hold {recording.name}: has no unit. Give --units N if all files are in newtons")
+        if recording.unit != "N":
+            raise ValueError(f"--hold {recording.name}: is in {recording.unit}, and a moved record is fitted in N. Give the "
+                             "hold as a force: divide a torque by the lever arm")  # fmt: skip
+    return moved, held
+
+
+def _hold(path: str, reading: dict[str, Any], edges: Any) -> Any:
+    """The force in a file, in the column that it has in the moved records, if there is one."""
+    table, named = table_of(path, reading), reading["force_column"]
+    options = {name: reading[name] for name in READING}
+    return read(table, options | {"column": named if named in table.columns else None, "reference": None}, edges)
+
+
 def channels(table: "Table", reading: dict[str, Any]) -> dict[str, Any]:
     """The columns of force and displacement; nothing where there are not both."""
     named = {"force": reading["force_column"], "displacement": reading["displacement"]}
@@ -80,7 +110,7 @@ def channels(table: "Table", reading: dict[str, Any]) -> dict[str, Any]:
 
 
 def read_perturbed(
-    paths: "Sequence[str | Table]", reading: dict[str, Any], window: str | None = None
+    paths: "Sequence[str | Table]", reading: dict[str, Any], window: str | list[Any] | None = None
 ) -> "list[PerturbedRecording]":
     """The recordings of force and displacement in files, each with its steady part as window."""
     options = {name: value for name, value in reading.items() if name not in ("force_column", "displacement")}
@@ -115,8 +145,10 @@ def table_of(path: "str | Table", reading: dict[str, Any]) -> "Table":
         raise ValueError(str(error)) from None
 
 
-def windows_of(window: str | None, recordings: int) -> list[Any]:
-    """The window of every recording: one of --window for all, or one for each, in their order."""
+def windows_of(window: str | list[Any] | None, recordings: int) -> list[Any]:
+    """The window of every recording: one of --window for all, or one for each, in their order; or those found already."""
+    if isinstance(window, list):
+        return window
     each = [None] if window is None else [edges_of(part.strip()) for part in window.split(",")]
     if len(each) not in (1, recordings):
         whose = "one recording" if recordings == 1 else f"{recordings} recordings"

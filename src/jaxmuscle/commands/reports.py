@@ -30,7 +30,7 @@ FIGURES = {
 
 
 def fit_report(result: "FitResult", figure: Any, folder: Path) -> None:
-    """Write report.html of a fit of one target."""
+    """Write report.html of a fit of one target, or of several of one person."""
     card = result.summary()
     rows = {state: [row[:STATE] + row[STATE + 1 :] for row in card.rows if row[STATE] == state]
             for state in ("determined", "not determined", "fixed")}  # fmt: skip
@@ -39,7 +39,7 @@ def fit_report(result: "FitResult", figure: Any, folder: Path) -> None:
         pages.heading("What the data determine" if result.adequate is not False else WOULD),
         pages.table(PARAMETERS, rows["determined"]) if rows["determined"] else pages.paragraph("Nothing."),
         *_tried(result),
-        pages.picture(figure, FIGURES["fit" if result.only.fitted.size else "stiffness"]),
+        pages.picture(figure, FIGURES["fit" if _has_spectrum(result) else "stiffness"]),
         pages.heading("What it means"),
         pages.items(card.remarks),
         *([pages.paragraph("The data leave open:"), pages.items(result.undetermined)] if result.undetermined else []),
@@ -181,7 +181,9 @@ def _unit(unit: str) -> str:
 
 
 def _pictures(figures: dict[str, Any], drawn: dict[str, bytes]) -> list[Html]:
-    return [pages.picture(figure, FIGURES[name], pixels=drawn.get(name)) for name, figure in figures.items()]
+    return [
+        pages.picture(figure, FIGURES[name.partition("-")[0]], pixels=drawn.get(name)) for name, figure in figures.items()
+    ]
 
 
 def _verdict(words: str, *, good: bool | None) -> Html:
@@ -203,22 +205,27 @@ def _after_a_fit(result: "FitResult", path: Path) -> list[str]:
             "Say how much the powers scatter: `--segments N`, the number of Welch segments that were averaged.",
             "Then the fit can be judged.",
         ]
+    single = len(result.parts) == 1
     place, other = shlex.quote(str(path)), shlex.quote(str(path.parent / "compare"))
     if not result.adequate:
         return [
             "Look at the residuals: orange-red bars are where the model misses the data.",
-            *([f"Try other noises: `jaxmuscle compare {place} --out {other}`."] if result.only.fitted.size else []),
+            *([f"Try other noises: `jaxmuscle compare {place} --out {other}`."] if single and _has_spectrum(result) else []),
             "Look for drift and tremor in the recording: `jaxmuscle analyse RECORDING`.",
             "Report that the model does not describe the data, and no number of the model.",
             "Mean, variation, bands and peak need no model: `jaxmuscle steadiness RECORDING`.",
         ]
     return [
         f"How sure is each number? `jaxmuscle posterior {place}` draws from the posterior.",
-        f"Move the parameters yourself: `jaxmuscle explore {place}`.",
+        *([f"Move the parameters yourself: `jaxmuscle explore {place}`."] if single else []),
         f"What should you measure to know the rest? `jaxmuscle identifiability {place}`.",
         'In a paper, give the numbers under "What the data determine" with their intervals, unless a note says not to.',
         "Name those that the data do not determine.",
     ]
+
+
+def _has_spectrum(result: "FitResult") -> bool:
+    return any(part.fitted.size > 0 for part in result.parts.values())
 
 
 def _data(targets: dict[str, Any]) -> list[Html]:

@@ -102,15 +102,18 @@ def text_of(result: "FitResult") -> str:
 
 def _held(result: "FitResult") -> list[str]:
     """The masses and lengths that a fit takes as given, where its stiffness in newtons depends on them."""
-    if len(result.parts) > 1 or not result.derived:
+    whose = next((name for name, part in result.parts.items() if part.stiffness is not None), None)
+    if not result.derived or (len(result.parts) > 1 and whose is None):
         return []
-    task, moved = result.only.task, result.only.stiffness is not None
+    moved, at = whose is not None, f"@{whose}" * (len(result.parts) > 1)
+    task = (result.only if whose is None else result.parts[whose]).task
     if not moved and (task.output_unit != "N" or result.settings.get("mean_force") is None):
         return []
     names = ("m_w", *(("m_z",) if not moved else ()), *LENGTHS)
     if not set(names) <= set(task.parameter_names):
         return []
-    held = [name for name in names if name not in result.parameters or not result.parameters[name].free]
+    free = {base_of(name) for name, p in result.parameters.items() if p.free}
+    held = [name for name in names if name not in free]
     told = {name: f"{name} = {1e3 * float(task[name]):.3g} mm" if name in LENGTHS else f"{name} = {float(task[name]):.3g} kg"
             for name in held}  # fmt: skip
     if not moved:
@@ -122,8 +125,9 @@ def _held(result: "FitResult") -> list[str]:
         said += [f"held fixed: {told['m_w']}. The data do not tell it, and the verdict notices no wrong one. Where it is "
                  "wrong, C_w0 and K_w0 are, too (docs/perturbed.md has by how much). To have that in the errors let it be "
                  "free, as by default"]  # fmt: skip
-    if "x_ref_w" in held and "K_w_tangent" in result.derived:
-        tangent, base = (result.derived[name].value for name in ("K_w_tangent", "K_w0"))
+    if "x_ref_w" in held and f"K_w_tangent{at}" in result.derived:
+        base = result.derived["K_w0" if "K_w0" in result.derived else f"K_w0{at}"].value
+        tangent = result.derived[f"K_w_tangent{at}"].value
         other = [f"{tangent / (1 + (tangent / base - 1) / times**2):.4g}" for times in OTHER_LENGTHS]
         lengths = " or ".join(f"{1e3 * times * float(task['x_ref_w']):.3g}" for times in OTHER_LENGTHS)
         said += [f"held fixed: {told['x_ref_w']}. No record tells it, and K_w0 depends on it: with {lengths} mm it would be "
