@@ -78,6 +78,13 @@ def test_a_step_is_the_incomplete_beta_function(x64):
 
 
 @pytest.mark.slow
+def test_the_usual_step_rises_from_half_a_second_on_within_one():
+    """As design.md, section 2 has it."""
+    found = np.asarray(jax.vmap(SmoothStep())(jnp.array([0.0, 0.5, 1.0, 1.5, 15.0])))
+    np.testing.assert_allclose(found, [0.0, 0.0, 0.5, 1.0, 1.0], atol=1e-6)
+    np.testing.assert_array_equal(jax.vmap(RampHold())(jnp.array([0.5, 2.5])), [0.0, 1.0])
+
+
 def test_ends_are_reached_and_held_exactly():
     for dtype in (np.float32, np.float64):
         with jax.enable_x64(dtype == np.float64):
@@ -164,6 +171,8 @@ def test_impossible_signals_are_refused(user_view):
     ):
         with pytest.raises(ValueError, match="times"):
             Sampled.through(times, values)
+    with pytest.raises(ValueError, match="breaks must increase"):
+        Sampled(np.array([0.0, 1.0, 1.0]), np.zeros((2, 6)))
 
 
 @pytest.mark.parametrize("precision", ["float32", "float64"])

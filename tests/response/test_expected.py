@@ -20,6 +20,7 @@ from jaxmuscle.model import Constant, Decay, RampHold
 from jaxmuscle.objective._problem import target_variation
 from jaxmuscle.response._autocovariance import Autocovariance
 from jaxmuscle.response._expected import covariance_operator, expected_moments
+from jaxmuscle.response._harmonic_line import line_table
 from jaxmuscle.response._linearised import has_response, linearised
 from jaxmuscle.response._transfer import system_of, transfer
 from jaxmuscle.spectra._decimation import FINER
@@ -331,6 +332,23 @@ def assert_as_by_quadrature(task, settings, window):
     np.testing.assert_allclose(moments.mean, mean, rtol=1e-10, atol=1e-12 if task.quantity == "acceleration" else 0.0)
     np.testing.assert_allclose(moments.variance, variance, rtol=ALIASES)
     np.testing.assert_array_equal(jm.expected_spectrum(task, settings, window).power, moments.power)
+
+
+@pytest.mark.parametrize("frequency", [0.07, 0.31, 2.2])
+@pytest.mark.parametrize("direction", ["forward", "both"])
+def test_the_variance_of_a_line_is_that_of_its_samples(x64, frequency, direction):
+    """Of fractions of a period, too: a sine in time, low-passed by scipy, its variance about the mean of the samples."""
+    settings, reply = Settings().replace(filter_direction=direction), 1.3 * np.exp(0.4j)
+    begin, samples, ahead = 5.0, 1000, 4000
+    time = np.arange(-ahead, round(begin * settings.rate) + samples + ahead) / settings.rate
+    line = np.imag(reply * np.exp(2j * np.pi * frequency * time))
+    passed = scipy.signal.sosfilt(settings.sections, line)
+    if direction == "both":
+        passed = scipy.signal.sosfilt(settings.sections, passed[::-1])[::-1]
+    first = ahead + round(begin * settings.rate)
+    expected = np.var(passed[first : first + samples])
+    table = line_table(settings, (begin, begin + samples / settings.rate), jnp.asarray(frequency), samples)
+    np.testing.assert_allclose(table.variance(jnp.asarray(reply)), expected, rtol=1e-9)
 
 
 @pytest.mark.slow

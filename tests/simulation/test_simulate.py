@@ -19,7 +19,8 @@ from jaxmuscle.model._noise import Realisation
 from jaxmuscle.model._stream import Draws, Stream
 from jaxmuscle.simulation._batch import respond, streams_of
 from jaxmuscle.simulation._grid import Grid
-from jaxmuscle.simulation._simulate import schedule
+from jaxmuscle.simulation import _simulate
+from jaxmuscle.simulation._simulate import schedule, stable_substeps
 
 KEY = jax.random.key(11)
 HARMONIC = jm.Harmonic(0.1, 4.25, 0.3)
@@ -105,6 +106,20 @@ def test_a_stiff_task_gets_sub_steps_and_the_right_answer(x64):
     np.testing.assert_allclose(run.output, output, atol=1e-5 * np.abs(output).max())
     with pytest.raises(jm.errors.SimulationError, match="did not stay finite"):
         jm.simulate(task, KEY, duration=3.0, substeps=1)
+
+
+@pytest.mark.parametrize(("rate", "substeps"), [(1.0, 1), (500.0, 1), (501.0, 2), (1000.0, 2), (127_900.0, 256)])
+def test_so_many_substeps_that_an_eigenvalue_times_a_step_is_half_at_most(monkeypatch, rate, substeps):
+    """Of 1 ms, in powers of two up to 256."""
+    monkeypatch.setattr(_simulate, "fastest_rate", lambda *_: rate)
+    assert stable_substeps(jm.Isometric(), 1e-3) == substeps
+    assert rate * 1e-3 / substeps <= 0.5
+
+
+def test_more_substeps_than_256_are_refused(monkeypatch):
+    monkeypatch.setattr(_simulate, "fastest_rate", lambda *_: 128_100.0)
+    with pytest.raises(ValueError, match=r"eigenvalue of 1.28e\+05/s, which asks for 512 sub-steps of dt = 0.001 s"):
+        stable_substeps(jm.Isometric(), 1e-3)
 
 
 def test_an_eigenvalue_beyond_all_sub_steps_is_an_error():
