@@ -17,9 +17,9 @@ from jaxmuscle._common.types import Scalar
 from jaxmuscle.model import Decay, RampHold, Sampled, SmoothStep
 from jaxmuscle.model._noise import Realisation
 from jaxmuscle.model._stream import Draws, Stream
+from jaxmuscle.simulation import _simulate
 from jaxmuscle.simulation._batch import respond, streams_of
 from jaxmuscle.simulation._grid import Grid
-from jaxmuscle.simulation import _simulate
 from jaxmuscle.simulation._simulate import schedule, stable_substeps
 
 KEY = jax.random.key(11)
