@@ -134,6 +134,9 @@ def test_a_file_of_both_channels_is_fitted_from_the_command_line_alone_and_with_
         assert abs(joint[name].value - true) < 4.5 * joint[name].stderr
         assert joint[name].stderr < 1.02 * result[name].stderr  # more data; but each error is itself estimated
     words = " ".join(str(joint).split())
+    known, fitted = joint.parts["moved"].target.stiffness.known, joint.parts["moved"].stiffness
+    faint = int(np.sum(np.abs(fitted) < 2 * known.stderr))
+    assert faint > 0 and f"({faint} of them smaller than two standard errors: too little motion" in words
     assert "moved: dynamic stiffness: " in words and "Report K_w_tangent, the stiffness of the active tissue" in words
     written = write_fit(joint, folder, ["png"], report=True)
     tables = ["spectrum-moved.csv", "stiffness-moved.csv", "spectrum-held.csv"]

@@ -121,7 +121,9 @@ class GoodnessPart(Printed, Result, eqx.Module):
     def __str__(self) -> str:
         done = "foretold by fits of" if self.foretold else "each fitted anew,"
         head = f"{self.target.name}: against {len(self.residuals)} spectra drawn from the fit, {done} {self.law} law"
-        return folded([head, *(f"- {sentence}" for sentence in self.sentences)])
+        apart = "these checks look at the spectrum alone; the verdict of the fit also looks at the dynamic stiffness"
+        notes = [f"- {apart}"] * (self.target.stiffness is not None and not self.foretold)
+        return folded([head, *(f"- {sentence}" for sentence in self.sentences), *notes])
 
 
 class Goodness(Printed, Result, eqx.Module):

@@ -230,10 +230,11 @@ def _stiffness(part: FittedPart) -> list[str]:
     """How many points of the dynamic stiffness were fitted, and how well."""
     if part.stiffness is None or part.target.stiffness is None:
         return []
-    f = part.target.stiffness.known.frequency
-    return [
-        f"dynamic stiffness: {len(f)} points from {f[0]:.2g} to {f[-1]:.2g} Hz, chi2 per point {part.chi2_per_point:.2f}"
-    ]
+    known = part.target.stiffness.known
+    f, seen = known.frequency, int(np.sum(np.abs(part.stiffness) > 2 * known.stderr))
+    faint = f" ({len(f) - seen} of them smaller than two standard errors: too little motion there to tell)" * (seen < len(f))
+    return [f"dynamic stiffness: {len(f)} points from {f[0]:.2g} to {f[-1]:.2g} Hz{faint}, chi2 per point "
+            f"{part.chi2_per_point:.2f}"]  # fmt: skip
 
 
 def in_use(name: str) -> str | None:
