@@ -50,6 +50,8 @@ def test_the_table_has_its_labels():
     assert table["unit"].sel(parameter="k_w") == "N/m^3"
     assert float(table["value"].sel(parameter="c_w")) == float(TASK["c_w"])
     np.testing.assert_allclose(table["frequency"], TASK.settings.frequency)
+    said = {name: value for name, value, _ in whole()._card().rows}
+    assert said["x_ref_w"] == "0.02 m" and said["noise_K_w"] == f"{float(TASK['noise_K_w']):.4g}"  # a share has no unit
 
 
 @pytest.mark.slow
