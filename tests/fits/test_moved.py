@@ -136,12 +136,14 @@ def test_a_file_of_both_channels_is_fitted_from_the_command_line_alone_and_with_
     words = " ".join(str(joint).split())
     known, fitted = joint.parts["moved"].target.stiffness.known, joint.parts["moved"].stiffness
     faint = int(np.sum(np.abs(fitted) < 2 * known.stderr))
-    assert faint > 0 and f"({faint} of them smaller than two standard errors: too little motion" in words
+    assert faint > 0 and f"({faint} of them smaller than two standard errors, so they tell little)" in words
     assert "moved: dynamic stiffness: " in words and "Report K_w_tangent, the stiffness of the active tissue" in words
     written = write_fit(joint, folder, ["png"], report=True)
     tables = ["spectrum-moved.csv", "stiffness-moved.csv", "spectrum-held.csv"]
     assert written == ["fit.json", "fit.png", *tables, "report.html"]
     assert {file.name for file in folder.iterdir()} == set(written)  # the tables of the fit alone are gone
+    assert set(write_fit(result, folder)) == {"fit.json", "spectrum.csv", "stiffness.csv"}
+    assert {file.name for file in folder.iterdir()} == {"fit.json", "spectrum.csv", "stiffness.csv"}
     figure = joint.plot()
     titles = [ax.get_title(loc="left") for ax in figure.axes]
     assert {"moved: PrescribedLength", "held: Isometric", "moved: dynamic stiffness"} <= set(titles)
@@ -156,7 +158,10 @@ def test_a_file_of_both_channels_is_fitted_from_the_command_line_alone_and_with_
         (["PULL", "--hold", "HOLD", "--rungs", "1"], "with --hold all records get the base model"),
         (["PULL", "--hold", "HOLD", "--method", "montecarlo"], "with --hold all records get the base model"),
         (["PULL", "--hold", "HOLD", "--window", "1:9,2:9,3:9"], "3 windows for 2 recordings"),
-        (["PULL", "--hold", "TORQUE"], "--hold torque: is in N m, and a moved record is fitted in N"),
+        (["PULL", "--hold", "TORQUE"], "Give the hold in newtons (a torque over the lever arm"),
+        (["PULL", "--hold", "HOLD", "--units", "mN"], "--hold hold: is in mN, and a moved record is fitted in N"),
+        (["PULL", "--hold", "HOLD", "--task", "isometric"], "leave out --task and --quantity"),
+        (["PULL", "--hold", "HOLD", "--segments", "5"], "--segments and --dataset belong to spectra"),
         (["PULL", "--hold", "none.csv"], "none.csv"),
     ],
 )

@@ -207,7 +207,8 @@ def write_fit(result: "FitResult", folder: Path, formats: Iterable[str] = (), *,
     from .reports import REPORT, fit_report
 
     tables = fit_tables(result)
-    remove(folder, *tables, REPORT)
+    earlier = [f"{table}-{name}.csv" for name in parts_of(folder / "fit.json") for table in ("spectrum", "stiffness")]
+    remove(folder, *tables, *earlier, REPORT)
     remove_figures(folder, "fit")
     result.save(folder / "fit.json")
     remove(folder, REACHED)
@@ -222,6 +223,14 @@ def write_fit(result: "FitResult", folder: Path, formats: Iterable[str] = (), *,
             written.append(REPORT)
         written[1:1] = write_figure(figure, folder, "fit", formats)
     return written
+
+
+def parts_of(path: Path) -> list[str]:
+    """What the targets of an earlier result are called in the names of its files; nothing where there is none."""
+    try:
+        return list(file_names(json.loads(path.read_text(encoding="utf-8"))["parts"]).values())
+    except (OSError, ValueError, KeyError, TypeError):
+        return []
 
 
 def fit_tables(result: "FitResult") -> dict[str, dict[str, Any]]:

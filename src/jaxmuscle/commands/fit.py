@@ -86,7 +86,7 @@ def fit(
         int | None,
         typer.Option(
             min=1,
-            help="How many starting points the search has: 100 by default, 32 for each richer model, "
+            help="How many starting points the search has: 100 by default, 32 with --hold and for each richer model, "
             "8 if the spectrum has no formula.",
         ),
     ] = None,
@@ -136,8 +136,11 @@ def fit(
 
     If a motor moved the insertion, give recordings with a column of force (or torque) and one of displacement (or angle).
     Or give the frequency response: a CSV with the columns frequency, gain, phase, and coherence or stderr. Then
-    DIR/stiffness.csv holds the dynamic stiffness, measured and fitted. With --hold a recording of the held insertion is
-    fitted together with it: same muscle, one P_w for each.
+    DIR/stiffness.csv holds the dynamic stiffness, measured and fitted.
+
+    With --hold recordings of the held insertion are fitted together with those of the moved one: same muscle, one P_w for
+    the moved ones and one for the holds. The table comes at the end. The tables of the spectra are DIR/spectrum-moved.csv,
+    DIR/spectrum-held.csv, and DIR/stiffness-moved.csv.
 
     Several spectra are taken as those of several people. They are fitted together, by the formula of the spectrum alone,
     without simulation.
@@ -202,13 +205,16 @@ def fit(
             raise ValueError(
                 "--groups compares several spectra; to compare recordings of several people use `jaxmuscle study`"
             )
+        if any(recorded) and (segments is not None or dataset is not None):
+            raise ValueError("--segments and --dataset belong to spectra, and these are recordings: leave them out")
         if hold:
             simulated = {} if increments is None else {"increments": str(increments)}
             if method != MethodName.linear or rungs:
                 raise ValueError("with --hold all records get the base model, by the formula of the spectrum: leave out "
                                  "--method and --rungs")  # fmt: skip
-            if task not in (None, "prescribed-length"):
-                raise ValueError(NO_MOTION)
+            if task not in (None, "prescribed-length") or quantity is not None:
+                raise ValueError("with --hold the records are those of a moved insertion, and of the force in a hold: leave "
+                                 "out --task and --quantity")  # fmt: skip
             moved, held = read_with_holds(target, hold, reading, window)
             writable(output, "fit.json", force=force)
             options |= simulated | {"starts": starts or 32, "seeds": 0 if quick else seeds or 32}
@@ -222,8 +228,6 @@ def fit(
         options |= {"check_seeds": 0} if quick else {}
         options |= {} if increments is None else {"increments": str(increments)}
         if any(recorded):
-            if segments is not None or dataset is not None:
-                raise ValueError("--segments and --dataset belong to spectra, and these are recordings: leave them out")
             found = read_recordings(target, reading, window, task)
             if isinstance(found, list):
                 aim = found, jm.model.TASKS[task or "prescribed-length"]()

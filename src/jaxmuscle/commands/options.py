@@ -99,7 +99,8 @@ Window = Annotated[
     str | None,
     typer.Option(
         metavar="A:B",
-        help="Analyse from A to B in s, or `all`; one for each file: A:B,C:D. By default the steady part is found.",
+        help="Analyse from A to B in s, or `all`, or `auto` (the default): the steady part is found. One for each file: "
+        "A:B,auto.",
     ),
 ]
 Holds = Annotated[

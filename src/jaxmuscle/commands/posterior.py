@@ -14,6 +14,7 @@ from .console import (
     err,
     fit_into,
     out,
+    parts_of,
     plain,
     record,
     reporting,
@@ -106,7 +107,8 @@ def _write(found: "Posterior", folder: Path, formats: list[str]) -> None:
 
     from .reports import posterior_report
 
-    remove_figures(folder, "corner", "predictive")
+    earlier = [f"predictive-{name}" for name in parts_of(folder / "posterior.json")]
+    remove_figures(folder, "corner", "predictive", *earlier)
     found.save(folder / "posterior.nc")
     found.save(folder / "posterior.json")
     figures: dict[str, Any] = {}

@@ -91,8 +91,9 @@ def read_with_holds(
         if recording.unit == "1":
             raise ValueError(f"--hold {recording.name}: has no unit. Give --units N if all files are in newtons")
         if recording.unit != "N":
+            torque = " (a torque over the lever arm; --lever-arm serves the moved records alone)" * (recording.unit == "N m")
             raise ValueError(f"--hold {recording.name}: is in {recording.unit}, and a moved record is fitted in N. Give the "
-                             "hold as a force: divide a torque by the lever arm")  # fmt: skip
+                             f"hold in newtons{torque}")  # fmt: skip
     return moved, held
 
 
@@ -153,14 +154,16 @@ def windows_of(window: str | list[Any] | None, recordings: int) -> list[Any]:
     if len(each) not in (1, recordings):
         whose = "one recording" if recordings == 1 else f"{recordings} recordings"
         raise ValueError(f"--window {window}: {len(each)} windows for {whose}. Give one for all, or one for each in the "
-                         "order of the files, as --window 8:25,4:21")  # fmt: skip
+                         "order of the files, as --window 8:25,4:21 or --window 8:25,auto")  # fmt: skip
     return each * recordings if len(each) == 1 else each
 
 
 def edges_of(window: str | None) -> Any:
-    """The window of --window in s, `all`, or None."""
+    """The window of --window in s, `all`, or None where it is to be found."""
     if window is None or window == "all":
         return window
+    if window == "auto":
+        return None
     start, colon, stop = window.partition(":")
     try:
         if colon:

@@ -112,7 +112,7 @@ def _held(result: "FitResult") -> list[str]:
     names = ("m_w", *(("m_z",) if not moved else ()), *LENGTHS)
     if not set(names) <= set(task.parameter_names):
         return []
-    free = {base_of(name) for name, p in result.parameters.items() if p.free}
+    free = {name.removesuffix(at) if at else name for name, p in result.parameters.items() if p.free}
     held = [name for name in names if name not in free]
     told = {name: f"{name} = {1e3 * float(task[name]):.3g} mm" if name in LENGTHS else f"{name} = {float(task[name]):.3g} kg"
             for name in held}  # fmt: skip
@@ -232,7 +232,7 @@ def _stiffness(part: FittedPart) -> list[str]:
         return []
     known = part.target.stiffness.known
     f, seen = known.frequency, int(np.sum(np.abs(part.stiffness) > 2 * known.stderr))
-    faint = f" ({len(f) - seen} of them smaller than two standard errors: too little motion there to tell)" * (seen < len(f))
+    faint = f" ({len(f) - seen} of them smaller than two standard errors, so they tell little)" * (seen < len(f))
     return [f"dynamic stiffness: {len(f)} points from {f[0]:.2g} to {f[-1]:.2g} Hz{faint}, chi2 per point "
             f"{part.chi2_per_point:.2f}"]  # fmt: skip
 

@@ -1,6 +1,7 @@
 """What a design would tell of a fit's parameters: Fisher information."""
 
 import dataclasses
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -9,6 +10,7 @@ from jaxtyping import Float
 from jaxmuscle.data._target import Target
 from jaxmuscle.model._parameters import PARAMETERS
 from jaxmuscle.model._tasks import PrescribedLength
+from jaxmuscle.objective._arguments import base_of
 from jaxmuscle.objective._consequences import Expansion, expand
 from jaxmuscle.objective._coordinates import Coordinates
 from jaxmuscle.objective._likelihood import Likelihood, without_offsets
@@ -42,27 +44,29 @@ def opened(problem: FitProblem) -> FitProblem:
 
     The fit of a moved record finds m_z and lets m_w be free, and what else is known of the person helps with that.
     """
-    c, masses = problem.coordinates, open_masses(problem)
+    masses, c = open_masses(problem), problem.coordinates
     if not masses:
         return problem
-    rows, size = [PARAMETERS[name] for name in masses], len(c.names)
-
-    def widened(c: Coordinates, task: Any, names: tuple[str, ...]) -> Coordinates:
-        """These, and the masses of a task."""
-        more, unbounded = [rows[masses.index(name)] for name in names], np.full(len(names), np.inf)
-        return Coordinates((*c.names, *names), np.append(c.centre, [float(task[name]) for name in names]),
-                           np.append(c.sd, [row.prior_sd for row in more]),
-                           np.append(c.positive, np.array([row.positive for row in more], bool)),
-                           np.append(c.low, -unbounded), np.append(c.high, unbounded))  # fmt: skip
-
+    first = {name: problem.parts[parts[0]].task[base_of(name)] for name, parts in masses.items()}
+    places = {name: len(c.names) + i for i, name in enumerate(masses)}
     parts = []
-    for part in problem.parts:
-        own = tuple(name for name in masses if name in part.task.parameter_names)
-        columns = (*part.columns, *(size + masses.index(name) for name in own))
-        parts.append(dataclasses.replace(part, coordinates=widened(part.coordinates, part.task, own), columns=columns))
-    values = {row.name: next(p.task[row.name] for p in parts if row.name in p.task.parameter_names) for row in rows}
-    return dataclasses.replace(problem, parts=tuple(parts), coordinates=widened(c, values, masses),
+    for i, part in enumerate(problem.parts):
+        own = {
+            base_of(name): place for (name, which), place in zip(masses.items(), places.values(), strict=True) if i in which
+        }
+        coordinates = _widened(part.coordinates, {name: part.task[name] for name in own})
+        parts.append(dataclasses.replace(part, coordinates=coordinates, columns=(*part.columns, *own.values())))
+    return dataclasses.replace(problem, parts=tuple(parts), coordinates=_widened(c, first),
                                prior=np.append(problem.prior, np.ones(len(masses))))  # fmt: skip
+
+
+def _widened(c: Coordinates, values: Mapping[str, Any]) -> Coordinates:
+    """These, and masses of these values with their usual prior."""
+    rows, unbounded = [PARAMETERS[base_of(name)] for name in values], np.full(len(values), np.inf)
+    return Coordinates((*c.names, *values), np.append(c.centre, [float(value) for value in values.values()]),
+                       np.append(c.sd, [row.prior_sd for row in rows]),
+                       np.append(c.positive, np.array([row.positive for row in rows], bool)),
+                       np.append(c.low, -unbounded), np.append(c.high, unbounded))  # fmt: skip
 
 
 def design_information(

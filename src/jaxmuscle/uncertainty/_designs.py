@@ -8,7 +8,7 @@ import numpy as np
 from jaxmuscle._common.text import choices
 from jaxmuscle.data._target import Target
 from jaxmuscle.model._tasks import AbstractTask, Isometric, PrescribedForce, PrescribedLength
-from jaxmuscle.objective._arguments import INPUTS, MASSES
+from jaxmuscle.objective._arguments import INPUTS, MASSES, base_of
 from jaxmuscle.objective._consequences import Expansion
 from jaxmuscle.objective._likelihood import require_spread
 from jaxmuscle.objective._problem import FitProblem, Part
@@ -94,7 +94,9 @@ class Design(eqx.Module):
         data += [] if self.mean is None else [f"mean to {100 * self.mean:.2g} %"]
         if self.lengthening is not None:
             task = like.task if self.task is None else self.task
-            masses = " and ".join(name for name in open_masses(problem) if name in task.parameter_names)
+            own = next(i for i, part in enumerate(problem.parts) if part is like)
+            open_here = [base_of(name) for name, parts in open_masses(problem).items() if own in parts]
+            masses = " and ".join(name for name in open_here if name in task.parameter_names)
             data.append(f"response to a {self.lengthening}" + f" ({masses} {FITTED_TOO})" * bool(masses))
         kind = None if self.lengthening is None else PrescribedLength
         return _task_in_words(like.task if self.task is None else self.task, kind), ", ".join(data)
@@ -229,12 +231,20 @@ def moved_insertion(
                   lengthening=lengthening, target=target)  # fmt: skip
 
 
-def open_masses(problem: FitProblem) -> tuple[str, ...]:
+def open_masses(problem: FitProblem) -> dict[str, tuple[int, ...]]:
     """The masses that the fit of a further, moved record would find, and of which the fit at hand says nothing.
 
-    Where a moved record was fitted with a mass fixed, that mass is known.
+    By their names in the fit; with each the targets that have it fixed. Where a moved record was fitted with a mass fixed,
+    that mass is known.
     """
-    free = {name.partition("@")[0] for name in problem.coordinates.names}
-    known = {name for part in problem.parts if part.target.stiffness is not None for name in part.task.parameter_names}
-    has = {name for part in problem.parts for name in part.task.parameter_names}
-    return tuple(name for name in MASSES if name in has - free - known)
+    found: dict[str, tuple[int, ...]] = {}
+    for mass in MASSES:
+        parts = [i for i, part in enumerate(problem.parts) if mass in part.task.parameter_names]
+        fixed = [i for i in parts if mass not in problem.parts[i].coordinates.names]
+        if any(problem.parts[i].target.stiffness is not None for i in fixed):
+            continue
+        if len(fixed) == len(parts):
+            found |= {mass: tuple(fixed)} if fixed else {}
+        else:
+            found |= {f"{mass}@{problem.parts[i].name}": (i,) for i in fixed}
+    return found

@@ -178,7 +178,11 @@ class Experiment(NamedTuple):
         here = Here.of(problem, seen_here(problem, theta), dict.fromkeys([*derived, *tangents]))
         for name in quantity:
             if name not in here.gradients:
-                fixed = name.partition("@")[0] in (*problem.parts[0].task.parameter_names, *BASE.values())
+                base = name.partition("@")[0]
+                if base in TANGENTS:
+                    raise ValueError(f"quantity {name!r}: fits of a held or a moved insertion have it (Isometric, "
+                                     "PrescribedLength, with the paper's muscle)")  # fmt: skip
+                fixed = base in (*problem.parts[0].task.parameter_names, *BASE.values())
                 raise ValueError(f"quantity {name!r} " + ("is fixed: leave its parameter free" if fixed else
                                  f"is unknown: {choices(name, here.gradients)}"))  # fmt: skip
         design = moved_insertion(record, problem.parts[0].target.settings, coefficient_of_variation=True, target=target)
