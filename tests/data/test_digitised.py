@@ -12,6 +12,7 @@ import pages
 import pytest
 from typer.testing import CliRunner
 
+import jaxmuscle as jm
 from jaxmuscle._common.errors import TargetError
 from jaxmuscle.commands import fit as _cli_fit
 from jaxmuscle.commands.main import app
@@ -429,7 +430,8 @@ def test_bundled_targets_are_no_figures(option, word):
 
 def test_command_passes_dataset_and_axis_on(made, tmp_path, monkeypatch):
     path, seen = write(tmp_path, made), []
-    monkeypatch.setattr(_cli_fit, "_fit_one", lambda target, *_, **__: bool(seen.append(target)) or True)
+    monkeypatch.setattr(jm, "fit", lambda _, target, **__: seen.append(target))
+    monkeypatch.setattr(_cli_fit, "_fit_one", lambda fit, *_: fit(None, None) is None)
     result = CliRunner().invoke(app, ["fit", str(path), "--dataset", "95 MVC", "--segments", "6"])
     assert result.exit_code == 0 and seen[0] == load_target(path, dataset="95 MVC", segments=6)
     rows = "".join(f"{np.log10(f)},{np.log10(p)}\n" for f, p in zip(GRID, spectrum(GRID), strict=True))

@@ -51,9 +51,7 @@ def opened(problem: FitProblem) -> FitProblem:
     places = {name: len(c.names) + i for i, name in enumerate(masses)}
     parts = []
     for i, part in enumerate(problem.parts):
-        own = {
-            base_of(name): place for (name, which), place in zip(masses.items(), places.values(), strict=True) if i in which
-        }
+        own = {base_of(name): place for name, place in places.items() if i in masses[name]}
         coordinates = _widened(part.coordinates, {name: part.task[name] for name in own})
         parts.append(dataclasses.replace(part, coordinates=coordinates, columns=(*part.columns, *own.values())))
     return dataclasses.replace(problem, parts=tuple(parts), coordinates=_widened(c, first),

@@ -172,10 +172,8 @@ class Experiment(NamedTuple):
             theta = theta + step
             parts = (dataclasses.replace(part, task=part.task_at(theta)) for part in problem.parts)
             problem = dataclasses.replace(problem, parts=tuple(parts))
-        whole = len(problem.parts) == 1
-        tangents = [f"{name}@{part.name}" for part in problem.parts if has_tangents(part.task) for name in TANGENTS]
-        tangents = [name.partition("@")[0] for name in tangents] if whole else tangents
-        here = Here.of(problem, seen_here(problem, theta), dict.fromkeys([*derived, *tangents]))
+        told = problem.by_name([dict.fromkeys(TANGENTS if has_tangents(part.task) else ()) for part in problem.parts])
+        here = Here.of(problem, seen_here(problem, theta), dict.fromkeys([*derived, *told]))
         for name in quantity:
             if name not in here.gradients:
                 base = name.partition("@")[0]
