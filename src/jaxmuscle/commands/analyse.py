@@ -7,7 +7,7 @@ import typer
 
 from .console import absent, csv_text, err, out, plain, record, reporting, writable
 from .options import READING, Force, Formats, Json, Output, Recordings, SpectrumName, Window, formats_of
-from .recordings import perturbed, read_perturbed, read_trials, reads_perturbed, unused
+from .recordings import perturbed, read_perturbed, read_trials, reads_perturbed, unused, windows_of
 
 if TYPE_CHECKING:
     from jaxmuscle import PerturbedRecording, Trials
@@ -79,7 +79,9 @@ def analyse(
                 )
             if len(paths) > 1:
                 raise ValueError(f"{len(paths)} files are given; with force and displacement give one at a time")
-            return _write_perturbed(read_perturbed(paths, reading, window)[0], str(spectrum), output, formats_of(formats))
+            return _write_perturbed(
+                read_perturbed(paths, reading, windows_of(window, len(paths)))[0], str(spectrum), output, formats_of(formats)
+            )
         unused(
             reading, *READING, what="recordings with a moved insertion, whose columns --force-column and --displacement name"
         )

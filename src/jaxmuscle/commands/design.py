@@ -82,8 +82,9 @@ def design(
         out.print(f"Play the motion for {end:g} s and record force and displacement. Then fit both channels, without the "
                   f"first {begin:g} s: jaxmuscle fit RECORD.csv --task prescribed-length --window {begin:g}:{end:g} "
                   "--out out/moved. The errors above count what is known now. To reach them, fit with it what you have "
-                  "recorded so far: a moved record as a second file, a hold with --hold FILE. Then write an auto for each "
-                  f"of these: --window {begin:g}:{end:g},auto", highlight=False, soft_wrap=True)  # fmt: skip
+                  "recorded so far: a moved record as a second file, a hold with --hold FILE. The window above is that of the "
+                  f"new record. Let the others be found: --window {begin:g}:{end:g},auto (one auto for each further file)",
+                  highlight=False, soft_wrap=True)  # fmt: skip
 
 
 def _source(name: str) -> Any:

@@ -215,14 +215,10 @@ def fit(
             if task not in (None, "prescribed-length") or quantity is not None:
                 raise ValueError("with --hold the records are those of a moved insertion, and of the force in a hold: leave "
                                  "out --task and --quantity")  # fmt: skip
-            moved, held = read_with_holds(target, hold, reading, window)
-            writable(output, "fit.json", force=force)
             options |= simulated | {"starts": starts or 32, "seeds": 0 if quick else seeds or 32}
-
-            def joint(tell: Any, _: Any) -> Any:
-                return jm.fit_joint({"moved": moved, "held": held.target()}, progress=tell, **options)
-
-            converged = _fit_one(joint, "the moved and the held record", output, [] if quick else formats_of(formats))
+            given = read_with_holds(target, hold, reading, window)
+            writable(output, "fit.json", force=force)
+            converged = _fit_with_holds(*given, output, options, [] if quick else formats_of(formats))
             raise typer.Exit(CONVERGED if converged else NOT_CONVERGED)
         options |= {"method": str(method), "seeds": seeds, "rungs": rungs}
         options |= {"check_seeds": 0} if quick else {}
@@ -240,14 +236,26 @@ def fit(
             unused(reading, "axis", window=window, what="recordings; this is a spectrum")
             aim = aim_of(target[0], task, read)
         writable(output, "fit.json", force=force)
-        seen, model = aim
-
-        def single(tell: Any, answer: Any) -> Any:
-            return jm.fit(model, seen, progress=tell, answer=answer, **options)
-
-        called = seen[0].name if isinstance(seen, list) else seen.name
-        converged = _fit_one(single, called, output, [] if quick else formats_of(formats))
+        converged = _fit_alone(*aim, output, options, [] if quick else formats_of(formats))
     raise typer.Exit(CONVERGED if converged else NOT_CONVERGED)
+
+
+def _fit_alone(seen: Any, model: Any, folder: Path, options: dict[str, Any], formats: list[str]) -> bool:
+    """One spectrum, or the recordings of one condition."""
+
+    def fitted(tell: Any, answer: Any) -> Any:
+        return jm.fit(model, seen, progress=tell, answer=answer, **options)
+
+    return _fit_one(fitted, seen[0].name if isinstance(seen, list) else seen.name, folder, formats)
+
+
+def _fit_with_holds(moved: Any, held: Any, folder: Path, options: dict[str, Any], formats: list[str]) -> bool:
+    """Records of a moved and of a held insertion; there is no table before the end."""
+
+    def fitted(tell: Any, _: Any) -> Any:
+        return jm.fit_joint({"moved": moved, "held": held.target()}, progress=tell, **options)
+
+    return _fit_one(fitted, "the moved and the held record", folder, formats)
 
 
 def _fit_one(fit: Callable[[Any, Any], Any], called: str, folder: Path, formats: list[str]) -> bool:

@@ -65,7 +65,7 @@ def read_recordings(
 ) -> "list[PerturbedRecording] | Trials":
     """The recordings of one condition: of force and displacement, by the options, else by the task and the columns."""
     if perturbed(reading):
-        return read_perturbed(paths, reading, window)
+        return read_perturbed(paths, reading, windows_of(window, len(paths)))
     if task not in (None, "prescribed-length") or reading["column"] is not None:
         return read_trials(paths, reading, window)
     tables = [table_of(path, reading) for path in paths]
@@ -74,7 +74,9 @@ def read_recordings(
         raise ValueError(f"{paths[0]}: no displacement was found beside the force, and --task prescribed-length fits both: "
                          "name the columns with --force-column and --displacement; a hold is fitted with --task "
                          "isometric")  # fmt: skip
-    return read_perturbed(tables, reading, window) if both else read_trials(tables, reading, window)
+    if both:
+        return read_perturbed(tables, reading, windows_of(window, len(tables)))
+    return read_trials(tables, reading, window)
 
 
 def read_with_holds(
@@ -111,13 +113,13 @@ def channels(table: "Table", reading: dict[str, Any]) -> dict[str, Any]:
 
 
 def read_perturbed(
-    paths: "Sequence[str | Table]", reading: dict[str, Any], window: str | list[Any] | None = None
+    paths: "Sequence[str | Table]", reading: dict[str, Any], windows: Sequence[Any]
 ) -> "list[PerturbedRecording]":
-    """The recordings of force and displacement in files, each with its steady part as window."""
+    """The recordings of force and displacement in files, each with its window of `windows_of`."""
     options = {name: value for name, value in reading.items() if name not in ("force_column", "displacement")}
     named = {"force": reading["force_column"], "displacement": reading["displacement"]}
     tables = [table_of(path, reading) for path in paths]
-    each = zip(tables, windows_of(window, len(tables)), strict=True)
+    each = zip(tables, windows, strict=True)
     return [read(table, options | (channels(table, reading) or named), edges) for table, edges in each]
 
 
@@ -146,10 +148,8 @@ def table_of(path: "str | Table", reading: dict[str, Any]) -> "Table":
         raise ValueError(str(error)) from None
 
 
-def windows_of(window: str | list[Any] | None, recordings: int) -> list[Any]:
-    """The window of every recording: one of --window for all, or one for each, in their order; or those found already."""
-    if isinstance(window, list):
-        return window
+def windows_of(window: str | None, recordings: int) -> list[Any]:
+    """The window of every recording: one of --window for all, or one for each, in their order."""
     each = [None] if window is None else [edges_of(part.strip()) for part in window.split(",")]
     if len(each) not in (1, recordings):
         whose = "one recording" if recordings == 1 else f"{recordings} recordings"
