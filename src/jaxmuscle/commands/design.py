@@ -82,8 +82,8 @@ def design(
         out.print(f"Play the motion for {end:g} s and record force and displacement. Then fit both channels, without the "
                   f"first {begin:g} s: jaxmuscle fit RECORD.csv --task prescribed-length --window {begin:g}:{end:g} "
                   "--out out/moved. The errors above count what is known now. To reach them, fit with it what you have "
-                  "recorded so far: a moved record as a second file, a hold with --hold FILE. The window above is that of the "
-                  f"new record. Let the others be found: --window {begin:g}:{end:g},auto (one auto for each further file)",
+                  "recorded so far: a moved record as a second file, a hold with --hold FILE. The window above is that of "
+                  f"the new record. Let the others be found: --window {begin:g}:{end:g},auto (one auto for each further file)",
                   highlight=False, soft_wrap=True)  # fmt: skip
 
 
