@@ -83,7 +83,7 @@ def design(
                   f"first {begin:g} s: jaxmuscle fit RECORD.csv --task prescribed-length --window {begin:g}:{end:g} "
                   "--out out/moved. The errors above count what is known now. To reach them, fit with it what you have "
                   "recorded so far: a moved record as a second file, a hold with --hold FILE. The window above is that of "
-                  f"the new record. Let the others be found: --window {begin:g}:{end:g},auto (one auto for each further file)",
+                  f"the new record. Let the others be found: --window {begin:g}:{end:g},auto (one auto for each)",
                   highlight=False, soft_wrap=True)  # fmt: skip
 
 
