@@ -5,10 +5,11 @@ BIN = .venv/bin
 PYTEST = $(BIN)/python -m pytest -q -n 2 --dist loadfile --no-loadscope-reorder
 PIP = $(BIN)/python -m pip --quiet --disable-pip-version-check install
 
-.PHONY: help fit notebooks test test-fast test-minimum mutants bench docs clean
+.PHONY: help install fit notebooks test test-fast test-minimum mutants bench docs clean
 
 help:
 	@echo "make fit        fit a bundled measured target; writes report and figure to out/fit"
+	@echo "make install    only install jaxmuscle into .venv"
 	@echo "make notebooks  open the notebooks in JupyterLab; make notebooks OPEN=no only installs it"
 	@echo "make test       ruff, basedpyright and the whole test suite"
 	@echo "make test WING=spectra  the tests of one folder of the package and of those above it"
@@ -19,6 +20,9 @@ help:
 	@echo "make docs       write the documentation; open site/index.html"
 	@echo "make clean      remove outputs and caches, but not .venv and .venv-minimum"
 	@echo "Another interpreter: make PYTHON=python3.12 fit"
+
+install: .venv/.stamp-run
+	@echo "jaxmuscle is installed in .venv; now: .venv/bin/jaxmuscle --help"
 
 fit: .venv/.stamp-run
 	$(BIN)/jaxmuscle fit vastus-lateralis-26mvc --out out/fit --force

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from jaxmuscle._common.names import LONGEST, file_name, file_names
+from jaxmuscle._common.names import LONGEST, file_name, file_names, name_of_all
 
 NAMES = {
     "anna": "anna",
@@ -72,3 +72,19 @@ def test_clashes_are_numbered_in_their_order_and_good_names_come_first():
 def test_no_two_are_one(names):
     found = file_names(names)
     assert list(found) == names and len({place.casefold() for place in found.values()}) == len(names)
+
+
+@pytest.mark.parametrize(
+    ("names", "together"),
+    [
+        (["S07_hold20_1", "S07_hold20_2"], "S07_hold20"),
+        (["S07_hold20", "S07_hold25"], "S07_hold"),
+        (["trial1", "trial2"], "trial"),
+        (["trial", "trial"], "trial"),
+        (["anna 9", "anna 10"], "anna"),
+        (["a", "b"], "2 trials"),
+        (["alone_7"], "alone_7"),
+    ],
+)
+def test_the_name_of_trials_keeps_the_condition_and_leaves_the_number_out(names, together):
+    assert name_of_all(names) == together

@@ -277,7 +277,7 @@ REFUSED = {
     "window no pair": (lambda: Recording(GOOD, 100, window=(3,)), "window=(3,): give two times"),
     "window short": (
         lambda: Recording(GOOD, 100).steady((5, 8.8)),
-        "window=(5.0, 8.8): holds 1 of the 2 Welch segments needed; give at least 3.84 s",
+        "recording: window=(5.0, 8.8) holds 1 of the 2 Welch segments needed; give at least 3.84 s",
     ),
     "signal short": (lambda: Recording(GOOD[:200], 100).spectrum(), "one segment needs 256"),
     "fft short": (lambda: Recording(GOOD[:7], 100).fft_spectrum(), "is too short for a spectrum"),

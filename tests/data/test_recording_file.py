@@ -76,6 +76,27 @@ def test_ways_to_name_a_column(column, tmp_path):
     assert load_recording(path, column="torque").quantity == "torque"
 
 
+@pytest.mark.parametrize(
+    "header", ["Time (s),Force (N),EMG_VL (mV),Trigger", "time,emg,Kraft,trigger", "time,a [mV],b [N],c"]
+)
+def test_the_only_column_of_force_is_found(header, tmp_path):
+    """By its unit, else by its name; and said."""
+    n = 500
+    columns = np.stack([np.arange(n) / 100, *np.random.default_rng(1).standard_normal((3, n))], axis=1)
+    at = next(i for i, name in enumerate(header.split(",")) if "N)" in name or "N]" in name or name == "Kraft")
+    path = tmp_path / "trial.csv"
+    np.savetxt(path, columns, delimiter=",", header=header, comments="", fmt="%.9g")
+    found = load_recording(path, units="N")
+    np.testing.assert_allclose(found.samples, columns[:, at], rtol=1e-8)
+    assert any(notice.startswith("column ") and "taken, of " in notice for notice in found.notices)
+
+
+def test_several_columns_of_force_are_not_chosen_between(tmp_path):
+    path = write(tmp_path, "time,Fx (N),Fy (N),Fz (N)\n" + "".join(f"{i / 100},{i},{i},{i}\n" for i in range(500)))
+    with pytest.raises(ValueError, match="holds 3 columns besides the time; choose one"):
+        load_recording(path)
+
+
 def test_reference_is_subtracted(tmp_path):
     path = write(tmp_path, text(TIME, X, X**2, header="time,a,b"))
     np.testing.assert_array_equal(load_recording(path, column="a", reference="b").whole, X - X**2)
@@ -299,7 +320,7 @@ BAD = {
     "constant": (text(X * 0 + 3), {"rate": 100}, "column 0: samples: constant at 3"),
     "all empty": (text(TIME, [""] * 40, header="time,force"), {"column": 1}, "holds no number, only gaps"),
     "long gap": (HOLE, {}, "gaps longer than max_gap=0.2 s at 0.100 s to 0.350 s; cut the recording there"),
-    "unit": (text(X), {"rate": 100, "units": "lb"}, "units='lb': Known: N, mN"),
+    "unit": (text(X), {"rate": 100, "units": "lb"}, "units='lb': unknown. Known: N, mN"),
     "unit in header": (text(X, header="force (kg)"), {"rate": 100}, "unknown unit 'kg'; give `units`"),
     "axis": (POINT, {"axis": "w"}, "axis='w': choose one of x, y, z, principal"),
     "axis left out": (POINT, {"column": "finger"}, "column='finger' is a point of three columns; give axis"),
@@ -449,7 +470,7 @@ def test_command(tmp_path):
         (("--max-gap", "-1"), "--max-gap -1.0: give a time in s"),
         (("--skip-rows", "9999"), "holds no data"),
         (("--time", "clock"), "no time 'clock'"),
-        (("--units", "lb"), "--units 'lb': Known"),
+        (("--units", "lb"), "--units 'lb': unknown. Known"),
         (("--save-target", "held.csv"), "a target is saved as TOML"),
     ],
 )

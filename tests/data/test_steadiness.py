@@ -242,7 +242,23 @@ def test_a_mean_near_zero_has_no_variation():
 def test_trials_of_different_length_are_noticed():
     long, short = jm.Recording(forces(3, 15.0)[0], RATE), jm.Recording(forces(3, 15.0)[1][:900], RATE)
     assert "the trials last 9 s to 15 s" in jm.steadiness([long, short]).notices[-1]
-    assert not jm.steadiness([long, long]).notices
+    assert not jm.steadiness([long, jm.Recording(forces(3, 15.0)[1], RATE)]).notices
+
+
+def test_trials_that_are_no_trials_of_one_condition_are_noticed():
+    first, second = (jm.Recording(x, RATE, name=name) for x, name in zip(forces(3, 15.0), "ab", strict=False))
+    strong = jm.Recording(3 * second.samples, RATE, name="strong")
+    twice = jm.Recording(first.samples, RATE, name="again")
+    notices = jm.steadiness([first, strong]).notices
+    low, high = (f"{np.mean(r.filtered()):.4g} {r.unit}" for r in (first, strong))
+    assert notices[0].startswith(
+        f"the means of the trials reach from {low} (a) to {high} (strong): are they of one condition"
+    )
+    assert "three or more" in notices[1]
+    assert "a and again hold the same numbers" in jm.steadiness([first, twice, second]).notices[0]
+    assert any("a and again hold the same numbers" in notice for notice in jm.data.Trials([first, twice]).target().notices)
+    assert any("are they of one condition" in notice for notice in jm.data.Trials([first, strong]).target().notices)
+    assert not jm.data.Trials([first, second]).target().notices
 
 
 def test_tables_and_files(found, tmp_path):

@@ -151,6 +151,20 @@ def test_a_single_bin_beside_the_run_is_named_with_its_own_sign(x64):
     assert words(-2.0) == said
 
 
+def test_a_run_has_no_bin_that_is_clearly_off_the_other_way(x64):
+    """The figure shows two hills with a dip between them, or one hill with a small one."""
+    frequency, plan = SETTINGS.frequency, planned(TASK, drawn(60, 3), FitOptions())
+    objective = plan.problem.linear()
+
+    def words(between: float) -> str:
+        residuals = np.zeros(len(frequency) + objective.parts[0].data.further)
+        residuals[15:20] = 3.1, 3.0, between, 3.0, 3.0
+        return _misfit(plan.problem, objective, residuals, np.eye(len(residuals)))
+
+    assert f"more power than the model from {frequency[15]:.2g} to {frequency[19]:.2g} Hz" in words(-0.9)
+    assert f"more power than the model from {frequency[15]:.2g} to {frequency[16]:.2g} Hz" in words(-1.9)
+
+
 @pytest.mark.slow
 def test_errors_of_such_a_fit_are_widened_and_its_harmonic_is_not_judged():
     result = missed()

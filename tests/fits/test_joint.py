@@ -425,3 +425,31 @@ def test_priors_and_bounds_by_joint_or_plain_name(x64):
     assert (sd["c_w@a"], sd["c_w@b"]) == (0.5, 0.25)
     assert plan.problem.prior[c.names.index("k_w")] == 0 and plan.settings["prior_sd"]["k_w"] is None
     assert np.isfinite(c.low[c.names.index("c_w@a")]) and not np.isfinite(c.low[c.names.index("c_w@b")])
+
+
+@pytest.mark.slow
+def test_two_targets_climb_together_and_their_aic_is_that_of_both(x64):
+    """Two spectra of one person with a tremor: the base model fails, one with a tremor describes both."""
+    rng, truth = np.random.default_rng(4), jm.on_rung(jm.Isometric(), 2).replace(resonance_amplitude=0.3)
+    power = np.asarray(jm.expected_spectrum(truth).proportional)
+    pair = {name: jm.Target(name, power * rng.gamma(60, 1 / 60, power.size), segments=60) for name in ("first", "second")}
+    found = jm.fit_joint(pair, rungs=2, starts=16, seeds=0, check_seeds=0)
+    numbers = [rung.number for rung in found.ladder]
+    assert numbers == [0, 1, 2] and found.ladder[0].p < 0.01 and found.ladder[2].chosen and found.adequate
+    rung = found.ladder[2]
+    height = sum(float(jm.log_likelihood(part.task, part.target)) for part in found.parts.values())
+    assert rung.aic == pytest.approx(2 * rung.parameters - 2 * height, abs=0.05)
+    assert abs(found["tremor_frequency"].value - float(truth["tremor_frequency"])) < 1.0
+    assert "with tremor instead of the harmonic the AIC falls by" in " ".join(str(found).split())
+    with pytest.raises(ValueError, match="rungs = 2: give at most 3, and no tasks"):
+        jm.fit_joint(pair, rungs=2, tasks={name: jm.Isometric() for name in pair})
+
+
+@pytest.mark.slow
+def test_tasks_of_another_mean_force_are_noticed():
+    """With tasks the mean is no datum: their newtons are those of another muscle."""
+    stated = expected(TRUTH, mean=[60.0, 61.0], unit="N", segments=[12, 12])
+    pair = {"a": stated, "b": stated}
+    found = jm.fit_joint(pair, tasks=dict.fromkeys(pair, TRUTH), starts=4, seeds=0, check_seeds=0, free=("c_w", "noise_K_w"))
+    said = [notice for notice in found.notices if "scale the tasks (jaxmuscle.at_force)" in notice]
+    assert len(said) == 2 and "the recording with 60.5 N" in said[0]

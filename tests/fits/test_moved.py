@@ -1,11 +1,13 @@
 """A fitted dynamic stiffness: what is stored, printed and drawn of it, from Python and from the command line."""
 
 import csv
+import re
 
 import jax
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
+import scipy.stats
 from typer.testing import CliRunner
 
 import jaxmuscle as jm
@@ -92,6 +94,42 @@ def test_its_figure_shows_gain_phase_and_residuals(fitted):
     plt.close(figure)
 
 
+@pytest.mark.slow
+def test_goodness_of_a_response_has_the_law_of_least_squares():
+    """Three numbers that it determines are free: what a replicate's fit leaves is chi² of so many degrees fewer."""
+    free = ("k_z", "c_z", "m_z")
+    fit = jm.fit(TASK, jm.Target("figure", None, stiffness=response()), free=free, starts=8)
+    found = jm.goodness(fit, replicates=499)
+    assert set(found.observed) == set(found.reference) == {"chi2_per_point", "largest_point"}
+    rest = scipy.stats.chi2(2 * F.size - len(free))
+    assert scipy.stats.kstest(2 * F.size * found.reference["chi2_per_point"], rest.cdf).pvalue > 1e-4
+    share = np.mean(found.reference["chi2_per_point"] >= found.observed["chi2_per_point"])
+    assert found.p_values["chi2_per_point"] == pytest.approx(share, abs=1 / 500)
+    # A point off by a Rayleigh number of standard errors; the three numbers take up a tenth of the squares.
+    below = scipy.stats.rayleigh(scale=np.sqrt(1 - len(free) / (2 * F.size))).cdf(
+        np.median(found.reference["largest_point"])
+    )
+    assert 0.3 < below**F.size < 0.7
+    assert "17 points" not in str(found) and "499 dynamic stiffnesses drawn from the fit, each fitted anew" in str(found)
+
+
+@pytest.mark.slow
+def test_goodness_finds_the_point_that_is_off():
+    true = response()
+    value = true.value.copy()
+    value[5] += 8 * true.stderr[5]
+    odd = jm.FrequencyResponse(F, value, true.stderr, name="figure")
+    found = jm.goodness(jm.fit(TASK, jm.Target("figure", None, stiffness=odd), starts=8), replicates=199)
+    assert found.p_values["largest_point"] == 1 / 200
+    words = " ".join(str(found).split())
+    assert re.search(rf"one point stands out: it is off by [5-9]\.\d standard errors at {F[5]:.2f} Hz", words)
+    figure = found.plot()
+    (panel,) = (ax for ax in figure.axes if ax.get_ylabel() == "|Residual| (SE)")
+    (out,) = (line for line in panel.lines if line.get_label().startswith("above it"))
+    assert F[5] in out.get_xdata()
+    plt.close(figure)
+
+
 def moved(folder, seconds=40.0):
     """A file of both channels of the simulated muscle."""
     rng, rate = np.random.default_rng(3), 100
@@ -153,10 +191,13 @@ def test_a_file_of_both_channels_is_fitted_from_the_command_line_alone_and_with_
 @pytest.mark.parametrize(
     ("given", "message"),
     [
-        (["HOLD", "--hold", "HOLD"], "--hold belongs to records of a moved insertion"),
+        (["HOLD", "--hold", "HOLD"], "hold.csv: no displacement was found beside the force"),
         (["vastus-lateralis-26mvc", "--hold", "HOLD"], "--hold belongs to records of a moved insertion"),
-        (["PULL", "--hold", "HOLD", "--rungs", "1"], "with --hold all records get the base model"),
-        (["PULL", "--hold", "HOLD", "--method", "montecarlo"], "with --hold all records get the base model"),
+        (
+            ["PULL", "--hold", "HOLD", "--method", "montecarlo"],
+            "by the formula of the spectrum: leave out --method",
+        ),
+        (["PULL", "--hold", "PULL"], "its column x_m moves by 0.996 mm rms, and in a hold"),
         (["PULL", "--hold", "HOLD", "--window", "1:9,2:9,3:9"], "3 windows for 2 recordings"),
         (["PULL", "--hold", "TORQUE"], "Give the hold in newtons (a torque over the lever arm"),
         (["PULL", "--hold", "HOLD", "--units", "mN"], "--hold hold: is in mN, and a moved record is fitted in N"),

@@ -282,7 +282,7 @@ def test_numbers_that_are_read_in_two_ways_are_said_in_both():
         "coefficient_of_variation": Estimate(0.02013, "1", 0.00078),
     }
     rows = {line.split()[0]: line for line in str(made_result(derived=derived)).splitlines() if "±" in line}
-    assert rows["tremor_share"].endswith("above 4.6 Hz")
+    assert rows["tremor_share"].endswith("> 4.6 Hz")
     assert rows["coefficient_of_variation"].endswith("= 2.01 %")
     assert rows["tremor_frequency"].endswith(" Hz")
     alone = {"tremor_share": Estimate(0.0133, "1", 0.0033)}  # the frequency is not determined

@@ -190,7 +190,7 @@ def test_every_part_of_the_chosen_model_says_what_it_gains_over_the_poorer_one()
         "with activation the AIC falls by 50.0 (chi2 per bin 4.00 instead of 9.00)",
         "with tremor instead of the harmonic the AIC rises by 0.5 (chi2 per bin 4.05 instead of 4.00)",
     )
-    assert f"2 or less says nothing; jaxmuscle compare asks for at least {NEEDED:g}." in said[-1]
+    assert f"2 or less says nothing. jaxmuscle compare asks for at least {NEEDED:g}, and" in said[-1]
     assert "no p-value" in said[-1] and "No model" not in said[-1]
 
 

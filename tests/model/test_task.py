@@ -1,5 +1,9 @@
 """The tasks: which noise and inputs each allows, the inverse problem's output, static equilibria."""
 
+import json
+import subprocess
+import sys
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -229,3 +233,42 @@ def test_displacement_at_constant_force_oscillates_about_the_equilibrium(x64):
     crossings = np.sum(np.diff(np.sign(displacement - expected), axis=1) != 0, axis=1)
     assert np.all(crossings > 8)  # more than one per second: it oscillates
     assert np.all(displacement.std(axis=1) > 1e-5 * expected)
+
+
+WRONG_PARTS = {
+    "jm.Isometric(noise=jm.PinkNoise)": "noise = the class PinkNoise: give an object",
+    "jm.Isometric(noise=0.1)": "noise = 0.1: give an object, as jaxmuscle.PinkNoise",
+    "jm.Isometric(noise='purple')": "noise = 'purple': unknown. Known: white",
+    "jm.Isometric().replace(noise='pink')": "use task.with_parts(noise=...)",
+    "jm.Isometric(harmonic=3.0)": "harmonic = 3.0: give an object, as jaxmuscle.Harmonic",
+    "jm.Isometric(activation=0.06)": "activation = 0.06: give an object, as jaxmuscle.Activation",
+    "jm.Isometric(settings='slow')": "settings = 'slow': give an object, as jaxmuscle.SpectrumSettings.named('slow')",
+    "jm.Isometric(muscle='hill')": "muscle = 'hill': give an object",
+    "jm.Isometric(k_w=1 + 2j)": "k_w = (1+2j): give a number",
+    "jm.PrescribedLength(x_z=np.zeros(9))": "array of shape (9,): give a number or a signal",
+    "jm.Isometric(P_w=lambda t: 5.0)": "an input is a function: give a number or a signal",
+    "jm.Isometric(x_z=jm.model.SmoothStep(0.01))": "Isometric holds the insertion, so this is a number; PrescribedLength",
+    "jm.simulate(jm.Isometric(), 0, seed=[1, 2])": "For several use jaxmuscle.ensemble(task, key, seeds=...)",
+    "jm.expected_spectrum(jm.Isometric(), window=(9.0, 5.0))": "window = (9.0, 5.0): give its start",
+    "jm.expected_spectrum(jm.Isometric(), 'slow')": "as SpectrumSettings.named('slow')",
+    "jax.jit(lambda n: jm.simulate(jm.Isometric(), 0, substeps=n).output)(2)": "substeps is traced by JAX",
+}
+TRIED = """
+import json, sys
+import jax, numpy as np, jaxmuscle as jm
+for expression in json.load(sys.stdin):
+    try:
+        eval(expression)
+        print("nothing was raised")
+    except ValueError as error:
+        print(str(error).replace("\\n", " "))
+"""
+
+
+@pytest.mark.slow
+def test_what_cannot_be_a_part_of_a_task_or_its_call_is_named():
+    """In a process without the type checks of the tests, which would come first."""
+    ran = subprocess.run([sys.executable, "-c", TRIED], input=json.dumps([*WRONG_PARTS]), capture_output=True, text=True,
+                         check=True)  # fmt: skip
+    for (expression, message), said in zip(WRONG_PARTS.items(), ran.stdout.splitlines(), strict=True):
+        assert message in said, expression

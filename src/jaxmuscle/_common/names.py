@@ -46,5 +46,8 @@ def name_of_all(names: Sequence[str]) -> str:
     """What the names of trials have in common, without a number at the end, or how many trials there are."""
     if len(names) == 1:
         return names[0]
-    same = itertools.takewhile(lambda letters: len(set(letters)) == 1, zip(*names, strict=False))
-    return "".join(letters[0] for letters in same).rstrip("_- .0123456789") or f"{len(names)} trials"
+    letters = itertools.takewhile(lambda each: len(set(each)) == 1, zip(*names, strict=False))
+    same = "".join(each[0] for each in letters)
+    if any(name[len(same) :][:1].isdigit() for name in names):  # half of a number is none
+        same = same.rstrip("0123456789")
+    return same.rstrip("_- .") or f"{len(names)} trials"

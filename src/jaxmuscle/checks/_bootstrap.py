@@ -45,8 +45,12 @@ def bootstrap(
     the fit determines: spread of the refits over the stated standard error, bias, and how many of the refits' own 95 %
     intervals (±1.96 errors) hold the value that was simulated.
 
-    **Arguments:** `result`; `replicates`; `key`, a `jax.random` key or a seed number; `progress`, True or a function of
-    (text, share).
+    **Arguments:**
+
+    - `result`: what `fit` returns
+    - `replicates`: how many data sets are made and fitted
+    - `key`: a `jax.random` key or a seed number
+    - `progress`: True or a function of (text, share)
 
     **Returns:** a `Bootstrap`; replicates that could not be simulated or fitted are in `failed`, with the reason.
 

@@ -1,4 +1,4 @@
-"""Is the fit as good as the scatter of the data allows? Chi², runs and the largest residual, by bootstrap with refits."""
+"""Is the fit as good as the scatter of the data allows? Chi², runs and largest residuals, by bootstrap with refits."""
 
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -6,7 +6,7 @@ import equinox as eqx
 import jax
 import numpy as np
 from jax import Array
-from jaxtyping import Float
+from jaxtyping import Complex, Float
 
 from jaxmuscle import plot
 from jaxmuscle._common.cards import Printed, Result
@@ -17,6 +17,7 @@ from jaxmuscle._common.tables import frame
 from jaxmuscle._common.text import folded, probability
 from jaxmuscle._common.types import Key
 from jaxmuscle.data._target import Target
+from jaxmuscle.fits._part import FittedPart
 from jaxmuscle.fits._reopened import reopened
 from jaxmuscle.fits._result import FitResult
 from jaxmuscle.objective._consequences import expand
@@ -39,6 +40,8 @@ ELSEWHERE = 3
 LINE_SHAPE = np.array([0.25, 1.0, 0.25])
 SMALL_P, LARGE_P = 0.05, 0.975
 CHECKS = ("chi2_per_bin", "runs", "largest")
+AT_POINTS = ("chi2_per_point", "largest_point")
+COUNTED = {2: "both", 3: "all three", 5: "all five"}
 
 
 def _check(result: FitResult, judged: Target | None) -> None:
@@ -52,12 +55,18 @@ def _check(result: FitResult, judged: Target | None) -> None:
 
 
 def numbers_of(residuals: Rows) -> dict[str, Float[np.ndarray, " rows"]]:
-    """The three numbers of every row."""
+    """The three numbers of every row of a spectrum's residuals."""
     return {
         "chi2_per_bin": np.sum(residuals**2, axis=1) / (residuals.shape[1] - 1),
         "runs": 1.0 + np.sum(np.diff(np.sign(residuals), axis=1) != 0, axis=1),
         "largest": np.max(np.abs(residuals), axis=1),
     }
+
+
+def numbers_at_points(residuals: Complex[np.ndarray, "rows points"]) -> dict[str, Float[np.ndarray, " rows"]]:
+    """The two numbers of every row of a dynamic stiffness's residuals."""
+    size = np.abs(residuals)
+    return {"chi2_per_point": np.mean(size**2, axis=1) / 2, "largest_point": np.max(size, axis=1)}
 
 
 def p_values(observed: dict[str, np.ndarray], reference: dict[str, np.ndarray]) -> dict[str, float]:
@@ -74,11 +83,13 @@ def p_values(observed: dict[str, np.ndarray], reference: dict[str, np.ndarray]) 
 
 
 class GoodnessPart(Printed, Result, eqx.Module):
-    """How the spectrum of one target lies about the fit, against spectra drawn from the fit that were themselves fitted.
+    """How the data of one target lie about the fit, against data drawn from the fit that were themselves fitted.
 
-    `residual` z_k of every bin [standard deviations of its log power]; `observed` {chi2_per_bin, runs, largest}, each with
-    its `reference` values of the replicates and `p_values`, and "all", the p-value of the smallest of the three;
-    `residuals` of the replicates; `foretold`, whether the spectrum is another than the one fitted; `law` of the bins.
+    `residual` z_k of every bin [standard deviations of its log power]; `stiffness_residual` of every point of a dynamic
+    stiffness, complex [standard errors]; `observed`, the numbers of `goodness` by name, each with its `reference` values of
+    the replicates and `p_values`, and "all", the p-value of the smallest of them; `residuals` and `stiffness_residuals` of
+    the replicates; `foretold`, whether the spectrum is another than the one fitted; `law` of the bins. A target without
+    spectrum has no bins; one without dynamic stiffness, or a foretold one, no points.
     """
 
     target: Target
@@ -89,12 +100,41 @@ class GoodnessPart(Printed, Result, eqx.Module):
     residuals: Float[np.ndarray, "replicates bins"]
     foretold: bool
     law: str
+    stiffness_residual: Complex[np.ndarray, " points"]
+    stiffness_residuals: Complex[np.ndarray, "replicates points"]
 
     @property
     def sentences(self) -> tuple[str, ...]:
-        """Each check in words, then the three together."""
+        """Each check in words, then all together."""
+        said = (*(self._of_spectrum() if self.residual.size else ()), *(self._of_stiffness() if self._points else ()))
+        return (*said, f"{COUNTED[len(said)]} together: {probability(self.p_values['all'])}")
+
+    @property
+    def _points(self) -> int:
+        return len(self.stiffness_residual)
+
+    def _of_stiffness(self) -> tuple[str, str]:
         p, seen = self.p_values, self.observed
-        thing = "prediction" if self.foretold else "fit"
+        low, high = np.quantile(self.reference["chi2_per_point"], [0.05, 0.95])
+        chi2 = (f"chi2 per point {seen['chi2_per_point']:.2f}, expected {low:.2f} to {high:.2f}, "
+                f"{probability(p['chi2_per_point'])}")  # fmt: skip
+        if p["chi2_per_point"] < SMALL_P:
+            first = f"the dynamic stiffness is further from the fit than expected: {chi2}"
+        elif p["chi2_per_point"] > LARGE_P:
+            first = f"the dynamic stiffness is nearer to the fit than it should be: {chi2}; are its errors too large?"
+        else:
+            first = f"the dynamic stiffness is as near to the fit as expected: {chi2}"
+        measured, size = self.target.stiffness, np.abs(self.stiffness_residual)
+        assert measured is not None  # or it would have no residuals
+        worst = int(np.argmax(size))
+        place = f"{size[worst]:.1f} standard errors at {measured.known.frequency[worst]:.2f} Hz"
+        if p["largest_point"] < SMALL_P:
+            return first, f"one point stands out: it is off by {place}, {probability(p['largest_point'])}"
+        return first, f"no point stands out: the one furthest off is so by {place}, {probability(p['largest_point'])}"
+
+    def _of_spectrum(self) -> tuple[str, str, str]:
+        p, seen = self.p_values, self.observed
+        thing = "prediction" if self.foretold else "fit of the spectrum" if self._points else "fit"
         low, high = np.quantile(self.reference["chi2_per_bin"], [0.05, 0.95])
         said = {name: probability(value) for name, value in p.items()}
         chi2 = f"chi2 per bin {seen['chi2_per_bin']:.2f}, expected {low:.2f} to {high:.2f}, {said['chi2_per_bin']}"
@@ -116,14 +156,14 @@ class GoodnessPart(Printed, Result, eqx.Module):
             third = f"one bin stands out: {place}, {said['largest']}; a line or an artefact that the model does not have"
         else:
             third = f"no bin stands out: the largest residual is {place}, {said['largest']}"
-        return first, second, third, f"all three together: {said['all']}"
+        return first, second, third
 
     def __str__(self) -> str:
-        done = "foretold by fits of" if self.foretold else "each fitted anew,"
-        head = f"{self.target.name}: against {len(self.residuals)} spectra drawn from the fit, {done} {self.law} law"
-        apart = "these checks look at the spectrum alone; the verdict of the fit also looks at the dynamic stiffness"
-        notes = [f"- {apart}"] * (self.target.stiffness is not None and not self.foretold)
-        return folded([head, *(f"- {sentence}" for sentence in self.sentences), *notes])
+        done = "foretold by fits of replicates" if self.foretold else "each fitted anew"
+        count, law = len(next(iter(self.reference.values()))), f", {self.law} law" * bool(self.residual.size)
+        what = " and ".join(["spectra"] * bool(self.residual.size) + ["dynamic stiffnesses"] * bool(self._points))
+        head = f"{self.target.name}: against {count} {what} drawn from the fit, {done}{law}"
+        return folded([head, *(f"- {sentence}" for sentence in self.sentences)])
 
 
 class Goodness(Printed, Result, eqx.Module):
@@ -146,12 +186,14 @@ class Goodness(Printed, Result, eqx.Module):
 
     target = of_only("target", "The target.")
     residual = of_only("residual", "Residual of every bin.")
-    observed = of_only("observed", "The three numbers.")
-    reference = of_only("reference", "The three numbers of the replicates.")
+    observed = of_only("observed", "The numbers of every check.")
+    reference = of_only("reference", "The numbers of the replicates.")
     p_values = of_only("p_values", "p-value of each number and of all.")
     residuals = of_only("residuals", "Residuals of the replicates.")
+    stiffness_residual = of_only("stiffness_residual", "Residual of every point of the dynamic stiffness.")
+    stiffness_residuals = of_only("stiffness_residuals", "The same of the replicates.")
     law = of_only("law", "Law of the bins.")
-    sentences = of_only("sentences", "Each check in words, then the three together.")
+    sentences = of_only("sentences", "Each check in words, then all together.")
 
     @property
     def foretold(self) -> bool:
@@ -189,9 +231,16 @@ def goodness(result: FitResult, target: Target | None = None, *, replicates: int
     that a harmonic finds the highest of many bins, and that neighbouring bins correlate by 0.45. The runs test of Wald and
     Wolfowitz (1940) assumes independent signs; it would find too few runs in every good fit.
 
-    **Arguments:** `result`; `target`, another spectrum of the same bins and settings that the fit is to have foretold (its
-    reference: spectra drawn by its law, against fits of replicates of the fitted one); `replicates`; `key`, a `jax.random`
-    key or a seed number.
+    A target with a dynamic stiffness H(f) adds two numbers, from `r = (H - fitted) / stderr` of every point: chi² per point
+    `Σ |r|² / (2 points)`, and the largest |r|. Its replicates scatter by the stated standard errors about the fitted H.
+
+    **Arguments:**
+
+    - `result`: what `fit` returns
+    - `target`: another spectrum of the same bins and settings that the fit is to have foretold (its reference: spectra drawn
+      by its law, against fits of replicates of the fitted one)
+    - `replicates`: how many data sets are drawn and fitted, at least 19
+    - `key`: a `jax.random` key or a seed number
 
     **Returns:** a `Goodness`. **Raises:** `ValueError` for a target without segments and sigma, other bins, a failed fit,
     a task without linear response, fewer than 19 replicates.
@@ -211,23 +260,40 @@ def goodness(result: FitResult, target: Target | None = None, *, replicates: int
     if np.sum(kept) < 19:
         raise ValueError(f"{result.title}: only {np.sum(kept)} of {replicates} refits are finite: fit again first")
     parts = {}
-    for (name, fitted), drawn_power, expected, share in zip(result.parts.items(), power, refits.expected, refits.share,
-                                                            strict=True):  # fmt: skip
+    for i, (name, fitted) in enumerate(result.parts.items()):
         judged = fitted.target if target is None else target
-        residual = residuals_of(judged.proportional_power[None], fitted.fitted[None], judged, fitted.harmonic_share[None])[0]
-        residuals = residuals_of(drawn_power[kept], expected[kept], judged, share[kept])
-        observed, reference = numbers_of(residual[None]), numbers_of(residuals)
+        residual = residuals_of(judged.proportional_power[None], fitted.fitted[None], judged, fitted.harmonic_share[None])
+        residuals = residuals_of(power[i][kept], refits.expected[i][kept], judged, refits.share[i][kept])
+        off, offs = _at_points(fitted if target is None else None, drawn.stiffness[i], refits.stiffness[i], kept)
+        observed, reference = {}, {}
+        if residual.size:
+            observed, reference = numbers_of(residual), numbers_of(residuals)
+        if off.size:
+            observed, reference = observed | numbers_at_points(off), reference | numbers_at_points(offs)
         law = "gamma" if judged.segments is not None else "Gaussian"
-        parts[name] = GoodnessPart(judged, residual, {n: float(x[0]) for n, x in observed.items()}, reference,
-                                   p_values(observed, reference), residuals, target is not None, law)  # fmt: skip
+        parts[name] = GoodnessPart(judged, residual[0], {n: float(x[0]) for n, x in observed.items()}, reference,
+                                   p_values(observed, reference), residuals, target is not None, law, off[0],
+                                   offs)  # fmt: skip
     observed = {f"{n}@{name}": np.array([x]) for name, part in parts.items() for n, x in part.observed.items()}
     reference = {f"{n}@{name}": x for name, part in parts.items() for n, x in part.reference.items()}
     together = p_values(observed, reference)["all"]
     return Goodness(parts, together, int(np.sum(~kept)), number_of(key))
 
 
+def _at_points(fitted: FittedPart | None, drawn: Any, refitted: Any, kept: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Complex residuals of a dynamic stiffness in standard errors, and those of its replicates; of no points without one."""
+    own = None if fitted is None else fitted.stiffness_residual
+    if own is None:
+        return np.zeros((1, 0), complex), np.zeros((int(np.sum(kept)), 0), complex)
+    value, sd = drawn
+    parts = (value - refitted)[kept]
+    return own[None], (parts[:, 0] + 1j * parts[:, 1]) / sd[kept]
+
+
 def residuals_of(power: Rows, expected: Rows, target: Target, share: Rows) -> Rows:
     """`(ln(p_k / E_k) - bias_k - mean) / sd_k` of every row, the line's share of its bins known."""
+    if not power.size:
+        return power
     law = bin_statistics(target, share)
     z = np.log(power) - np.log(expected) - law.bias
     return (z - z.mean(axis=1, keepdims=True)) / law.sd
@@ -244,12 +310,14 @@ class Drawn(NamedTuple):
 
 
 class Refits(NamedTuple):
-    """Where every drawn set's fit ended; of every part the `expected` proportional power and the `share` of the line."""
+    """Where every drawn set's fit ended; of every part the `expected` proportional power, the `share` of the line, and the
+    `stiffness` at the points of a measured one, real and imaginary part along the second axis."""
 
     theta: Float[np.ndarray, "rows free"]
     cost: Float[np.ndarray, " rows"]
     expected: tuple[Rows, ...]
     share: tuple[Rows, ...]
+    stiffness: tuple[Any, ...]
 
 
 def _drawn(problem: FitProblem, result: FitResult, count: int) -> tuple[Drawn, tuple[Moments, ...]]:
@@ -287,9 +355,9 @@ def refitted(problem: FitProblem, theta: Float[np.ndarray, " free"], drawn: Draw
                           data=jax.tree.map(lambda x: np.repeat(x, each, axis=0), data))  # fmt: skip
     cost = np.where(np.isfinite(first.cost), first.cost, np.inf).reshape(count, each)
     s = first.s.reshape(count, each, -1)[np.arange(count), np.argmin(cost, axis=1)]
-    share = _seen_share(objective, s)[1]
+    share = _seen(objective, s)[1]
     second = least_squares(objective, s, 40, data=_data(problem, objective, drawn, share))
-    return Refits(np.asarray(objective.theta(second.s)), second.cost, *_seen_share(objective, second.s))
+    return Refits(np.asarray(objective.theta(second.s)), second.cost, *_seen(objective, second.s))
 
 
 def _starts(problem: FitProblem, theta: np.ndarray, drawn: Drawn) -> Float[np.ndarray, "rows starts free"]:
@@ -321,8 +389,10 @@ def _data(problem: FitProblem, objective: Residuals, drawn: Drawn, share: tuple[
     return tuple(made)
 
 
-def _seen_share(objective: Residuals, s: np.ndarray) -> tuple[tuple[Rows, ...], tuple[Rows, ...]]:
+def _seen(objective: Residuals, s: np.ndarray) -> tuple[tuple[Rows, ...], tuple[Rows, ...], tuple[Any, ...]]:
+    """Of every part, at every row of coordinates: proportional power, share of the line, dynamic stiffness."""
     moments = expand(objective, np.asarray(objective.theta(s))).moments
     power = [np.asarray(m.power) for m in moments]
     share = tuple(np.clip(np.nan_to_num(np.asarray(m.line) / p), 0.0, 1.0) for m, p in zip(moments, power, strict=True))
-    return tuple(p / p.sum(axis=1, keepdims=True) for p in power), share
+    whole = tuple(p / p.sum(axis=1, keepdims=True) for p in power)
+    return whole, share, tuple(np.asarray(m.stiffness) for m in moments)

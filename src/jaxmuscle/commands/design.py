@@ -63,6 +63,7 @@ def design(
     with reporting(as_json):
         from jaxmuscle._common.environment import keep_compiled_programs
         from jaxmuscle._common.figures import write_figure
+        from jaxmuscle._common.text import folded
 
         keep_compiled_programs()
         writable(output, "motor.csv", "design.json", force=force)
@@ -79,11 +80,21 @@ def design(
         out.print(plain(found), highlight=False, soft_wrap=True)
         out.print(f"Written: {output}/{', '.join(['motor.csv', 'design.json', *figures])}", highlight=False)
         begin, end = found.window
-        out.print(f"Play the motion for {end:g} s and record force and displacement. Then fit both channels, without the "
-                  f"first {begin:g} s: jaxmuscle fit RECORD.csv --task prescribed-length --window {begin:g}:{end:g} "
-                  "--out out/moved. The errors above count what is known now. To reach them, fit with it what you have "
-                  "recorded so far: a moved record as a second file, a hold with --hold FILE. The window above is that of "
-                  f"the new record. Let the others be found: --window {begin:g}:{end:g},auto (one auto for each)",
+        period = found.lengthening.seconds
+        out.print(folded([
+            f"- Play the motion for {end:g} s: motor.csv holds one period of {period:g} s, to be repeated without a gap. It "
+            "begins in the middle of the motion, so let the motor move to its first value slowly. Its largest acceleration "
+            f"is {found.acceleration:.2g} m/s². If the person tires, record several shorter trials instead.",
+            f"- Record force and displacement, and fit both channels without the first {begin:g} s:",
+        ]), highlight=False)  # fmt: skip
+        fit = f"jaxmuscle fit RECORD.csv --task prescribed-length --window {begin:g}:{end:g}"
+        out.print(f"    {fit} --out out/moved", highlight=False, soft_wrap=True)
+        out.print(folded([
+            "- The errors above count what is known now. To reach them, fit with it what you have recorded so far: a moved "
+            "record as a second file, a hold with --hold. The window is that of the new record; let the others be found "
+            "(one auto for each):",
+        ]), highlight=False)  # fmt: skip
+        out.print(f"    jaxmuscle fit RECORD.csv --hold HOLD.csv --window {begin:g}:{end:g},auto --out out/both",
                   highlight=False, soft_wrap=True)  # fmt: skip
 
 

@@ -45,9 +45,10 @@ from .options import (
     formats_of,
     names_in,
 )
-from .recordings import NO_MOTION, read_recordings, read_with_holds, reads_perturbed, unused
+from .recordings import NO_MOTION, read_recordings, read_with_holds, reads_perturbed, require_files, unused
 from .signals import STAYS, interrupted, stays
 
+RUNGS = 3  # richer models that may be tried
 NOTHING = "nothing was written, the fit had no table yet"
 
 
@@ -176,6 +177,7 @@ def fit(
         fixed = fixed_values(fix)
         names = names_in(free)
         read = {"quantity": quantity, "segments": segments, "dataset": dataset, "axis": "linear" if axis is None else axis}
+        require_files(target)
         recorded = [jm.data.is_recording(name) for name in target]
         if any(recorded) and not all(recorded):
             raise ValueError(f"{target[recorded.index(True)]} is a recording, {target[recorded.index(False)]} a spectrum. "
@@ -209,9 +211,9 @@ def fit(
             raise ValueError("--segments and --dataset belong to spectra, and these are recordings: leave them out")
         if hold:
             simulated = {} if increments is None else {"increments": str(increments)}
-            if method != MethodName.linear or rungs:
-                raise ValueError("with --hold all records get the base model, by the formula of the spectrum: leave out "
-                                 "--method and --rungs")  # fmt: skip
+            if method != MethodName.linear:
+                raise ValueError("with --hold all records are fitted by the formula of the spectrum: leave out --method")
+            options |= {"rungs": rungs if rungs is not None else 0 if noise is not None or names else RUNGS}
             if task not in (None, "prescribed-length") or quantity is not None:
                 raise ValueError("with --hold the records are those of a moved insertion, and of the force in a hold: leave "
                                  "out --task and --quantity")  # fmt: skip
@@ -250,10 +252,10 @@ def _fit_alone(seen: Any, model: Any, folder: Path, options: dict[str, Any], for
 
 
 def _fit_with_holds(moved: Any, held: Any, folder: Path, options: dict[str, Any], formats: list[str]) -> bool:
-    """Records of a moved and of a held insertion; there is no table before the end."""
+    """Records of a moved and of a held insertion."""
 
-    def fitted(tell: Any, _: Any) -> Any:
-        return jm.fit_joint({"moved": moved, "held": held.target()}, progress=tell, **options)
+    def fitted(tell: Any, answer: Any) -> Any:
+        return jm.fit_joint({"moved": moved, "held": held.target()}, progress=tell, answer=answer, **options)
 
     return _fit_one(fitted, "the moved and the held record", folder, formats)
 

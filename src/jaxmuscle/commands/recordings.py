@@ -3,6 +3,7 @@
 import functools
 import inspect
 from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import jaxmuscle as jm
@@ -16,6 +17,7 @@ if TYPE_CHECKING:
 
 NO_MOTION = ("--hold belongs to records of a moved insertion, with a column of force and one of displacement: fit a hold "
              "alone as `jaxmuscle fit HOLD`")  # fmt: skip
+STILL = 3e-5  # m rms: less moves no force that one could see
 
 
 def reads_recordings(command: Callable[..., None], options: Mapping[str, tuple[Any, Any]] = READING) -> Callable[..., None]:
@@ -85,8 +87,11 @@ def read_with_holds(
     """Records of a moved insertion and those of the same person with the insertion held, which have the force alone."""
     windows = windows_of(window, len(paths) + len(holds))
     tables = [table_of(path, reading) for path in paths]
-    if not perturbed(reading) and not all(channels(table, reading) for table in tables):
-        raise ValueError(NO_MOTION)
+    for path, table in zip(paths, tables, strict=True):
+        if not perturbed(reading) and not channels(table, reading):
+            raise ValueError(f"{path}: no displacement was found beside the force. Name the columns with --force-column and "
+                             "--displacement. Or are the files swapped? Moved records come first, --hold takes the "
+                             "holds")  # fmt: skip
     moved = read_perturbed(tables, reading, windows[: len(paths)])
     held = jm.Trials([_hold(path, reading, edges) for path, edges in zip(holds, windows[len(paths) :], strict=True)])
     for recording in held:
@@ -102,6 +107,12 @@ def read_with_holds(
 def _hold(path: str, reading: dict[str, Any], edges: Any) -> Any:
     """The force in a file, in the column that it has in the moved records, if there is one."""
     table, named = table_of(path, reading), reading["force_column"]
+    if both := channels(table, reading | {"force_column": None, "displacement": None}):
+        others = {name: value for name, value in reading.items() if name not in ("force_column", "displacement")}
+        size = float(jm.load_recording(table, **others, **both).displacement.samples.std())
+        if size > STILL:
+            raise ValueError(f"--hold {path}: its column {both['displacement']} moves by {1e3 * size:.3g} mm rms, and in a "
+                             "hold the insertion rests. Name this file among the moved records, before --hold")  # fmt: skip
     options = {name: reading[name] for name in READING}
     return read(table, options | {"column": named if named in table.columns else None, "reference": None}, edges)
 
@@ -146,6 +157,16 @@ def table_of(path: "str | Table", reading: dict[str, Any]) -> "Table":
         return jm.data.read_table(path, reading["skip_rows"])
     except ImportError as error:
         raise ValueError(str(error)) from None
+
+
+def require_files(names: Sequence[str]) -> None:
+    """Raise a `ValueError` for a folder, and for what looks like a file and is not there."""
+    for name in names:
+        path = Path(name).expanduser()
+        if path.is_dir() and name not in jm.list_targets():
+            raise ValueError(f"{name}: is a folder; give the files in it, as {path / '*.csv'}")
+        if path.suffix and not path.exists():
+            raise ValueError(f"{name}: no such file")
 
 
 def windows_of(window: str | None, recordings: int) -> list[Any]:

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
 
 REPORT = "report.html"
 WOULD = "What the data would determine if the model held"
+SPELT_OUT = {"carried": "multiplied, to come to the mean force"}  # names of settings that say too little
 STATE = 4  # the column of a fit's card that says whether the data determine a number
 PARAMETERS = ("name", "value", "95 % interval", "unit", "what it is")
 FIGURES = {
@@ -209,11 +210,15 @@ def _after_a_fit(result: "FitResult", path: Path) -> list[str]:
     place, other = shlex.quote(str(path)), shlex.quote(str(path.parent / "compare"))
     if not result.adequate:
         return [
-            "Look at the residuals: orange-red bars are where the model misses the data.",
-            *([f"Try other noises: `jaxmuscle compare {place} --out {other}`."] if single and _has_spectrum(result) else []),
-            "Look for drift and tremor in the recording: `jaxmuscle analyse RECORDING`.",
             "Report that the model does not describe the data, and no number of the model.",
             "Mean, variation, bands and peak need no model: `jaxmuscle steadiness RECORDING`.",
+            "Look at the residuals: orange-red bars are where the model misses the data.",
+            "See whether the recording drifts: `jaxmuscle analyse RECORDING`.",
+            *(
+                [f"Try other noises: `jaxmuscle compare {place} --out {other}`. That takes as long as all fits so far."]
+                if single and _has_spectrum(result)
+                else []
+            ),
         ]
     return [
         f"How sure is each number? `jaxmuscle posterior {place}` draws from the posterior.",
@@ -237,6 +242,6 @@ def _how(settings: dict[str, Any], versions: dict[str, str]) -> list[Html]:
     return [
         pages.heading("To make it again"),
         pages.code(shlex.join(["jaxmuscle", *sys.argv[1:]])),
-        pages.settings_table(settings),
+        pages.settings_table({SPELT_OUT.get(name, name): value for name, value in settings.items()}),
         pages.paragraph("Versions: " + ", ".join(f"{name} {number}" for name, number in versions.items())),
     ]

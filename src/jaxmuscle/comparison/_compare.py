@@ -62,10 +62,16 @@ def compare_noise(
     least 6 and the held-out score says the same (docs/noise-colour.md); a harmonic whose frequency is free has to gain
     6 + 2 ln(bins).
 
-    **Arguments:** `task`, whose own noise keeps its values while the others take their defaults; `target`; `noises`, names
-    of `NOISES` and of richer models; `free`, `fix`, `priors`, `bounds` as in `fit`, those of a parameter that one model has
-    and another has not for those that have it; `groups`; `key`, for an eighth of the starting points; `progress` as in
-    `fit`.
+    **Arguments:**
+
+    - `task`: whose own noise keeps its values while the others take their defaults
+    - `target`: what is fitted, as in `fit`
+    - `noises`: names of `NOISES` and of richer models
+    - `free`, `fix`, `priors`, `bounds`: as in `fit`, those of a parameter that one model has and another has not for those
+      that have it
+    - `groups`
+    - `key`: for an eighth of the starting points
+    - `progress`: as in `fit`
 
     **Returns:** a `Comparison`. A model that the task cannot carry is in its `left_out`, with the reason. With a sigma but
     no segments there is no held-out score.

@@ -114,9 +114,15 @@ class FrequencyResponse(Printed, eqx.Module):
 
             stderr = gain √((1 - γ²) / (2 K γ²))
 
-        **Arguments:** `frequency` [Hz]; `gain` [N/m]; `phase` [deg], positive where the force leads; `coherence` γ²;
-        `segments`, K, one number or one for each frequency; `stderr` [N/m]; `name`, `source`, `notices` as in
-        `FrequencyResponse`.
+        **Arguments:**
+
+        - `frequency` [Hz]
+        - `gain` [N/m]
+        - `phase` [deg]: positive where the force leads
+        - `coherence` γ²
+        - `segments`: K, one number or one for each frequency
+        - `stderr` [N/m]
+        - `name`, `source`, `notices`: as in `FrequencyResponse`
 
         **Raises:** `ValueError` without `stderr` and without (`coherence` and `segments`), and as `FrequencyResponse` does.
 

@@ -47,9 +47,13 @@ def load_frequency_response(
     N/m; `phase` in deg (without unit) or rad; `stderr`, of the gain, in the gain's unit. Phase and gain are those of force
     over *lengthening*: the phase is near 0 at low frequency. `FrequencyResponse.save` writes such a file.
 
-    **Arguments:** `path`; `segments`, the number of independent averages, one or one for each frequency, needed without
-    `stderr`; `lever_arm` [m], which turns torque over angle into force over displacement; `name`, by default that of the
-    file; `source`.
+    **Arguments:**
+
+    - `path`: a CSV file
+    - `segments`: the number of independent averages, one or one for each frequency, needed without `stderr`
+    - `lever_arm` [m]: which turns torque over angle into force over displacement
+    - `name`: by default that of the file
+    - `source`
 
     **Raises:** `ValueError` naming file, line and column, and the remedy.
     """

@@ -65,10 +65,14 @@ def perturbed_target(
     window nor leakage of the input biases Ĥ; where H is the muscle's own, e is its fluctuation alone. Its spectrum, mean and
     coefficient of variation are the target's. S_E is the measured density of e.
 
-    **Arguments:** `recordings` with their windows; `stiffness` H(f) [N/m] of a vector of frequencies, by default the
-    nonparametric one (`PerturbedRecording.frequency_response`); `predicted`, which gives the response of the force [N] to
-    lengthening, its velocity and acceleration (at times so far apart [s], every second of which is asked for), by the
-    nonlinear muscle say, instead of H, which stays where that is not finite; others as in `Recording.target`.
+    **Arguments:**
+
+    - `recordings` with their windows
+    - `stiffness` H(f) [N/m] of a vector of frequencies, by default the nonparametric one
+      (`PerturbedRecording.frequency_response`)
+    - `predicted`: which gives the response of the force [N] to lengthening, its velocity and acceleration (at times so far
+      apart [s], every second of which is asked for), by the nonlinear muscle say, instead of H, which stays where that is
+      not finite; others as in `Recording.target`
     """
     settings = recorded_settings(settings)
     each = [_measured(recording, settings) if stiffness is None else stiffness for recording in recordings]

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from ._recording import Recording
 
 DRIFT = 0.5  # share of the variance
+UNLIKE = 1.1  # ratio of the means of two trials
 FOUND = "steady part found by itself: "
 
 
@@ -56,7 +57,10 @@ def pooled_target(
         unit=unit,
         trial_power=rows if len(rows) > 1 else None,
         settings=settings,
-        notices=_notices(recordings, drifts),
+        notices=(
+            *_notices(recordings, drifts),
+            *(unlike([r.name for r in recordings], signals, unit) if quantity in ("force", "torque") else ()),
+        ),
     )
 
 
@@ -71,6 +75,18 @@ def _notices(recordings: "Sequence[Recording]", more: list[tuple[str, ...]]) -> 
         whose.setdefault(together if joined else notice, []).append(name)
     alone = {together} | {notice for notice, names in whose.items() if len(names) == len(recordings)}
     return tuple(notice if notice in alone else f"{', '.join(names)}: {notice}" for notice, names in whose.items())
+
+
+def unlike(names: Sequence[str], signals: Sequence[np.ndarray], unit: str) -> tuple[str, ...]:
+    """What to say of trials that are the same, or whose means differ by more than a tenth."""
+    said = [f"{names[i]} and {names[k]} hold the same numbers: give each trial once, or the errors come out too small"
+            for k in range(len(signals)) for i in range(k) if np.array_equal(signals[i], signals[k])]  # fmt: skip
+    means = [abs(float(np.mean(x))) for x in signals]
+    low, high = int(np.argmin(means)), int(np.argmax(means))
+    if means[high] > UNLIKE * means[low]:
+        said.append(f"the means of the trials reach from {means[low]:.4g} {unit} ({names[low]}) to {means[high]:.4g} {unit} "
+                    f"({names[high]}): are they of one condition, and did the person tire?")  # fmt: skip
+    return tuple(said)
 
 
 def _drift(x: Float[np.ndarray, " times"]) -> tuple[str, ...]:

@@ -112,8 +112,11 @@ class Recording(Shown, eqx.Module):
                    notices: Iterable[str] = ()) -> "Recording":  # fmt: skip
         """A recording from an array: one signal, or a column of several.
 
-        **Arguments:** `samples`, shape `(times,)` or `(times, columns)`; `rate` [Hz]; `column`, counted from 0; the
-        others as in `Recording`.
+        **Arguments:**
+
+        - `samples`: shape `(times,)` or `(times, columns)`
+        - `rate` [Hz]
+        - `column`: counted from 0; the others as in `Recording`
 
         **Raises:** `ValueError` for a column that is not there, and as `Recording` does.
         """
@@ -130,7 +133,7 @@ class Recording(Shown, eqx.Module):
             raise ValueError(f"window={window!r}: give two times in s, as (8, 25)") from None
         remedy = f"give times with {self.start:g} <= start < stop <= {self.stop:g} s, the recording's own"
         near = 0.5 / self.rate
-        require(self.start - near <= a < b <= self.stop + near, "window", window, remedy)
+        require(self.start - near <= a < b <= self.stop + near, f"{self.name}: window", window, remedy)
         return a, b
 
     def span(self, rate: float | int) -> tuple[int, int]:
@@ -196,7 +199,7 @@ class Recording(Shown, eqx.Module):
 
         **Raises:** `ValueError` if no plateau is found, and if the window is shorter than two Welch segments (3.84 s).
         """
-        notices = self.notices
+        notices, found = self.notices, None
         if window is None:
             even = self.resampled(RECORDED.rate)
             level = self.quantity != "acceleration"
@@ -213,8 +216,10 @@ class Recording(Shown, eqx.Module):
             notices = (*notices, words if whole else f"{FOUND}{window[0]:.2f} s to {window[1]:.2f} s")
         part = self._with(self.whole, self.rate, window, notices)
         held, needed = part.segments(), RECORDED.length + (SEGMENTS - 1) * RECORDED.step
-        remedy = f"holds {held} of the {SEGMENTS} Welch segments needed; give at least {needed / RECORDED.rate:g} s"
-        require(held >= SEGMENTS, "window", part.window, remedy)
+        if held < SEGMENTS:
+            what = f"window={part.window!r}" if found is None else f"its steady part of {part.duration:.3g} s"
+            raise ValueError(f"{self.name}: {what} holds {held} of the {SEGMENTS} Welch segments needed; give at least "
+                             f"{needed / RECORDED.rate:g} s")  # fmt: skip
         return part
 
     def segments(self, settings: SpectrumSettings | str | None = None) -> int:
@@ -301,8 +306,13 @@ class Recording(Shown, eqx.Module):
         what the low-pass lets through, which fixes the scale of the noise; and says so if most of that is a straight
         drift. Several recordings of one condition give one target: `Trials.target`.
 
-        **Arguments:** `name`, or that of the recording; `quantity`, or that of the unit; `provenance`; `mvc` [`unit`], the
-        maximal voluntary contraction, for the level (a recording in % MVC needs none); `settings` as for `spectrum`.
+        **Arguments:**
+
+        - `name`: or that of the recording
+        - `quantity`: or that of the unit
+        - `provenance`
+        - `mvc` [`unit`]: the maximal voluntary contraction, for the level (a recording in % MVC needs none)
+        - `settings`: as for `spectrum`
 
         **Raises:** `ValueError` if the unit (V, a.u.) does not say what was measured, and as `spectrum` does.
         """

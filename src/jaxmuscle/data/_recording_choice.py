@@ -1,6 +1,7 @@
 """From a table to a recording: choose a column or a point, find rate and unit, close short gaps."""
 
 import math
+import re
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -12,14 +13,17 @@ from jaxmuscle._common.text import choices, printable
 from jaxmuscle.spectra._settings import require
 
 from ._recording_quality import filled
-from ._recording_table import AXES, Table, find, listed, points, triple, values
+from ._recording_table import AXES, Table, bare, find, listed, points, triple, values
 from ._recording_time import clock, sampling
-from ._units import UNITS, known_unit
+from ._units import UNITS, known_unit, quantity_of
+
+FORCE = re.compile(r"force|torque|moment|kraft|drehmoment|f_?[xyz]?")  # what a column of force is called
 
 
 class _Choice(NamedTuple):
     name: str
     columns: list[str]
+    told: str = ""  # what to say of it, where it was chosen among several
 
 
 class Reading(NamedTuple):
@@ -45,6 +49,7 @@ def recording_of(make: Callable[..., Any], table: Table, reading: Reading, name:
     if reference is not None:
         signal = signal - values(table, _reference(table, reference, axis, signal.shape))
     found, notices = sampling(table, chosen.columns[0], times, signal.shape[0], rate)
+    notices = [*([chosen.told] if chosen.told else []), *notices]
     unit = _unit(table, chosen, units, axis, notices)
     file = Path(table.file)
     words = [file.name, f"column {chosen.name}" if axis is None else f"point {chosen.name}, axis {axis}"]
@@ -114,6 +119,11 @@ def _chosen(
     others = _others(table, time)
     if reference is not None:
         others = [name for name in others if name != find(table, reference, "reference")]
+    if len(others) > 1:
+        forces = [name for name in others if quantity_of(table.units.get(name, "")) in ("force", "torque")]
+        forces = forces if len(forces) == 1 else [name for name in forces or others if FORCE.fullmatch(bare(name))]
+        if len(forces) == 1:
+            return _Choice(forces[0], forces, f"column {forces[0]} taken, of {listed(others)}")
     if len(others) != 1:
         which = listed(others) or "none"
         raise ValueError(f"{table.file}: holds {len(others)} columns besides the time; choose one with `column`: {which}")

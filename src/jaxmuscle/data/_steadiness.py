@@ -22,6 +22,7 @@ from jaxmuscle.spectra._measures import regularity
 from jaxmuscle.spectra._settings import require
 
 from ._measure import Measure, log_interval, logit_interval, student_interval
+from ._pooled import unlike
 from ._recording import RECORDED, SEGMENTS, Recording
 
 if TYPE_CHECKING:
@@ -217,7 +218,11 @@ def steadiness(recordings: Recording | Iterable[Recording]) -> Steadiness:
     together = {name: _together([m[name] for m in own]) for name in own[0]} | {"peak_frequency": peak}
     said = [f"{name}: {notice}" for name, recording in zip(names, each, strict=True) for notice in recording.notices]
     together = _stated(together, len(each), sum(map(len, segments)))
-    return Steadiness(together, trials, durations, each[0].unit, each[0].quantity, (*said, *_mind(durations, together)))
+    alike = unlike(names, signals, each[0].unit) if each[0].quantity in ("force", "torque") else ()
+    if alike and len(each) < ENOUGH:
+        alike = (*alike, "the errors do not contain how much two trials differ: for that give three or more")
+    notices = (*said, *_mind(durations, together), *alike)
+    return Steadiness(together, trials, durations, each[0].unit, each[0].quantity, notices)
 
 
 def _same_unit(each: list[Recording]) -> None:

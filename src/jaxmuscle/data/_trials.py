@@ -82,9 +82,13 @@ class Trials(Shown, Sequence[Recording]):
         keeps the spectra of several trials. Their scatter gives the dispersion: how much more the trials differ than their
         segments explain (`Target.dispersion`).
 
-        **Arguments:** `name`, or what the trials' names have in common; `quantity`, or that of the unit; `provenance`; `mvc`
-        [`unit`], the maximal voluntary contraction, for the level (recordings in % MVC need none); `settings`, by default
-        those of `Recording.spectrum`.
+        **Arguments:**
+
+        - `name`: or what the trials' names have in common
+        - `quantity`: or that of the unit
+        - `provenance`
+        - `mvc` [`unit`]: the maximal voluntary contraction, for the level (recordings in % MVC need none)
+        - `settings`: by default those of `Recording.spectrum`
 
         **Raises:** `ValueError` if the unit (V, a.u.) does not say what was measured, and as `Recording.spectrum` does.
         """
@@ -125,10 +129,13 @@ def load_recordings(
 
         target = jm.load_recordings(["trial1.csv", "trial2.csv"]).steady().target("anna")
 
-    **Arguments:** `paths`, a list of files, or the path of one file that has a column for each trial (or what
-    `jaxmuscle.data.read_table` read of them); `columns`, which columns of this one file are trials (by default all with
-    numbers but the time); `column`, `rate`, `units`, `axis`, `reference`, `time`, `skip_rows`, `max_gap` as in
-    `load_recording`, the same for all files.
+    **Arguments:**
+
+    - `paths`: a list of files, or the path of one file that has a column for each trial (or what `jaxmuscle.data.read_table`
+      read of them)
+    - `columns`: which columns of this one file are trials (by default all with numbers but the time)
+    - `column`, `rate`, `units`, `axis`, `reference`, `time`, `skip_rows`, `max_gap`: as in `load_recording`, the same for
+      all files
 
     **Returns:** `Trials`, in the order given. **Raises:** `ValueError` as `load_recording` does, and for different units.
     """

@@ -9,13 +9,13 @@ from jaxmuscle.spectra._settings import require
 
 from ._as_target import is_recording
 from ._perturbed import PerturbedRecording
-from ._recording_choice import Reading, perturbed_of, signals
+from ._recording_choice import FORCE, Reading, perturbed_of, signals
 from ._recording_files import read_table
 from ._recording_table import Table, bare, find, listed
 from ._units import quantity_of
 
 CALLED = {
-    "force": re.compile(r"force|torque|moment|kraft|drehmoment|f_?[xyz]?"),
+    "force": FORCE,
     "displacement": re.compile(r"disp(lacement)?|length|position|pos|angle|way|weg|auslenkung|winkel|x_z"),
 }
 MEASURED = {"force": ("force", "torque"), "displacement": ("displacement", "angle")}

@@ -95,9 +95,12 @@ def ensemble(  # pyright: ignore[reportInconsistentOverload]
     Seed i is `simulate(..., seed=i)`, whatever the chunk, the devices or the number of processes. Chunks run on all GPUs of
     this process. Without a GPU they run on all cores of the CPU that the process may use, or on so many as `threads` says.
 
-    **Arguments:** `task`, or a `Sweep`, or tasks that differ in numbers only; `key`, `duration` [s], `dt` [s], `rate` [Hz],
-    `substeps`, `sampling` as in `simulate`; `chunk`, how many seeds (points times seeds) run at once; `progress`, True for
-    a bar or a function of (text, share).
+    **Arguments:**
+
+    - `task`: or a `Sweep`, or tasks that differ in numbers only
+    - `key`, `duration` [s], `dt` [s], `rate` [Hz], `substeps`, `sampling`: as in `simulate`
+    - `chunk`: how many seeds (points times seeds) run at once
+    - `progress`: True for a bar or a function of (text, share)
 
     `control` carries the linearised task along on the same noise paths, as control variate for the mean spectrum; None
     does so wherever it pays: the run covers the analysed window and the task has a stable equilibrium whose transients

@@ -23,7 +23,11 @@ PATIENCE = 10.0
 def join(coordinator: str | None, processes: int | None, process_id: int | None) -> None:
     """Become one of several processes; with None for all arguments as the launcher says (SLURM, Open MPI, ...).
 
-    **Arguments:** `coordinator`, "host:port" of process 0; `processes`, how many; `process_id` of this one, from 0.
+    **Arguments:**
+
+    - `coordinator`: "host:port" of process 0
+    - `processes`: how many
+    - `process_id` of this one, from 0
 
     **Raises:** `ValueError` for arguments that do not go together, or if nobody answers.
     """

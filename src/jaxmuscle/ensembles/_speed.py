@@ -34,7 +34,12 @@ def peak_memory() -> int:
 def measure(task: AbstractTask, seeds: int, duration: float, threads: int | None = None) -> dict[str, Any]:
     """Compile time [s], speed and memory of a reduced ensemble: the first call, then the median of three.
 
-    **Arguments:** `task`; `seeds`; `duration` [s]; `threads`, how many cores of a CPU (None: all).
+    **Arguments:**
+
+    - `task`: what is simulated
+    - `seeds`: how many
+    - `duration` [s]
+    - `threads`: how many cores of a CPU (None: all)
 
     **Returns:** a table of numbers and names.
     """

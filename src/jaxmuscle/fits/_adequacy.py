@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import itertools
 from typing import NamedTuple
 
 import jax
@@ -245,13 +246,22 @@ def _drawn(objective: Residuals, scatter: np.ndarray, generator: np.random.Gener
     return drawn
 
 
+def rows_of(ended: Endpoint) -> list[slice]:
+    """Which residuals are those of each target."""
+    ends = np.cumsum([0, *(_rows_of(part) for part in ended.objective.parts)])
+    return [slice(int(a), int(b)) for a, b in itertools.pairwise(ends)]
+
+
 def _rows_of(part: PartResiduals) -> int:
     bins = len(part.statistics.sd) - (part.residual == "cumulative")
     return bins + part.data.further
 
 
 def _misfit(problem: FitProblem, objective: Residuals, residuals: np.ndarray, covariance: np.ndarray) -> str:
-    """In words, the run of neighbouring bins whose residuals have the largest sum in its standard errors."""
+    """In words, the run of neighbouring bins whose residuals have the largest sum in its standard errors.
+
+    No bin in it is off by more than one standard deviation the other way.
+    """
     if problem.residual == "cumulative":
         return ""
     whose = {part.name: f"{part.name} has" if len(problem.parts) > 1 else "the data have" for part in problem.parts}
@@ -277,6 +287,9 @@ def _misfit(problem: FitProblem, objective: Residuals, residuals: np.ndarray, co
         first, last = np.triu_indices(bins + 1, 1)
         # A run that the fit has taken up has hardly any variance of its own.
         ratio = (size[last] - size[first]) / np.sqrt(np.maximum(variance[first, last], 0.1 * (last - first)))
+        # Where a bin is clearly off the other way, the figure shows no such run.
+        mixed = [np.min(np.sign(x) * residuals[rows][a:b]) < -1.0 for x, a, b in zip(ratio, first, last, strict=True)]
+        ratio[mixed] = 0.0
         i = int(np.argmax(np.abs(ratio)))
         if abs(ratio[i]) > abs(worst[0]):
             low, high = part.target.frequency[first[i]], part.target.frequency[last[i] - 1]

@@ -189,11 +189,16 @@ def fit_cohort(
     on simulated seeds, no profile over the harmonic's frequency; fit a target alone for those. Targets that can share a
     batch are those of the same task, bins and settings.
 
-    **Arguments:** `targets`, one of each person, in any form that `fit` takes (a list is the trials of one); `groups`
-    {target name: group}; `task`, the same kind for all (by default what each measured); `noise`, `fix`, `free`, `residual`,
-    `bounds`, `priors`, `key`, `max_steps`, `coefficient_of_variation` as in `fit`; `starts` for each target; `rung`, the
-    model of all of them (`on_rung`: 0 the base model, 1 with activation, 2 with tremor, 3 with a second resonance), so that
-    their numbers can be compared; `progress`, True or a function of (text, share).
+    **Arguments:**
+
+    - `targets`: one of each person, in any form that `fit` takes (a list is the trials of one)
+    - `groups` {target name: group}
+    - `task`: the same kind for all (by default what each measured)
+    - `noise`, `fix`, `free`, `residual`, `bounds`, `priors`, `key`, `max_steps`, `coefficient_of_variation`: as in `fit`
+    - `starts` for each target
+    - `rung`: the model of all of them (`on_rung`: 0 the base model, 1 with activation, 2 with tremor, 3 with a second
+      resonance), so that their numbers can be compared
+    - `progress`: True or a function of (text, share)
 
     **Returns:** a `CohortResult`. A target that cannot be read, or not be fitted with these options, is
     listed in `failed` with the reason and does not stop the rest.

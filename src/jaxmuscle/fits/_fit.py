@@ -7,16 +7,17 @@ from jaxmuscle._common.environment import fitting
 from jaxmuscle._common.progress import told
 from jaxmuscle._common.types import Key
 from jaxmuscle.data._as_target import as_target
+from jaxmuscle.data._perturbed import PerturbedRecording
 from jaxmuscle.data._target import Target
 from jaxmuscle.model._noise import AbstractNoise
 from jaxmuscle.model._noises import with_noise
-from jaxmuscle.model._rungs import QUIET, RUNGS, is_base
+from jaxmuscle.model._rungs import QUIET, RUNGS, is_base, on_rung
 from jaxmuscle.model._task import AbstractTask, require_task
 from jaxmuscle.model._white_noise import BandLimitedNoise
-from jaxmuscle.objective._arguments import DT, FitOptions, at_mean, planned
+from jaxmuscle.objective._arguments import DT, FitOptions, Plan, at_mean, planned
 
 from ._ladder import Models, options_for
-from ._perturbed import analysed, recordings_of, without_rhythm
+from ._perturbed import ANEW, alike, analysed, recordings_of, seen_with, without_rhythm
 from ._result import FitResult
 from ._search import search
 
@@ -61,24 +62,38 @@ def fit(
     `seeds` noise paths that stay the same throughout (common random numbers), with the linear response as control variate
     where the task has one. The reported spectrum comes from `check_seeds` fresh paths of the nonlinear model.
 
-    **Arguments:** `task` (its values are the prior's centre; `task_for(target)` makes one) and `target`, whose spectrum
-    settings replace the task's: a `Target`, a `Recording`, the recordings of one condition (a list, `Trials`), a
-    `PerturbedRecording` or several, a `FrequencyResponse`, or names and paths of these (with a `PrescribedLength` a file of
-    force and displacement is a perturbed recording, see `jaxmuscle.data.two_channels`); `free`,
-    names to fit (default: `DEFAULT_FREE`, those of them that the task has; where a motor moves the insertion m_w, m_z, too);
-    `fix`, values to set, which are then not free; `noise`, a name or an object; `residual`, "log", "linear" or
-    "cumulative"; `starts` (100, or 8 for a task without linear response); `seeds` (32, or 48 then; 0: no nonlinear
-    correction); `key`, a `jax.random` key or a seed number; `bounds` {name: (low, high)}; `priors` {name: sd in log, or None
-    for a flat one}; `coefficient_of_variation`, whether the target's, if it states one, is one more residual (it fixes the
-    scale of the noise); `mean_force` (value, sd) [N] as a further residual, by default the target's if it states its mean in
-    newtons: the task is then scaled to it (`at_force`) and P_w is free (False: not used); `max_steps` for each descent;
-    `check_seeds` (64, or 200 then; 0: not simulated); `dt` [s], noise grid of a Monte Carlo fit; `progress`, True or a
-    function of (text, share); `rungs`, how many richer models may be tried where the base model does not describe the data
-    (`on_rung`; 3, or 0 where `noise` or `free` is given); `optimiser`, what makes the steps instead of
-    `optimistix.LevenbergMarquardt`: another of optimistix's Gauss-Newton solvers, `optimistix.Dogleg(1e-9, 1e-9)` say
-    (for others there is `problem`); `increments`, "weak" for the faster random numbers of `ensemble` in all that is
-    simulated here, of which only means over the seeds are taken; `answer`, a function that gets the result as soon as the
-    search ends, before simulated check, profile and p-value.
+    **Arguments:**
+
+    - `task`: the model; its values are the prior's centre. `task_for(target)` makes one
+    - `target`: what is fitted; its spectrum settings replace the task's. A `Target`, a `Recording`, the recordings of one
+      condition (a list, `Trials`), a `PerturbedRecording` or several, a `FrequencyResponse`, or names and paths of these
+      (with a `PrescribedLength` a file of force and displacement is a perturbed recording, see
+      `jaxmuscle.data.two_channels`)
+    - `free`: names to fit (default: `DEFAULT_FREE`, those of them that the task has; where a motor moves the insertion m_w,
+      m_z, too)
+    - `fix`: values to set, which are then not free
+    - `noise`: a name or an object
+    - `residual`: "log", "linear" or "cumulative"
+    - `starts`: from how many points the search starts (100, or 8 for a task without linear response)
+    - `seeds`: noise paths of the nonlinear correction (32, or 48 then; 0: no nonlinear correction)
+    - `key`: a `jax.random` key or a seed number
+    - `bounds` {name: (low, high)}
+    - `priors` {name: sd in log, or None for a flat one}
+    - `coefficient_of_variation`: whether the target's, if it states one, is one more residual (it fixes the scale of the
+      noise)
+    - `mean_force` (value, sd) [N] as a further residual, by default the target's if it states its mean in newtons: the task
+      is then scaled to it (`at_force`) and P_w is free (False: not used)
+    - `max_steps` for each descent
+    - `check_seeds`: fresh noise paths of the reported spectrum (64, or 200 then; 0: not simulated)
+    - `dt` [s]: noise grid of a Monte Carlo fit
+    - `progress`: True or a function of (text, share)
+    - `rungs`: how many richer models may be tried where the base model does not describe the data (`on_rung`; 3, or 0 where
+      `noise` or `free` is given)
+    - `optimiser`: what makes the steps instead of `optimistix.LevenbergMarquardt`: another of optimistix's Gauss-Newton
+      solvers, `optimistix.Dogleg(1e-9, 1e-9)` say (for others there is `problem`)
+    - `increments`: "weak" for the faster random numbers of `ensemble` in all that is simulated here, of which only means
+      over the seeds are taken
+    - `answer`: a function that gets the result as soon as the search ends, before simulated check, profile and p-value
 
     **Returns:** a `FitResult`; a fit that fails is one, too, and says why.
 
@@ -100,13 +115,32 @@ def fit(
             tell("subtracting the response to the movement", 0.01)
             target = analysed(recordings, without_rhythm(task, options), options)
         top = _top(task, target, options, chosen=noise is not None)
-        task, options = at_mean(task, target, options)
-        unknown = len(target.bins) > 0 and target.segments is None and target.sigma is None  # no verdict
-        first = task if target.stiffness is None or unknown else without_rhythm(task, options)
-        lowest = 0 if first is task else QUIET
-        plan = planned(first, target, options_for(first, options))
-        models = Models(task, top, lambda task: planned(task, target, options_for(task, options)), lowest)
-        return search(plan, answer, models if top > lowest else None)
+        plan, models = _models(task, target, options, top, recordings)
+        return search(plan, answer, models if top > models.lowest else None)
+
+
+def _models(
+    task: AbstractTask, target: Target, given: FitOptions, top: int, recordings: tuple[PerturbedRecording, ...]
+) -> tuple[Plan, Models]:
+    """The fit of the first model, and the richer ones that may follow."""
+    base, options = at_mean(task, target, given)
+    unknown = len(target.bins) > 0 and target.segments is None and target.sigma is None  # no verdict
+    first = base if target.stiffness is None or unknown else without_rhythm(base, options)
+
+    def plan_of(task: AbstractTask) -> Plan:
+        return planned(task, target, options_for(task, options))
+
+    def renewed(muscles: tuple[AbstractTask, ...]) -> tuple[Plan, Models] | None:
+        """The response was taken off by a muscle of the base model: where that is not chosen, by the one that is."""
+        given.progress(ANEW, 0.0)
+        again = seen_with(muscles[0], recordings)
+        return None if alike(target, again) else _models(task, again, given, top, recordings)
+
+    lowest = 0 if first is base else QUIET
+    models = Models(
+        top, lambda number: plan_of(on_rung(base, number)), lowest, base, plan_of, renewed if recordings else None
+    )
+    return plan_of(first), models
 
 
 def _top(task: AbstractTask, target: Target, options: FitOptions, *, chosen: bool) -> int:

@@ -12,6 +12,7 @@ from jaxmuscle.data._target import Target
 from jaxmuscle.model._noise import AbstractNoise
 from jaxmuscle.model._noises import with_noise
 from jaxmuscle.model._parameters import proper, proper_values, unknown_parameter
+from jaxmuscle.model._rungs import RUNGS, on_rung
 from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.objective._arguments import (
     MASSES,
@@ -30,11 +31,13 @@ from jaxmuscle.objective._arguments import (
 from jaxmuscle.objective._problem import FitProblem
 from jaxmuscle.response._scaling import at_force, is_scalable, times_force
 
-from ._perturbed import aimed
+from ._ladder import Models
+from ._perturbed import ANEW, aimed, alike, recordings_of, seen_with
 from ._result import FitResult
 from ._search import search
 
 Tasks = dict[str, AbstractTask]
+FAR = 0.1  # of a stated mean force
 
 
 def fit_joint(
@@ -58,6 +61,8 @@ def fit_joint(
     max_steps: int = 40,
     increments: str = "gaussian",
     progress: bool | Callable[[str, float], None] = False,
+    rungs: int = 0,
+    answer: Callable[[FitResult], None] | None = None,
 ) -> FitResult:
     """Fit several spectra of the same person with shared parameters: two force levels, or force and displacement.
 
@@ -69,16 +74,26 @@ def fit_joint(
     have it; one that only one task has belongs to that. The inputs (`P_w`, `F_ext`, `x_z`) are each task's own.
     Not for two spectra of one recording ("standard" and "slow"): its data would count twice; a notice says so.
 
-    **Arguments:** `targets` {name: target, in any form that `fit` takes} (of one: the fit of that); `tasks` {name: task}
-    (`task_for` of each target by default), whose values are the prior's centre and whose spectrum settings the target's
-    replace; `separate`, names of parameters that have a value for each target, then called "c_w@high"; `proportional`, names
-    that keep the ratio which their values have in the tasks (as `at_level` sets them); `free`, names to fit, "P_w@high" for
-    one target's (default as in `fit`); `fix` {name or "name@target": value}; `noise` of all tasks; `starts`; `seeds` of the
-    nonlinear correction (0: none); `check_seeds`, fresh seeds of the nonlinear model for each reported spectrum (0: linear
-    response times the correction); `bounds`, `priors`, `key`, `residual`, `coefficient_of_variation`, `max_steps`,
-    `increments`, `progress` as in `fit`; `mean_force` {target: (value, sd)}, by default what the
-    targets state in newtons, if no `tasks` are given: all tasks are then scaled by one number to the first, with a free
-    P_w each. Where one target is of a moved insertion, the masses are not scaled, and are free in all tasks.
+    **Arguments:**
+
+    - `targets` {name: target, in any form that `fit` takes} (of one: the fit of that)
+    - `tasks` {name: task} (`task_for` of each target by default), whose values are the prior's centre and whose spectrum
+      settings the target's replace
+    - `separate`: names of parameters that have a value for each target, then called "c_w@high"
+    - `proportional`: names that keep the ratio which their values have in the tasks (as `at_level` sets them)
+    - `free`: names to fit, "P_w@high" for one target's (default as in `fit`)
+    - `fix` {name or "name@target": value}
+    - `noise` of all tasks
+    - `starts`: as in `fit`
+    - `seeds` of the nonlinear correction (0: none)
+    - `check_seeds`: fresh seeds of the nonlinear model for each reported spectrum (0: linear response times the correction)
+    - `bounds`, `priors`, `key`, `residual`, `coefficient_of_variation`, `max_steps`, `increments`, `progress`: as in `fit`
+    - `mean_force` {target: (value, sd)}, by default what the targets state in newtons, if no `tasks` are given: all tasks
+      are then scaled by one number to the first, with a free P_w each. Where one target is of a moved insertion, the masses
+      are not scaled, and are free in all tasks
+    - `rungs`: how many richer models may be tried where the base model does not describe the data (`on_rung`; all targets
+      get the same one). Not with `tasks`
+    - `answer`: as in `fit`
 
     **Returns:** a `FitResult` with a part for each target; a fit that fails is one, too, and says why.
 
@@ -88,19 +103,51 @@ def fit_joint(
     options = FitOptions(free=free, fix=fix, residual=residual, starts=starts, seeds=seeds, check_seeds=check_seeds, key=key,
                          bounds=bounds, priors=priors, coefficient_of_variation=coefficient_of_variation,
                          max_steps=max_steps, increments=increments)  # fmt: skip
-    loaded = _loaded(targets)
+    loaded = _loaded(targets, tasks or {})
     for argument, named in (("tasks", tasks or {}), ("mean_force", mean_force or {})):
         for name in named:
             if name not in loaded:
                 raise ValueError(f"{argument}: no target is called {name!r}: {choices(name, loaded)}")
-    models = _models(loaded, tasks or {}, noise, proper_values(fix))
-    carried: tuple[str, ...] = ()
-    if mean_force is None and not tasks and "P_w" not in map(base_of, fix or ()):
-        models, mean_force, factor = _at_means(models, loaded)
-        carried, options = tuple(mean_force), dataclasses.replace(options, carried=factor)
+    if rungs and (tasks or rungs >= len(RUNGS)):
+        raise ValueError(f"rungs = {rungs}: give at most {len(RUNGS) - 1}, and no tasks: they are their own models")
+    moved = {name: found for name, given in targets.items() if (found := recordings_of(given, (tasks or {}).get(name)))}
+
+    def all_models(loaded: dict[str, Target], options: FitOptions) -> tuple[Plan, Models]:
+        """The fit of the base model, and of the richer ones."""
+        base, means, carried = _models(loaded, tasks or {}, noise, proper_values(fix)), mean_force, ()
+        if means is None and not tasks and "P_w" not in map(base_of, fix or ()):
+            base, means, factor = _at_means(base, loaded)
+            carried, options = tuple(means), dataclasses.replace(options, carried=factor)
+
+        def plan_at(rung: int) -> Plan:
+            made = {name: on_rung(task, rung) for name, task in base.items()} if rung else base
+            return planned_jointly(made, loaded, options, separate, proportional, means, carried)
+
+        def renewed(muscles: tuple[AbstractTask, ...]) -> tuple[Plan, Models] | None:
+            options.progress(ANEW, 0.0)
+            fitted = dict(zip(loaded, muscles, strict=True))
+            again = loaded | {name: seen_with(fitted[name], found) for name, found in moved.items()}
+            return None if all(alike(loaded[name], again[name]) for name in moved) else all_models(again, options)
+
+        return plan_at(0), Models(rungs, plan_at, renewed=renewed if moved else None)
+
     with told(progress, f"fitting {', '.join(loaded)}") as tell, fitting():
-        options = dataclasses.replace(options, progress=tell)
-        return search(planned_jointly(models, loaded, options, separate, proportional, mean_force, carried))
+        plan, models = all_models(loaded, dataclasses.replace(options, progress=tell))
+        result = search(plan, answer, models if rungs else None)
+    left_out = () if mean_force is not None or not tasks else _far_from_means(result)
+    return dataclasses.replace(result, notices=(*result.notices, *left_out))
+
+
+def _far_from_means(result: FitResult) -> tuple[str, ...]:
+    """What to say where the tasks that were given have another mean force than the targets state."""
+    found = []
+    for name, part in result.parts.items():
+        stated, own = part.target.mean_force, result.derived.get(f"mean@{name}" if len(result.parts) > 1 else "mean")
+        if stated is not None and own is not None and abs(own.value - stated[0]) > FAR * stated[0]:
+            found.append(f"{name}: the fitted muscle pulls with {own.value:.3g} N, the recording with {stated[0]:.3g} N. "
+                         "With tasks= the mean force is no datum: scale the tasks (jaxmuscle.at_force), and give mean_force="
+                         f"{{{name!r}: (mean, sd)}}. All newtons here are those of another muscle")  # fmt: skip
+    return tuple(found)
 
 
 def planned_jointly(
@@ -145,13 +192,13 @@ def planned_jointly(
     return first._replace(problem=problem, settings=settings)
 
 
-def _loaded(targets: Mapping[str, Any]) -> dict[str, Target]:
+def _loaded(targets: Mapping[str, Any], tasks: Mapping[str, AbstractTask]) -> dict[str, Target]:
     if not targets:
         raise ValueError("targets: none given: name at least one")
     for name in targets:
         if not name or "@" in name:
             raise ValueError(f"targets: a name must not be empty nor contain '@', as {name!r} does")
-    return {name: aimed(t) for name, t in targets.items()}
+    return {name: aimed(t, tasks.get(name)) for name, t in targets.items()}
 
 
 def _models(targets: dict[str, Target], tasks: Mapping[str, AbstractTask], noise: Any, fix: dict[str, float]) -> Tasks:

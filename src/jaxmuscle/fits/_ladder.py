@@ -14,14 +14,14 @@ from jaxmuscle._common.text import probability
 from jaxmuscle.model._noise import NoiseSum
 from jaxmuscle.model._parameters import HARMONIC, default
 from jaxmuscle.model._resonant_noise import ResonantNoise
-from jaxmuscle.model._rungs import QUIET, on_rung, rung_name
+from jaxmuscle.model._rungs import QUIET, rung_name
 from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.objective._arguments import FitOptions, Plan
 from jaxmuscle.objective._covariance import effective_parameters
 from jaxmuscle.objective._likelihood import log_marginal, measured_bins
 from jaxmuscle.objective._starts import continued, starting_points
 
-from ._adequacy import ADEQUATE, Endpoint
+from ._adequacy import ADEQUATE, Endpoint, rows_of
 from ._checks import Stage
 from ._harmonic_evidence import SIGNIFICANT, p_of_line_left_out, p_value
 
@@ -83,7 +83,8 @@ def gains(ladder: tuple[Rung, ...], *, describes: bool | None, datum: str = "bin
     if not said:
         return ()
     meaning = ("the AIC weighs the fit against the number of parameters; the lower, the better. A difference of "
-               f"{ALIKE:g} or less says nothing; jaxmuscle compare asks for at least 6. It is no p-value")  # fmt: skip
+               f"{ALIKE:g} or less says nothing. jaxmuscle compare asks for at least 6, and that the richer model foretells "
+               "left-out bins better. It is no p-value")  # fmt: skip
     if describes is False:
         meaning += (". No model that was tried describes the data: then a lower AIC says that a model misses less, not that "
                     "the muscle has this part")  # fmt: skip
@@ -117,12 +118,18 @@ Descend = Callable[[Plan, np.ndarray, list[Stage]], Any]
 
 
 class Models(NamedTuple):
-    """The models that may be tried: the base model, up to which rung, how a task is fitted, and from which rung on."""
+    """The models that may be tried: up to which rung, how each is fitted, and from which rung on.
 
-    base: AbstractTask
+    `base` and `plan_of`, of one target: the task of the base model, and how another is fitted. `renewed`: of moved records,
+    what the muscles that were fitted make of their targets; None where that says nothing new.
+    """
+
     top: int
-    plan_of: Callable[[AbstractTask], Plan]
+    plan_at: Callable[[int], Plan]
     lowest: int = 0
+    base: AbstractTask | None = None
+    plan_of: Callable[[AbstractTask], Plan] | None = None
+    renewed: "Callable[[tuple[AbstractTask, ...]], tuple[Plan, Models] | None] | None" = None
 
 
 def climb(first: Plan, models: Models, descend: Descend, keep: Callable[[Climbed], None]) -> tuple[Rung, ...]:
@@ -140,7 +147,7 @@ def climb(first: Plan, models: Models, descend: Descend, keep: Callable[[Climbed
         described = best is not None and best.rung.p >= ADEQUATE
         if described and number != due:
             continue
-        plan = models.plan_of(on_rung(models.base, number)) if number > models.lowest else first
+        plan = models.plan_at(number) if number > models.lowest else first
         points = starting_points(plan.problem, plan.starts) if best is None else _warm(plan, best)
         plan = plan._replace(settings=plan.settings | {"starts": len(points)})
         stages: list[Stage] = []
@@ -164,7 +171,9 @@ def climb(first: Plan, models: Models, descend: Descend, keep: Callable[[Climbed
 
 
 def _due(best: Climbed, number: int, models: Models) -> int | None:
-    """Which model is tried after this one, where the best one describes the data."""
+    """Which model is tried after this one, where the best one describes the data; of several targets none."""
+    if models.base is None:
+        return None
     if number == QUIET:
         line = float(models.base.harmonic.amplitude) > 0 and p_of_line_left_out(best.ended) < SIGNIFICANT
         return number + 1 if line else None
@@ -191,9 +200,10 @@ def _has_line(found: Climbed) -> bool:
 
 def _warm(plan: Plan, best: Climbed) -> Float[np.ndarray, "starts free"]:
     """Starts of a richer model: for the most part what it shares with the best one begins where that ended."""
-    before = best.plan.problem
-    (task,) = before.tasks_at(best.ended.seen.theta)
-    known = {name: float(task[name]) for name in before.coordinates.names}
+    before, known = best.plan.problem, dict[str, float]()
+    for part, task in zip(before.parts, before.tasks_at(best.ended.seen.theta), strict=True):
+        for column, name in zip(part.columns, part.coordinates.names, strict=True):
+            known.setdefault(before.coordinates.names[column], float(task[name]))
     return continued(plan.problem, _fewer(plan.starts), known)
 
 
@@ -206,24 +216,25 @@ def rung_of(ended: Endpoint, number: int) -> Rung:
     """The rung that was fitted, of data whose scatter is known."""
     verdict = ended.adequacy
     assert verdict is not None
-    (part,) = ended.problem.parts
     aic, parameters = criterion(ended)
-    points = 0 if part.points is None else 2 * len(part.points)
-    return Rung(number, rung_name(number), aic, parameters, verdict.chi2 / (len(part.target.bins) - 1 + points), verdict.p)
+    numbers = [max(len(part.target.bins) - 1, 0) + (0 if part.points is None else 2 * len(part.points))
+               for part in ended.problem.parts]  # fmt: skip
+    return Rung(number, rung_name(number), aic, parameters, verdict.chi2 / sum(numbers), verdict.p)
 
 
 def criterion(ended: Endpoint) -> tuple[float, float]:
     """AIC of the likelihood where a fit ended, and the effective number of parameters."""
     found, precision = ended.found, np.linalg.pinv(ended.scatter, rcond=1e-9, hermitian=True)
     parameters = effective_parameters(found.jacobian.T @ precision @ found.jacobian, ended.problem.prior)
-    (part,), (moments,) = ended.problem.parts, ended.seen.moments
-    bins = len(part.target.bins)
-    if part.target.segments is None:
-        height = -0.5 * float(found.residuals @ precision @ found.residuals)
-    else:
-        law = as_arrays(measured_bins(part.target))
-        height = float(_height(law, np.asarray(moments.power), np.asarray(moments.line)))
-        height -= 0.5 * float(np.sum(found.residuals[bins:] ** 2))
+    height = 0.0
+    for part, moments, rows in zip(ended.problem.parts, ended.seen.moments, rows_of(ended), strict=True):
+        residuals = found.residuals[rows]
+        if part.target.segments is None:
+            height -= 0.5 * float(residuals @ precision[rows, rows] @ residuals)
+        else:
+            law = as_arrays(measured_bins(part.target))
+            height += float(_height(law, np.asarray(moments.power), np.asarray(moments.line)))
+            height -= 0.5 * float(np.sum(residuals[len(part.target.bins) :] ** 2))
     return 2 * parameters - 2 * height, parameters
 
 
@@ -239,6 +250,7 @@ def line_or_resonance(
 
     It is where a harmonic is significant (`climb` has tried the tremor then), and where a resonance is narrower than a bin.
     """
+    assert models.plan_of is not None  # of one target
     chosen = next(rung for rung in ladder if rung.chosen)
     (part,) = plan.problem.parts
     task, resolution = part.task, part.target.settings.resolution

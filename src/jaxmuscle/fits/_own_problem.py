@@ -181,8 +181,11 @@ def problem(
 
     The model is that of the linear response; `task` is fitted as it is, without the richer models that `fit` may try.
 
-    **Arguments:** `task`; `target`, in any form that `fit` takes but a perturbed recording; `free`, `fix`, `noise`,
-    `residual`, `bounds`, `priors`, `coefficient_of_variation`, `mean_force` as in `fit`.
+    **Arguments:**
+
+    - `task`: the model; its values are the prior's centre. Not traced by JAX
+    - `target`: in any form that `fit` takes but a perturbed recording
+    - `free`, `fix`, `noise`, `residual`, `bounds`, `priors`, `coefficient_of_variation`, `mean_force`: as in `fit`
 
     **Returns:** a `Problem`. **Raises:** `ValueError` as `fit` does.
     """

@@ -21,8 +21,11 @@ from jaxmuscle.objective._least_squares import least_squares
 from jaxmuscle.objective._starts import starting_points
 from jaxmuscle.response._input_response import dynamic_stiffness
 from jaxmuscle.simulation._driven import driven
+from jaxmuscle.spectra._bin_law import bin_statistics
 
 STARTS, STEPS, ROUNDS, KEPT = 16, 20, 2, 2
+NEAR = 0.1
+ANEW = "subtracting the response to the movement by the model found"
 
 
 def aimed(given: Any, task: AbstractTask | None = None, options: FitOptions | None = None) -> Target:
@@ -58,6 +61,21 @@ def seen_with(muscle: AbstractTask, recordings: Sequence[PerturbedRecording]) ->
         return driven(muscle, -motion, interval)
 
     return perturbed_target(recordings, stiffness, predicted=predicted)
+
+
+def alike(one: Target, other: Target) -> bool:
+    """Whether two targets of the same recordings differ by less than a tenth of their scatter, as root mean squares."""
+    apart = []
+    if one.stiffness is not None and other.stiffness is not None:
+        known, again = one.stiffness.known, other.stiffness.known
+        if len(known.frequency) != len(again.frequency):
+            return False
+        apart.append(np.abs(again.value - known.value) / known.stderr / np.sqrt(2))
+    if len(one.bins):
+        level, later = (np.log(t.proportional_power) + np.log(np.mean(np.square(t.coefficient_of_variation or 1.0)))
+                        for t in (one, other))  # fmt: skip
+        apart.append((later - level) / bin_statistics(one).sd)
+    return all(np.sqrt(np.mean(np.square(each))) < NEAR for each in apart)
 
 
 def recordings_of(given: object, task: AbstractTask | None = None) -> tuple[PerturbedRecording, ...]:

@@ -1,5 +1,6 @@
 """The result of a fit as text."""
 
+import re
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
@@ -79,7 +80,7 @@ def text_of(result: "FitResult") -> str:
     lines += _table(title + _per_newton(result, rows), rows, " 95 % interval    " * intervals)
     lines += [f"  {sentence}" for sentence in _by_band(result, bands)]
     fixed = [name for name in result.products if name not in result.parameters]
-    lines += [f"  products and ratios known roughly: {', '.join(map(spelt, fixed))}"] if fixed else []
+    lines += [f"  products and ratios known roughly: {', '.join(map(_as_people_say, fixed))}"] if fixed else []
     loose = {name: p for name, p in every.items() if name not in shown and p.free}
     title = f"not determined: do not interpret these values{_per_newton(result, loose)}"
     lines += _table(title, loose) if loose else []
@@ -157,11 +158,14 @@ def _over(p: Estimate, mean: float) -> Estimate:
 
 def _table(title: str, table: dict[str, Estimate], column: str = "") -> list[str]:
     """Rows of name, value ± error, interval and unit."""
-    wide = max([26, *(2 + len(name) for name in table)])
-    lines = [f"  {title}:"] if not column else [f"  {title + ': ':<{wide + 24}}{column.strip()}"]
+    wide, next_to, beside = max([26, *(2 + len(name) for name in table)]), 20, 20
+    if wide > 26:  # no wider than it must be
+        next_to = 2 + max(len(p.in_words()) for p in table.values())
+        beside = 1 + max(len(p.interval_in_words()) for p in table.values())
+    lines = [f"  {title}:"] if not column else [f"  {title + ': ':<{wide + next_to + 4}}{column.strip()}"]
     for name, p in table.items():
-        interval, unit = f"{p.interval_in_words():<19} " if column else "", _beside(name, table)
-        lines.append(f"    {name:<{wide}}{p.in_words():<20}{interval}{unit}".rstrip())
+        interval, unit = f"{p.interval_in_words():<{beside}}" if column else "", _beside(name, table)
+        lines.append(f"    {name:<{wide}}{p.in_words():<{next_to}}{interval}{unit}".rstrip())
     return lines if table else [*lines, "    nothing"]
 
 
@@ -172,7 +176,7 @@ def _beside(name: str, table: Mapping[str, Estimate]) -> str:
         return f"= {100 * table[name].value:.3g} %"
     rhythm = table.get(f"tremor_frequency{at}{target}")
     if base == "tremor_share" and rhythm is not None:
-        return f"above {0.5 * rhythm.value:.2g} Hz"
+        return f"> {0.5 * rhythm.value:.2g} Hz"
     # A parameter of an own muscle has a unit that only its author knows: it is never divided by a force.
     return {"1": "", "": "in its own unit"}.get(table[name].unit, table[name].unit)
 
@@ -183,9 +187,11 @@ def _by_band(result: "FitResult", table: dict[str, Estimate]) -> list[str]:
     for name, part in result.parts.items():
         at, of = ("", "") if len(result.parts) == 1 else (f"@{name}", f" of {name}")
         shares = in_bands(part.target.frequency, part.target.settings.resolution) @ part.target.proportional_power
-        each = [f"{low:g}-{high:g} Hz {100 * table[band + at].value:.2g} % ({100 * share:.2g} %)"
-                for (band, (low, high)), share in zip(BANDS.items(), shares, strict=True) if band + at in table]  # fmt: skip
-        sentences += [f"power by band{of}, fitted (measured): {', '.join(each)}"] * bool(each)
+        fitted = [f"{100 * table[band + at].value:.2g} %" if band + at in table else "not determined" for band in BANDS]
+        each = [f"{low:g}-{high:g} Hz {own} ({100 * share:.2g} %)"
+                for (low, high), own, share in zip(BANDS.values(), fitted, shares, strict=True)]  # fmt: skip
+        known = any(band + at in table for band in BANDS)
+        sentences += [f"power by band{of}, fitted (measured): {', '.join(each)}; shares of the compared bins"] * known
     return sentences
 
 
@@ -235,6 +241,11 @@ def _stiffness(part: FittedPart) -> list[str]:
     faint = f" ({len(f) - seen} of them smaller than two standard errors, so they tell little)" * (seen < len(f))
     return [f"dynamic stiffness: {len(f)} points from {f[0]:.2g} to {f[-1]:.2g} Hz{faint}, chi2 per point "
             f"{part.chi2_per_point:.2f}"]  # fmt: skip
+
+
+def _as_people_say(product: str) -> str:
+    """A product of parameters by the names of the table above it."""
+    return re.sub(r"\w+", lambda word: in_use(word[0]) or word[0], spelt(product))
 
 
 def in_use(name: str) -> str | None:

@@ -34,6 +34,7 @@ MANY = 64  # starts, of which those that are left behind end sooner; of fewer ev
 RIVAL_MARGIN = 6.0
 POLISHES = 4
 STILL = 2e-3
+RENEWALS = 2  # of the target of a moved record, where a richer model than the base one was chosen
 TOLD = {"trying starts": "searching from all starting points", "linear response": "refining the best",
         "polishing": "correcting by simulation"}  # fmt: skip
 
@@ -80,6 +81,17 @@ def search(plan: Plan, answer: Callable[[FitResult], None] | None = None, models
             known = _descended(plan, starting_points(problem, plan.starts), stages)
         else:
             ladder = climb(plan, models, _descended, keep)
+            for _ in range(RENEWALS):
+                richer = any(rung.chosen and rung.number > 0 for rung in ladder)
+                anew = models.renewed(_reached(plan, stages)) if richer and models.renewed is not None else None
+                if anew is None:
+                    break
+                before = plan, models, known, ladder, list(stages)
+                plan, models = anew
+                ladder = climb(plan, models, _descended, keep)
+                if not any(rung.chosen for rung in ladder):  # no start is finite: what was found before stays
+                    plan, models, known, ladder, stages[:] = before
+                    break
         if known is not None:
             _polished(plan, known, stages)
     except KeyboardInterrupt:
@@ -97,7 +109,7 @@ def search(plan: Plan, answer: Callable[[FitResult], None] | None = None, models
         result = report_fit(plan, stages, ladder, ended=ended)
         if answer is not None and not plan.check_seeds:
             answer(result)
-        if models is not None and result.success:
+        if models is not None and models.plan_of is not None and result.success:
             said = line_or_resonance(plan, result.task, ladder, models, _descended)
             result = dataclasses.replace(result, notices=(*result.notices, *said))
     except KeyboardInterrupt:
@@ -114,9 +126,14 @@ def _checked_later(found: FitResult) -> FitResult:
 
 def _stopped(plan: Plan, stages: list[Stage], *reached: Any, **how: Any) -> FitInterrupted:
     """Where the search stands, and what reports it."""
-    found = stages[-1].minima
-    tasks = plan.problem.tasks_at(np.asarray(plan.problem.coordinates.theta(found.s[found.best])))
+    tasks = _reached(plan, stages)
     return FitInterrupted(tasks, lambda: _unchecked(plan, stages, *reached, **how))
+
+
+def _reached(plan: Plan, stages: list[Stage]) -> tuple[AbstractTask, ...]:
+    """The tasks of the best point so far."""
+    found = stages[-1].minima
+    return plan.problem.tasks_at(np.asarray(plan.problem.coordinates.theta(found.s[found.best])))
 
 
 def _unchecked(

@@ -259,7 +259,9 @@ def proper_values(values: Mapping[str, Any] | None) -> dict[str, Any]:
 def _with_values(task: Any, values: dict[str, Any]) -> Any:
     for name, value in values.items():
         row = PARAMETERS.get(name)
-        if isinstance(value, bool | str | None):
+        if name in {field.name for field in dataclasses.fields(task)} and isinstance(value, str | eqx.Module):
+            raise ValueError(f"{name} = {value!r}: it is a part of the task, not a number; use task.with_parts({name}=...)")
+        if isinstance(value, bool | str | complex | None) or callable(value):
             raise ValueError(f"{name} = {value!r}: give a number")
         if np.ndim(value) > 0:
             raise ValueError(f"{name} has the shape {np.shape(value)}: a parameter is one number. For several tasks use "

@@ -63,8 +63,11 @@ class PinkNoise(AbstractNoise):
     their number, which is the least that keeps the density within 5 % of 1/f in the whole band: four states for the default
     band, within 3.6 % (`deviation`). Continuous, not differentiable.
 
-    **Arguments:** `std` (stationary standard deviation of the whole, see `AbstractNoise`); `f_low`, `f_high` [Hz], plain
-    numbers with 0 < 2 f_low <= f_high, which are no parameters of a fit; `relative`, `shared`.
+    **Arguments:**
+
+    - `std` (stationary standard deviation of the whole, see `AbstractNoise`)
+    - `f_low`, `f_high` [Hz]: plain numbers with 0 < 2 f_low <= f_high, which are no parameters of a fit
+    - `relative`, `shared`: as in `AbstractNoise`
 
     **Raises:** `ValueError` for an impossible band or amplitude.
     """

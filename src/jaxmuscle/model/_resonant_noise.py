@@ -37,8 +37,12 @@ class ResonantNoise(AbstractNoise):
     domain `N' = -2πb N - 2πf0 q + std √(4πb) w`, `q' = 2πf0 N`; N and q have the variance std². As b → 0 it becomes a line
     whose phase and amplitude are random (Rayleigh). Continuous, not differentiable.
 
-    **Arguments:** `std`, the standard deviation: one number is that of the drive, a fraction of P_w; four or five, or a
-    mapping, as in `AbstractNoise`; `frequency` [Hz] > 0, `width` [Hz] > 0; `relative`, `shared`.
+    **Arguments:**
+
+    - `std`: the standard deviation. One number is that of the drive, a fraction of P_w; four or five, or a mapping, as in
+      `AbstractNoise`
+    - `frequency` [Hz] > 0, `width` [Hz] > 0
+    - `relative`, `shared`: as in `AbstractNoise`
     """
 
     amplitude: Scalar = eqx.field(converter=as_amplitude)

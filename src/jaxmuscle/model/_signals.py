@@ -220,17 +220,26 @@ def _row_jvp(order, interval, primals, tangents):
 
 def as_signal(value: AbstractSignal | Scalar) -> AbstractSignal:
     """A signal as it is; a number as a smooth step to that level."""
-    return value if isinstance(value, AbstractSignal) else SmoothStep(_level(value))
+    return value if isinstance(value, AbstractSignal) else SmoothStep(as_level(value))
 
 
 def as_held(value: AbstractSignal | Scalar) -> AbstractSignal:
     """A signal as it is; a number as that level from the start."""
-    return value if isinstance(value, AbstractSignal) else Constant(_level(value))
+    return value if isinstance(value, AbstractSignal) else Constant(as_level(value))
 
 
-def _level(value: Any) -> Any:
+def as_level(value: Any) -> Any:
+    """One number, as it is. Raises `ValueError` for what is none."""
+    if isinstance(value, AbstractSignal):
+        raise ValueError(f"x_z = {value}: Isometric holds the insertion, so this is a number; PrescribedLength moves it")
     if isinstance(value, bool | str | bytes | list | tuple | dict | None):
         raise ValueError(f"an input is {value!r}: give a number or a signal, as jaxmuscle.model.SmoothStep(5.0)")
+    if callable(value):
+        raise ValueError("an input is a function: give a number or a signal. Of its values at some times jaxmuscle.model."
+                         "Sampled.through(times, values) makes a signal")  # fmt: skip
+    if np.ndim(value) > 0:
+        raise ValueError(f"an input is an array of shape {np.shape(value)}: give a number or a signal. Of values at some "
+                         "times jaxmuscle.model.Sampled.through(times, values) makes a signal")  # fmt: skip
     return value
 
 

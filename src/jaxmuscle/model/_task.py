@@ -40,6 +40,25 @@ State = Float[Array, " states"]
 Task = TypeVar("Task", bound="AbstractTask")
 
 
+# What a field must be, and how one is written.
+PARTS = {
+    "muscle": (AbstractMuscle, "jaxmuscle.Muscle()"),
+    "noise": (AbstractNoise, "jaxmuscle.PinkNoise(), or a name, as 'pink'"),
+    "harmonic": (Harmonic, "jaxmuscle.Harmonic(amplitude=0.02, frequency=9.0)"),
+    "activation": (Activation, "jaxmuscle.Activation(time=0.06)"),
+    "settings": (SpectrumSettings, "jaxmuscle.SpectrumSettings.named('slow')"),
+}
+
+
+def proper_part(name: str, value: Any) -> Any:
+    """A field of a task as it is. Raises `ValueError` for what cannot be one, with an example."""
+    kind, example = PARTS[name]
+    if not isinstance(value, kind):
+        what = f"the class {value.__name__}" if isinstance(value, type) else repr(value)
+        raise ValueError(f"{name} = {what}: give an object, as {example}")
+    return value
+
+
 class AbstractTask(Shown, eqx.Module):
     """What is simulated: `y' = vector_field(t, y, u)`, observed as `output(t, y, u, u')`.
 
@@ -55,7 +74,7 @@ class AbstractTask(Shown, eqx.Module):
 
     muscle: AbstractMuscle = eqx.field(default_factory=Muscle, kw_only=True)
     noise: AbstractNoise = eqx.field(
-        default_factory=BandLimitedNoise, kw_only=True, converter=lambda noise: noise.per_channel()
+        default_factory=BandLimitedNoise, kw_only=True, converter=lambda noise: proper_part("noise", noise).per_channel()
     )
     harmonic: Harmonic = eqx.field(default_factory=Harmonic, kw_only=True)
     activation: Activation | None = eqx.field(default=None, kw_only=True)
@@ -220,6 +239,8 @@ def fill(task: AbstractTask, fields: Mapping[str, Any], parameters: Mapping[str,
             value = empty[field.name]()
         if field.name == "noise":
             value = named_noise(value, task.smoothness_needed) if isinstance(value, str) else value
+        if field.name in PARTS and not (field.name == "activation" and value is None):
+            value = proper_part(field.name, value)
         converter = field.metadata.get("converter")
         object.__setattr__(task, field.name, value if converter is None else converter(value))
     if parameters:

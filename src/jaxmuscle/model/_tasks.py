@@ -15,7 +15,7 @@ from ._activation import Activation
 from ._muscle import AbstractMuscle, Perturbation
 from ._noise import AbstractNoise
 from ._parameters import PARAMETERS, default
-from ._signals import AbstractSignal, Harmonic, as_held, as_signal, derivatives
+from ._signals import AbstractSignal, Harmonic, as_held, as_level, as_signal, derivatives
 from ._task import AbstractTask, State, check_smooth, check_smooth_envelope, check_task, fill
 
 Observed = Literal["displacement", "acceleration"]
@@ -168,8 +168,13 @@ class PrescribedLength(AbstractTask):
     x_z counts in the direction of the muscle's pull: where it rises, the muscle shortens. `dynamic_stiffness` is the
     linear response of -F_ext to it.
 
-    **Arguments:** `P_w` [N], a number (a smooth step from zero) or a signal; `x_z` [m], a number (held from the start) or
-    a signal with two continuous derivatives; the common fields.
+    **Arguments:**
+
+    - `P_w` [N]: a number (a smooth step from zero) or a signal, as `jaxmuscle.model.RampHold(5.0)`
+    - `x_z` [m]: a number (held from the start) or a signal with two continuous derivatives; samples over time become one by
+      `jaxmuscle.model.Sampled.through(times, values)`
+    - `muscle`, `noise`, `harmonic`, `activation`, `settings`, `initial`: the fields that all tasks have
+    - any other name: a parameter of the table `jaxmuscle.PARAMETERS`, as `k_w=4e5`
 
     **Raises:** `ValueError` for white noise on K_z or C_z, which F_ext contains directly, and for an x_z that is not smooth.
     """
@@ -228,12 +233,17 @@ class Isometric(PrescribedLength):
 
     `PrescribedLength` with an insertion at rest: output `F_ext = C_z x_w' + K_z (x_w - x_z)`, the negative passive force.
 
-    **Arguments:** `P_w` [N], a number (a smooth step from zero) or a signal; `x_z` [m], a number; the common fields.
+    **Arguments:**
+
+    - `P_w` [N]: a number (a smooth step from zero) or a signal, as `jaxmuscle.model.RampHold(5.0)`
+    - `x_z` [m]: a number
+    - `muscle`, `noise`, `harmonic`, `activation`, `settings`, `initial`: the fields that all tasks have
+    - any other name: a parameter of the table `jaxmuscle.PARAMETERS`, as `k_w=4e5`
 
     **Raises:** `ValueError` for white noise on K_z or C_z, which F_ext contains directly.
     """
 
-    x_z: Scalar = default("x_z")  # pyright: ignore[reportIncompatibleVariableOverride]
+    x_z: Scalar = eqx.field(converter=as_level, default=default("x_z"))  # pyright: ignore[reportIncompatibleVariableOverride]
 
     def __init__(
         self,

@@ -22,8 +22,11 @@ def reproduce(
 
     Writes fig2, fig3, fig4a, fig4b, fig5, fig6a, fig6b, fig7, fig8 as .png and .pdf, claims.json and index.html.
 
-    **Arguments:** `out`, a folder; `recordings`, three of your own (`Recording` or file) instead of the simulated ones of
-    Figures 7 and 8; `progress`, a bar on a terminal. Runs in float64.
+    **Arguments:**
+
+    - `out`: a folder
+    - `recordings`: three of your own (`Recording` or file) instead of the simulated ones of Figures 7 and 8
+    - `progress`: a bar on a terminal
 
     **Raises:** `ValueError` unless there are three recordings of one quantity, and for a file that cannot be read.
     """

@@ -9,10 +9,12 @@ from matplotlib.figure import Figure, SubFigure
 from matplotlib.ticker import MaxNLocator
 
 from ._numbers import in_words
-from ._style import BLUE, COLUMN, GREY, SKY, VERMILLION, canvas, fitted_to, heading, ink, key, shade, styled
+from ._style import BLUE, COLUMN, GREY, SKY, VERMILLION, canvas, fitted_to, heading, ink, key, log_axis, shade, styled
 
-TITLES = {"chi2_per_bin": "χ² per bin", "runs": "Runs of\nequal sign", "largest": "Largest\n|residual| (SD)"}
+TITLES = {"chi2_per_bin": "χ² per bin", "runs": "Runs of\nequal sign", "largest": "Largest\n|residual| (SD)",
+          "chi2_per_point": "χ² per point", "largest_point": "Largest\n|residual| (SE)"}  # fmt: skip
 SMALL_P = 0.05
+COUNTED = {2: "Both", 3: "All three", 5: "All five"}
 HISTOGRAM, BINS = 15, 24  # refits from which on they are drawn as a histogram; its bins
 HEIGHTS = 1.8, 1.7  # inches: residuals, references
 HEIGHT, ACROSS = 1.85, 2  # inches, panels
@@ -21,28 +23,42 @@ REFERENCE = "replicates, each fitted"
 
 @styled
 def goodness(found: Any, ax: Axes | None = None) -> Figure | SubFigure:
-    """Draws residuals with what is usual in each bin, and the three checks with their reference distributions.
+    """Draws residuals with what is usual in each bin, and the checks with their reference distributions.
 
-    Grey is what replicates of the fitted model give, coloured what the target gives: red where less than 5 % of them are as
-    unusual. Letters are legible in a column of 85 mm.
+    Where a dynamic stiffness was fitted, its residuals follow below. Grey is what replicates of the fitted model give,
+    coloured what the target gives: red where less than 5 % of them are as unusual. Letters are legible in a column of 85 mm.
     """
-    count = len(found.parts)
-    fig = canvas(ax, (COLUMN, sum(HEIGHTS) * count))
-    places = fig.subfigures(count, 1, squeeze=False)[:, 0] if count > 1 else [fig]
-    lines = [_goodness(place, part) for place, part in zip(places, found.parts.values(), strict=True)]
-    fitted_to(fig, sum(HEIGHTS) * count + 0.3 * (count - 1), sum(lines))
+    each = [HEIGHTS * ((part.residual.size > 0) + (part.stiffness_residual.size > 0)) for part in found.parts.values()]
+    height = sum(map(sum, each)) + 0.3 * (len(each) - 1)
+    fig = canvas(ax, (COLUMN, height))
+    places = [fig]
+    if len(each) > 1:
+        places = fig.subfigures(len(each), 1, squeeze=False, height_ratios=[sum(rows) for rows in each])[:, 0]
+    lines = [_goodness(*one) for one in zip(places, found.parts.values(), each, strict=True)]
+    fitted_to(fig, height, sum(lines))
     return fig
 
 
-def _goodness(fig: Any, found: Any) -> int:
+def _goodness(fig: Any, found: Any, heights: tuple[float, ...]) -> int:
     """One target; how many lines of words stand about its panels."""
-    grid = fig.add_gridspec(2, 3, height_ratios=HEIGHTS)
-    _residuals(fig.add_subplot(grid[0, :]), found)
-    for column, name in enumerate(TITLES):
-        panel = fig.add_subplot(grid[1, column])
-        _reference(panel, found, name)
-        if not column:
-            panel.set_ylabel("Share of replicates")
+    grid = fig.add_gridspec(len(heights), 6, height_ratios=heights)
+    rows, first = iter(range(len(heights))), None
+    for residuals, names in ((_residuals, ("chi2_per_bin", "runs", "largest")), (_off, ("chi2_per_point", "largest_point"))):
+        if names[0] not in found.observed:
+            continue
+        above = fig.add_subplot(grid[next(rows), :])
+        residuals(above, found)
+        first = first or above
+        row, width = next(rows), 6 // len(names)
+        for column, name in enumerate(names):
+            panel = fig.add_subplot(grid[row, column * width : (column + 1) * width])
+            _reference(panel, found, name)
+            if not column:
+                panel.set_ylabel("Share of replicates")
+    p = found.p_values["all"]
+    assert first is not None  # a target has bins or points
+    first.set_title(f"{COUNTED[len(found.observed)]} checks together: p = {p:.2g}",
+                    color=VERMILLION if p < SMALL_P else ink())  # fmt: skip
     return heading(fig, found.target.name + " (foretold)" * found.foretold) + key(fig)
 
 
@@ -59,8 +75,21 @@ def _residuals(ax: Axes, found: Any) -> None:
     ax.axhline(0, color=ink(), lw=0.6, zorder=4)
     reach = 1.15 * max(float(np.abs(r).max()), float(high.max()), float(-low.min()))
     ax.set(xlim=(edges[0], edges[-1]), ylim=(-reach, reach), xlabel="Frequency (Hz)", ylabel="Residual (SD)")
-    p = found.p_values["all"]
-    ax.set_title(f"All three checks together: p = {p:.2g}", color=VERMILLION if p < SMALL_P else ink())
+
+
+def _off(ax: Axes, found: Any) -> None:
+    """How far every point of the dynamic stiffness lies from the fit, whatever the direction."""
+    f, off = np.asarray(found.target.stiffness.known.frequency), np.abs(found.stiffness_residual)
+    high = np.quantile(np.abs(found.stiffness_residuals), 0.95, axis=0)
+    ax.fill_between(f, 0, high, color=shade(0.1), lw=0, zorder=1, label="95 % of the replicates")
+    out = off > high
+    ax.plot(f[~out], off[~out], "o", ms=3.5, color=BLUE, zorder=3, label="dynamic stiffness from fit")
+    if out.any():
+        said = f"above it ({out.sum()} of {len(f)} points)"
+        ax.plot(f[out], off[out], "o", ms=3.5, color=VERMILLION, zorder=3, label=said)
+    ax.set(xlim=(f[0] / 1.1, 1.1 * f[-1]), ylim=(0, 1.15 * max(float(off.max()), float(high.max()))),
+           xlabel="Frequency (Hz)", ylabel="|Residual| (SE)")  # fmt: skip
+    log_axis(ax)
 
 
 def _reference(ax: Axes, found: Any, name: str) -> None:

@@ -66,8 +66,14 @@ def components(result: Any, ax: Axes | None = None, target: str | None = None, *
     resonance are drawn where the model has them. Those of the two resonances hold all of their power, also that far below
     their peaks; a result's `tremor_share` counts from half the tremor's frequency on.
 
-    **Arguments:** `result`, what `jaxmuscle.fit` returns; `ax`, or a new figure; `target`, which of several; `log`, both
-    axes logarithmic with a line for each part, else areas upon each other. **Returns:** the axes.
+    **Arguments:**
+
+    - `result`: what `jaxmuscle.fit` returns
+    - `ax`: or a new figure
+    - `target`: which of several
+    - `log`: both axes logarithmic with a line for each part, else areas upon each other
+
+    **Returns:** the axes.
 
     **Raises:** `ValueError` for an unknown target, and where the parts are not known (no spectrum, or no linear response).
     """

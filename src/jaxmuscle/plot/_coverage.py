@@ -27,9 +27,14 @@ def coverage(ranks: Mapping[str, Any], draws: int | None = None, ax: Axes | None
 
     These are intervals of each quantity alone. A region of several at once may be wrong although they are right.
 
-    **Arguments:** `ranks` {quantity: ranks 0 to L, one for each simulation}, as simulation-based calibration gives them;
-    `draws`, L; without it `ranks` are the u_i themselves, the posterior's probability [1] below the truth; `ax`, or a new
-    figure, which is legible in a column of 85 mm; `level` [1] of the band. **Returns:** the axes.
+    **Arguments:**
+
+    - `ranks` {quantity: ranks 0 to L, one for each simulation}, as simulation-based calibration gives them
+    - `draws`: L; without it `ranks` are the u_i themselves, the posterior's probability [1] below the truth
+    - `ax`: or a new figure, which is legible in a column of 85 mm
+    - `level` [1] of the band
+
+    **Returns:** the axes.
 
     **Raises:** `ValueError` for no ranks, and for ranks outside their range.
 

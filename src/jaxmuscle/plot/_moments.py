@@ -11,7 +11,13 @@ from ._style import PALETTE, axes_or_new, legend, output_label, styled
 def moments(summary: Any, ax: Axes | None = None, point: int = 0) -> Axes:
     """Draws the mean of a reduced ensemble over time, and the bands between its outer quantiles.
 
-    **Arguments:** `summary`, an `EnsembleSummary`; `ax`, or a new figure; `point` of a sweep. **Returns:** the axes.
+    **Arguments:**
+
+    - `summary`: an `EnsembleSummary`
+    - `ax`: or a new figure
+    - `point` of a sweep
+
+    **Returns:** the axes.
     """
     ax = axes_or_new(ax)
     swept = summary.mean.ndim == 2

@@ -45,8 +45,13 @@ def schematic(task: Any, ax: Axes | None = None, *, values: bool = True) -> Axes
     in the direction of the contraction, F_ext against it. With a result the numbers have their standard errors, and † is
     behind what was fitted and the data do not determine.
 
-    **Arguments:** `task`, a task or what `jaxmuscle.fit` returns; `ax`; `values`, whether numbers are written. **Returns:**
-    the axes (`ax` or new).
+    **Arguments:**
+
+    - `task`: a task or what `jaxmuscle.fit` returns
+    - `ax`
+    - `values`: whether numbers are written
+
+    **Returns:** the axes (`ax` or new).
 
     **Raises:** `ValueError` for a fit of several targets, which has a task for each.
     """

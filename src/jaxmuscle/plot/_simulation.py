@@ -16,8 +16,12 @@ def trajectory(
 ) -> Axes:
     """Draws the output over time; of an ensemble the mean, the band that holds 90 % of the seeds and a few of them.
 
-    **Arguments:** `trajectory`; `ax`, or a new figure; `window` (start, stop) [s], by default all of it; `lines`, the
-    number of single seeds drawn thin.
+    **Arguments:**
+
+    - `trajectory`
+    - `ax`: or a new figure
+    - `window` (start, stop) [s], by default all of it
+    - `lines`: the number of single seeds drawn thin
 
     **Returns:** the axes. **Raises:** `ValueError` for a window outside the simulated time.
     """

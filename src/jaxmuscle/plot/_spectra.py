@@ -13,7 +13,13 @@ from ._style import BLUE, GREY, PALETTE, PROPORTIONAL, axes_or_new, density_unit
 def estimate(estimate: Any, ax: Axes | None = None, *, log: bool = False) -> Axes:
     """Draws the proportional power of a `SpectrumEstimate`, with two standard errors either way, and without control.
 
-    **Arguments:** `estimate`; `ax`, or a new figure; `log`, both axes logarithmic. **Returns:** the axes.
+    **Arguments:**
+
+    - `estimate`
+    - `ax`: or a new figure
+    - `log`: both axes logarithmic
+
+    **Returns:** the axes.
     """
     ax = axes_or_new(ax)
     frequency, whole = np.asarray(estimate.frequency), float(np.sum(estimate.power))
@@ -45,8 +51,13 @@ def spectrum(
     The mean line is p_k = ⟨P_k⟩ / Σ_j ⟨P_j⟩, absolute power averaged before it is normalised; the band runs from the
     5 % to the 95 % quantile of the seeds' own spectra. Seeds that are not finite are left out, and the legend says so.
 
-    **Arguments:** `spectrum`, leading axes being seeds; `ax`, or a new figure; `log`, both axes logarithmic;
-    `proportional`, or else power in `spectrum.unit`²/Hz; `label`, what the legend calls it.
+    **Arguments:**
+
+    - `spectrum`: leading axes being seeds
+    - `ax`: or a new figure
+    - `log`: both axes logarithmic
+    - `proportional`: or else power in `spectrum.unit`²/Hz
+    - `label`: what the legend calls it
 
     **Returns:** the axes.
     """
@@ -73,7 +84,11 @@ def target(target: Any, ax: Axes | None = None, *, log: bool = False) -> Axes:
     sd² = ln(1 + (sigma_k/p_k)²). Without segments and sigma there is no band. Spectra of trials are thin lines, in the same
     unit as their mean.
 
-    **Arguments:** `target`; `ax`, or a new figure; `log`, both axes logarithmic.
+    **Arguments:**
+
+    - `target`: what is drawn
+    - `ax`: or a new figure
+    - `log`: both axes logarithmic
 
     **Returns:** the axes.
     """

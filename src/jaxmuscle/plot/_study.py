@@ -17,8 +17,11 @@ HALF, LONGEST, TITLE = 26, 40, 24  # letters: half a line of the key, a group's 
 def study(study: Any, ax: Axes | None = None, *, proportional: bool = True) -> Figure | SubFigure:
     """Draws the spectrum of every person (thin) and the geometric mean of each group with its standard error (thick).
 
-    **Arguments:** `study`, a `StudyResult`; `ax`, its place, or a new figure; `proportional`, or else power in unit²/Hz,
-    which is known where everybody has at least two trials.
+    **Arguments:**
+
+    - `study`: a `StudyResult`
+    - `ax`: its place, or a new figure
+    - `proportional`: or else power in unit²/Hz, which is known where everybody has at least two trials
 
     **Raises:** `ValueError` for power in unit²/Hz where it is not known, or where people were measured in different units.
     """

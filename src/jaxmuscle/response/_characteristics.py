@@ -78,8 +78,12 @@ def static_characteristics(
 
     the limit at 0, and the tangents by differentiation. F_ext(x) is the output of `Isometric` in equilibrium at x_z = x.
 
-    **Arguments:** `task`; `span` [m], displacements from -span to span (by default twice the largest of the operating
-    point's, at least 0.02 m); `speed` [m/s], the same for velocities; `points`, odd to contain 0.
+    **Arguments:**
+
+    - `task`: whose muscle it is
+    - `span` [m]: displacements from -span to span (by default twice the largest of the operating point's, at least 0.02 m)
+    - `speed` [m/s]: the same for velocities
+    - `points`: odd to contain 0
 
     **Raises:** `ValueError` for a span or speed that is not positive and for fewer than 3 points.
     """

@@ -71,7 +71,11 @@ def _moments(
     require_task(task, call)
     settings = task.settings if settings is None else settings
     if not isinstance(settings, SpectrumSettings):
-        raise ValueError(f"settings: this is a {type(settings).__name__}; give a jaxmuscle.SpectrumSettings")
+        raise ValueError(f"settings: this is a {type(settings).__name__}; give a jaxmuscle.SpectrumSettings, as "
+                         "SpectrumSettings.named('slow')")  # fmt: skip
+    start, stop = window
+    if not 0 <= start < stop:
+        raise ValueError(f"window = {window}: give its start and its end [s], 0 <= start < end")
     concrete = all_concrete(task)
     if concrete:
         check_line(task, settings)

@@ -68,9 +68,12 @@ def at_level(
     not move and force is proportional to L. `at_level(task, reference)` is the task; two steps make one. It means the
     same in every task: P_w is prescribed in `Isometric` and `PrescribedForce`, in `PrescribedMotion` it follows from F_ext.
 
-    **Arguments:** `mvc_fraction`, `reference` and `steadiest` in (0, 1], fractions of the maximum voluntary contraction;
-    `contrast` of g; `resting` in [0, 1), the share of the stiffness at L = 1 that is there without activation; `damping`,
-    1 keeps C/K, 0.5 the damping ratio.
+    **Arguments:**
+
+    - `mvc_fraction`, `reference`, `steadiest`: in (0, 1], fractions of the maximum voluntary contraction
+    - `contrast` of g
+    - `resting` in [0, 1), the share of the stiffness at L = 1 that is there without activation
+    - `damping`: 1 keeps C/K, 0.5 the damping ratio
 
     **Returns:** a task of the same kind. **Raises:** `ValueError` for a fraction outside (0, 1] (30 % is 0.3), for a task
     in which no force is prescribed, for a muscle that is not made of the paper's quadratic laws; `OperatingPointError` (a

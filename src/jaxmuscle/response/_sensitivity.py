@@ -79,7 +79,12 @@ def sensitivity(
 
         jm.sensitivity(jm.Isometric(), ("k_w", "c_w")).plot()
 
-    **Arguments:** `task`; `names` of parameters (all by default); `settings` (the task's by default); `window` [s].
+    **Arguments:**
+
+    - `task`: any with a linear response
+    - `names` of parameters (all by default)
+    - `settings` (the task's by default)
+    - `window` [s]
 
     **Returns:** a `Sensitivity`. **Raises:** as `expected_spectrum`, and `ValueError` for an unknown name.
     """

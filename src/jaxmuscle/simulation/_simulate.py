@@ -49,19 +49,35 @@ def simulate(
         run = jm.simulate(jm.Isometric(k_w=4e5), jax.random.key(0), seed=3)
         run.plot()
 
-    Heun's method at fixed steps in diffrax. Differentiable in both modes with respect to the task's parameters.
+    Heun's method at fixed steps in diffrax. Differentiable in both modes with respect to the task's parameters, of which
+    `output` is a function. `duration`, `dt`, `rate`, `substeps` and `sampling` are static: they decide the shape of the
+    program.
 
-    **Arguments:** `task`; `key`, a `jax.random` key or a seed number, from which seed i takes `fold_in(key, i)`; `seed`;
-    `duration` [s]; `dt` [s], the grid on which noise is drawn, which must divide the sampling interval; `rate` [Hz] of the
-    samples returned, the task's spectrum settings by default; `substeps` per dt (by default as many as stability asks for,
-    a power of two, so that max |eigenvalue| dt / substeps <= 0.5); `sampling`, as in `SpectrumSettings` (the task's by
-    default): "filtered" needs two steps of dt or more per sample, and the first and last 10 samples feel the ends; at a
-    higher rate than that of the settings "instant" takes its place, as the spectrum is then low-passed when it is made.
+    **Arguments:**
 
-    **Returns:** a `Trajectory`. **Raises:** `ValueError` for a grid that does not fit, `SimulationError` if the result is
-    not finite (not under a JAX transformation, where it is returned as it is).
+    - `task`: what is simulated, as `jaxmuscle.Isometric()`
+    - `key`: a `jax.random` key or a seed number, from which seed i takes `fold_in(key, i)`
+    - `seed`: number of the noise path; for several use `ensemble`, or `jax.vmap`
+    - `duration` [s]
+    - `dt` [s]: the grid on which noise is drawn, which must divide the sampling interval
+    - `rate` [Hz] of the samples returned, the task's spectrum settings by default
+    - `substeps` per dt: by default as many as stability asks for, a power of two, so that max |eigenvalue| dt / substeps <=
+      0.5. That number hangs on the parameters. Where JAX traces them (jit, grad, vmap of the task) it cannot be known, and
+      one is taken: a stiff or strongly damped muscle then gives nan. Give the number that `simulate(task, key).substeps` has
+      for the stiffest values that you will try
+    - `sampling`: as in `SpectrumSettings` (the task's by default): "filtered" needs two steps of dt or more per sample, and
+      the first and last 10 samples feel the ends; at a higher rate than that of the settings "instant" takes its place, as
+      the spectrum is then low-passed when it is made
+
+    **Returns:** a `Trajectory`: its `output` at its `time` [s], the `states`.
+
+    **Raises:** `ValueError` for a grid that does not fit, `SimulationError` if the result is not finite (not under a JAX
+    transformation, where it is returned as it is).
     """
     require_task(task, "simulate(task, key)")
+    if np.ndim(seed) > 0:
+        raise ValueError(f"seed = {seed!r}: one simulation has one seed. For several use jaxmuscle.ensemble(task, key, "
+                         "seeds=...), or jax.vmap over seed")  # fmt: skip
     seeds = jnp.asarray([seed_of(seed)], jnp.uint32) if all_concrete(seed) else jnp.atleast_1d(jnp.asarray(seed))
     result = one(trajectories(task, None, key_of(key), seeds, schedule(task, duration, dt, rate, substeps, sampling)))
     require_finite(result)
@@ -120,11 +136,12 @@ def schedule(
     rate = own.rate if rate is None else rate
     if sampling not in get_args(Sampling):
         raise ValueError(f"sampling = {sampling!r} must be one of {', '.join(get_args(Sampling))}")
-    for name, value in (("dt", dt), ("rate", rate), ("duration", duration)):
+    for name, value in (("dt", dt), ("rate", rate), ("duration", duration), ("substeps", substeps)):
         if not is_concrete(value):
             raise ValueError(f"{name} is traced by JAX, and decides how many steps there are: close over it, or make it one "
                              "of the static_argnames of jax.jit")  # fmt: skip
-        positive(name, value)
+        if name != "substeps":
+            positive(name, value)
     if substeps is not None:
         count("substeps", substeps, 1, MAX_SUBSTEPS)
     every = steps_per_sample(rate, dt, sampling)

@@ -85,7 +85,8 @@ class Trajectory(Shown, eqx.Module):
     def _edges(self, window: tuple[float, float], rate: float) -> tuple[int, int]:
         start, stop = round(window[0] * rate), round(window[1] * rate)
         if not 0 <= start < stop <= self.output.shape[-1] * rate / self.rate:
-            raise ValueError(f"window {window} s does not lie in the simulated 0 to {self.time[-1]} s")
+            raise ValueError(f"window {window} s does not lie in the simulated 0 to {float(self.time[-1]):g} s: give "
+                             "another window, or simulate longer")  # fmt: skip
         return start, stop
 
     def filtered(

@@ -69,7 +69,11 @@ def dfa(signal: Real[Array | np.ndarray, "..."], smallest: int = 4, largest: int
 
     White noise has α = 1/2, 1/f noise 1, a random walk 3/2. Below about 10 samples F is steeper than that by itself.
 
-    **Arguments:** `signal` (times,) in any unit; `smallest` window [samples], at least 4; `largest`, by default N/10.
+    **Arguments:**
+
+    - `signal` (times,) in any unit
+    - `smallest` window [samples], at least 4
+    - `largest`: by default N/10
 
     **Raises:** `ValueError` if the signal is constant, not finite, or too short for two sizes of windows.
 

@@ -151,8 +151,11 @@ def normalised(
 
         shares = jm.spectra.normalised(5 + np.sin(np.arange(1000.0)), "maximum")
 
-    **Arguments:** `signal` [unit], force or displacement, time along the last axis; `by`, one of `"mean"`,
-    `"maximum"`, `"mvc"`; `mvc` [unit], for `by="mvc"` only.
+    **Arguments:**
+
+    - `signal` [unit]: force or displacement, time along the last axis
+    - `by`: one of `"mean"`, `"maximum"`, `"mvc"`
+    - `mvc` [unit]: for `by="mvc"` only
 
     **Returns:** the signal without unit, same shape and dtype; not finite where the reference is zero.
 

@@ -207,8 +207,12 @@ def spectrum_of(
 
         spectrum = jm.spectra.spectrum_of(np.sin(np.arange(1500.0)), jm.SpectrumSettings())
 
-    **Arguments:** `signal` [unit], time along the last axis, sampled at `settings.rate`; `settings`; the
-    analysed `window` (start, stop) in s from the start of the signal, or all of it; `unit` of the signal.
+    **Arguments:**
+
+    - `signal` [unit]: time along the last axis, sampled at `settings.rate`
+    - `settings`: how it is estimated
+    - `window` (start, stop) [s] from the start of the signal, or all of it
+    - `unit` of the signal
 
     **Returns:** a `Spectrum` with the leading axes of the signal.
 
@@ -219,7 +223,7 @@ def spectrum_of(
     if window is not None:
         samples = np.shape(signal)[-1]
         start, stop = (round(time * settings.rate) for time in window)
-        remedy = f"give 0 <= start < stop <= {samples / settings.rate:g} s, the duration of the signal"
+        remedy = f"give window=(start, stop), 0 <= start < stop <= {samples / settings.rate:g} s, the duration of the signal"
         require(0 <= start < stop <= samples, "window", window, remedy)
         edges = (start, stop)
     power = filtered_power(signal, settings, edges)

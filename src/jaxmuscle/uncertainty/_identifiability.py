@@ -41,8 +41,11 @@ def identifiability(
     of θ is determined if its singular value, the root of the eigenvalue of F, is at least 3; a quantity with gradient g if
     `gᵀ (F + Λ)⁻¹ g <= 0.1 gᵀ Λ⁻¹ g`, Λ the prior's precision: the data leave at most a tenth of its prior variance.
 
-    **Arguments:** `result` of a fit whose task has a linear response; `target`, instead of the fit's own; `designs` to be
-    tried (default: `standard_designs(result)`).
+    **Arguments:**
+
+    - `result` of a fit whose task has a linear response
+    - `target`: instead of the fit's own
+    - `designs` to be tried (default: `standard_designs(result)`)
 
     **Returns:** an `IdentifiabilityReport`: print it, `plot()` it, `save(path)` it.
 

@@ -69,14 +69,21 @@ def design_input(
     lines. It is then realised as a multisine, periodic in T, with phases that keep the peaks low. Everything reported is
     of this motion.
 
-    **Arguments:** `result` of a fit, or a task, whose usual free parameters are then free with their prior; `quantity`, a
-    free parameter or a derived quantity such as K_w0, K_z0, C_w0, C_z0, K_w_tangent, or several; `rms` [m], `peak` [m] and
-    `speed` [m/s], at most; where the motion would pass `peak` or `speed` it gets smaller or slower; `band` [Hz], from 0.5 Hz
-    on, as drift and slow movements of the person are not in the model; `seconds`, length of the record and period; `rate`
-    [Hz] of the motion; `key` of its phases; `spread`, the share of the mean square that is even over the band (a motion of
-    few lines could be foreseen, and would not test the model); `target`, which one of a fit with several; `durations` [s],
-    lengths of the record for which the errors are told, too, the motion being repeated; `error`, relative, 0.1 say: how long
-    a record takes until every quantity is known to that.
+    **Arguments:**
+
+    - `result` of a fit, or a task, whose usual free parameters are then free with their prior
+    - `quantity`: a free parameter or a derived quantity such as K_w0, K_z0, C_w0, C_z0, K_w_tangent, or several
+    - `rms` [m], `peak` [m], `speed` [m/s]: at most; where the motion would pass `peak` or `speed` it gets smaller or
+      slower
+    - `band` [Hz]: from 0.5 Hz on, as drift and slow movements of the person are not in the model
+    - `seconds`: length of the record and period
+    - `rate` [Hz] of the motion
+    - `key` of its phases
+    - `spread`: the share of the mean square that is even over the band (a motion of few lines could be foreseen, and would
+      not test the model)
+    - `target`: which one of a fit with several
+    - `durations` [s]: lengths of the record for which the errors are told, too, the motion being repeated
+    - `error`: relative, 0.1 say: how long a record takes until every quantity is known to that
 
     **Raises:** `ValueError` for an unknown quantity or one that is fixed, or of which no motion tells; for limits that are
     not positive, a band that holds no line or reaches beyond half the rate, seconds that are no whole number of samples;

@@ -39,8 +39,11 @@ def lines_in(band: tuple[float, float], seconds: float) -> Float[np.ndarray, " l
 class Lengthening(Printed, Result, eqx.Module):
     """A periodic lengthening of the muscle: `x(t) = Σ_k √(2 p_k) cos(2π f_k t + φ_k)`, recorded for one period.
 
-    **Arguments:** `frequency` f_k [Hz] (lines,), multiples of 1 / `seconds`; `power` p_k, the mean square of each line
-    [m²] (lines,); `seconds`, how long it is recorded. `Lengthening.flat(rms, band, seconds)` makes one of equal lines.
+    **Arguments:**
+
+    - `frequency` f_k [Hz] (lines,), multiples of 1 / `seconds`
+    - `power` p_k, the mean square of each line [m²] (lines,)
+    - `seconds`: how long it is recorded. `Lengthening.flat(rms, band, seconds)` makes one of equal lines
     """
 
     frequency: Float[np.ndarray, " lines"]

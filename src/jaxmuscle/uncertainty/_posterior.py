@@ -60,10 +60,17 @@ def posterior(
     is summed over a grid while the chains run, and drawn for every state of theirs afterwards: no mode can be missed by
     chains that do not cross.
 
-    **Arguments:** `result` of `fit` (prior, bounds and free parameters are the fit's unless given) and its `target`;
-    `key`, a `jax.random` key or a seed number; `chains`, `draws` of each (by default 600, and as long as the chains have
-    not mixed up to 3000), `warmup` steps before; `free`, names;
-    `priors` {name: sd, or (centre, sd)}; `bounds` {name: (low, high)}; `progress`, True or a function of (text, share).
+    **Arguments:**
+
+    - `result` of `fit` (prior, bounds and free parameters are the fit's unless given) and its `target`
+    - `key`: a `jax.random` key or a seed number
+    - `chains`: how many
+    - `draws` of each (by default 600, and as long as the chains have not mixed up to 3000)
+    - `warmup` steps before them
+    - `free`: names
+    - `priors` {name: sd, or (centre, sd)}
+    - `bounds` {name: (low, high)}
+    - `progress`: True or a function of (text, share)
 
     **Returns:** a `Posterior`; check `success` or call `summary()`.
 

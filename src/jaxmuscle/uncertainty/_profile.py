@@ -120,8 +120,13 @@ def profile(
     priors do not count: a quantity that the data leave open has an open interval (they still hold everything else within
     three prior standard deviations or so, three times wider than in the fit).
 
-    **Arguments:** `result` of `fit`; `name`; `target` (the result's own); `level` of the interval; `free`, `priors`,
-    `bounds` instead of the fit's.
+    **Arguments:**
+
+    - `result` of `fit`
+    - `name`
+    - `target` (the result's own)
+    - `level` of the interval
+    - `free`, `priors`, `bounds`: instead of the fit's
 
     **Returns:** a `Profile`. **Raises:** `ValueError` for an unknown or fixed name, a target without spread information, a
     level outside (0, 1), and a failed fit.
