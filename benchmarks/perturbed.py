@@ -2,7 +2,7 @@
 
     python benchmarks/perturbed.py PART [--count N]
 
-PART: classical, amplitude, reflex, inertia, active, reference, rhythm, seconds, coverage or time.
+PART: classical, amplitude, reflex, inertia, active, reference, rhythm, richer, seconds, coverage or time.
 
 Takes a minute to a quarter of an hour each.
 """
@@ -20,6 +20,7 @@ from measure import seconds as timed
 from perturbed_muscle import DT, Sines, force, recorded
 
 import jaxmuscle as jm
+from jaxmuscle.fits import _search
 
 TASK = jm.PrescribedLength()
 # The bundled knee extension as fitted, with masses of 0.5 kg
@@ -223,6 +224,36 @@ def rhythm(count: int) -> None:
                 )
 
 
+def richer(count: int) -> None:
+    """A strong muscle with a tremor, moved in two bands or evenly: its response taken off by the base model's muscle, or by
+    the one that is found."""
+    true = {"k_w": 1.61e7, "k_z": 1.61e7, "c_w": 1360.0, "c_z": 168.0, "P_w": 141.0, "noise_K_w": 0.27, "noise_K_z": 0.0013}
+    tremor = {"activation_time": 0.05, "resonance_amplitude": 0.14, "resonance_frequency": 9.6, "resonance_width": 1.6}
+    muscle, rate = jm.on_rung(TASK, 2).replace(**true, **tremor), 100
+    time, rng = np.arange(90 * rate + 1) / rate, np.random.default_rng(13)
+    bands = {"two bands": np.r_[28:36, 170:200], "even": np.r_[30:300]}
+    for words, lines in bands.items():
+        runs = []
+        for seed in range(count):
+            phase = rng.uniform(0, 2 * np.pi, lines.size)
+            length = np.cos(2 * np.pi * np.outer(time, lines / 60) + phase).sum(axis=1)
+            length *= 1e-3 / np.std(length)
+            moved = jm.settled(muscle).with_parts(x_z=jm.model.Sampled.through(time, -length))
+            force = np.asarray(jm.simulate(moved, seed, duration=90.0, rate=float(rate)).output)
+            runs.append(jm.PerturbedRecording.from_array(force, length, rate).steady((30.0, 90.0)))
+        for how, times in (("by the base model", 0), ("by the model found", _search.RENEWALS)):
+            kept, _search.RENEWALS = _search.RENEWALS, times
+            fits = [jm.fit(TASK, run, **(QUICK | {"rungs": 2})) for run in runs]
+            _search.RENEWALS = kept
+            print(f"{words}, subtracted {how}")
+            told(fits, TASK.replace(**{name: true[name] for name in ("k_w", "k_z", "c_w", "c_z")}))
+            held = {n: sum(f[n].interval is not None and f[n].interval[0] < t < f[n].interval[1] for f in fits)
+                    for n, t in truth(muscle).items()}  # fmt: skip
+            print(
+                "  95 % intervals that hold the truth: " + ", ".join(f"{n} {k}/{count}" for n, k in held.items()), flush=True
+            )
+
+
 def seconds(count: int) -> None:
     """Errors over the length of the recording, and over the amplitude."""
     for length, rms in ((30.0, 1e-3), (60.0, 1e-3), (120.0, 1e-3), (60.0, 0.5e-3), (60.0, 2e-3)):
@@ -267,7 +298,7 @@ def time(count: int) -> None:
 
 PARTS: dict[str, Callable[[int], None]] = {
     part.__name__: part
-    for part in (classical, amplitude, reflex, inertia, active, reference, rhythm, seconds, coverage, time)
+    for part in (classical, amplitude, reflex, inertia, active, reference, rhythm, richer, seconds, coverage, time)
 }
 
 

@@ -309,7 +309,7 @@ def test_the_active_force_may_be_free_with_a_prior_in_ratio():
     result = jm.fit(TASK, drawn(12, 1), free=("P_w", "noise_K_w", "noise_K_z", "c_w"), mean_force=(4.0, 0.02), **QUICK)
     assert held and result.derived["mean"].value == pytest.approx(4.0, abs=0.1)
     said = " ".join(str(result).split())
-    assert "held fixed: m_w = 0.5 kg, m_z = 0.5 kg, x_ref_w = 20 mm, x_ref_z = 20 mm. A held force tells no length" in said
+    assert "held fixed: m_w = 0.5 kg, m_z = 0.5 kg, x_ref_w = 20 mm, x_ref_z = 20 mm. They are no measurements" in said
     assert result.parameters["P_w"].value > 8
 
 

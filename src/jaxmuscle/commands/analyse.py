@@ -91,6 +91,7 @@ def analyse(
 def _write(
     trials: "Trials", settings: str, mvc: float | None, folder: Path, formats: list[str], save_target: Path | None
 ) -> None:
+    from rich.box import HEAVY_HEAD, SIMPLE_HEAD
     from rich.table import Table
 
     from jaxmuscle._common.figures import write_figure
@@ -117,9 +118,12 @@ def _write(
     notices = target.notices if target is not None else [notice for recording in trials for notice in recording.notices]
     for notice in dict.fromkeys(notices):
         err.print(f"[yellow]notice:[/] {plain(notice)}", highlight=False)
-    table = Table(title=plain(trials.name if several else trials[0].source), title_justify="left", show_header=several)
-    for heading in ("", *(recording.name for recording in trials)):
-        table.add_column(plain(heading))
+    table = Table(title=plain(trials.name if several else trials[0].source), title_justify="left", show_header=several,
+                  box=SIMPLE_HEAD if several else HEAVY_HEAD, padding=(0, 1))  # fmt: skip
+    table.add_column("", no_wrap=True)
+    for recording in trials:
+        rest = recording.name.removeprefix(trials.name).strip("_- .") or recording.name
+        table.add_column(plain(f"trial {rest}" if rest.isdigit() else rest))
     for row in zip(*(summary.rows() for summary in summaries), strict=True):
         table.add_row(row[0][0], *(plain(value) for _, value in row))
     out.print(table)

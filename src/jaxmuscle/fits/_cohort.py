@@ -18,7 +18,7 @@ from jaxmuscle.data._target import Target
 from jaxmuscle.model._noise import AbstractNoise
 from jaxmuscle.model._noises import with_noise
 from jaxmuscle.model._rungs import on_rung
-from jaxmuscle.model._tasks import AbstractTask
+from jaxmuscle.model._tasks import AbstractTask, PrescribedLength
 from jaxmuscle.objective._arguments import FitOptions, Plan, at_mean, planned, task_for
 from jaxmuscle.spectra._bin_law import trial_samples
 
@@ -205,7 +205,7 @@ def fit_cohort(
 
     **Raises:** `ValueError` for no targets, equal names and a group of an unknown target.
     """
-    loaded, failed = _loaded(targets)
+    loaded, failed = _loaded(targets, on_rung(PrescribedLength(), rung) if rung else None)
     unknown = set(groups or {}) - set(loaded) - set(failed)
     if unknown:
         raise ValueError(f"groups: no target is called {', '.join(sorted(unknown))}; there are {', '.join(loaded)}")
@@ -229,12 +229,14 @@ def fit_cohort(
     return CohortResult(ordered, {name: (groups or {})[name] for name in ordered if name in (groups or {})}, failed)
 
 
-def _loaded(targets: Iterable[Any]) -> tuple[dict[str, Target], dict[str, str]]:
+def _loaded(targets: Iterable[Any], moved: AbstractTask | None) -> tuple[dict[str, Target], dict[str, str]]:
+    """Targets by name, and why others could not be read; `moved`, the model by which a moved record's response is taken
+    off."""
     loaded: dict[str, Target] = {}
     failed: dict[str, str] = {}
     for given in targets:
         try:
-            target = aimed(given)
+            target = aimed(given, moved)
         except (ValueError, OSError) as error:
             failed[str(given)] = str(error)
             continue

@@ -118,8 +118,8 @@ def _held(result: "FitResult") -> list[str]:
     told = {name: f"{name} = {1e3 * float(task[name]):.3g} mm" if name in LENGTHS else f"{name} = {float(task[name]):.3g} kg"
             for name in held}  # fmt: skip
     if not moved:
-        means = ("A held force tells no length and no mass: with half of both x_ref, stiffness, damping and masses would be "
-                 "twice as large, and the fit the same")  # fmt: skip
+        means = ("They are no measurements: a held force tells no length and no mass. Half of both x_ref, with twice the "
+                 "stiffness, damping and masses, would fit as well")  # fmt: skip
         return [f"held fixed: {', '.join(told.values())}. {means}"] if {"m_w", *LENGTHS} <= set(held) else []
     said = []
     if "m_w" in held:
@@ -158,14 +158,15 @@ def _over(p: Estimate, mean: float) -> Estimate:
 
 def _table(title: str, table: dict[str, Estimate], column: str = "") -> list[str]:
     """Rows of name, value ± error, interval and unit."""
-    wide, next_to, beside = max([26, *(2 + len(name) for name in table)]), 20, 20
-    if wide > 26:  # no wider than it must be
-        next_to = 2 + max(len(p.in_words()) for p in table.values())
-        beside = 1 + max(len(p.interval_in_words()) for p in table.values())
-    lines = [f"  {title}:"] if not column else [f"  {title + ': ':<{wide + next_to + 4}}{column.strip()}"]
+    indent, wide, value, beside = 4, max([26, *(2 + len(name) for name in table)]), 20, 20
+    if wide > 26:  # names of one of several targets: no wider than it must be
+        indent, wide = 2, wide - 1
+        value, beside = (1 + max(len(words) for words in each) for each in
+                         zip(*((p.in_words(), p.interval_in_words()) for p in table.values()), strict=True))  # fmt: skip
+    lines = [f"  {title}:"] if not column else [f"  {title + ': ':<{wide + value + indent}}{column.strip()}"]
     for name, p in table.items():
         interval, unit = f"{p.interval_in_words():<{beside}}" if column else "", _beside(name, table)
-        lines.append(f"    {name:<{wide}}{p.in_words():<{next_to}}{interval}{unit}".rstrip())
+        lines.append(f"{'':{indent}}{name:<{wide}}{p.in_words():<{value}}{interval}{unit}".rstrip())
     return lines if table else [*lines, "    nothing"]
 
 
@@ -173,7 +174,7 @@ def _beside(name: str, table: Mapping[str, Estimate]) -> str:
     """What stands behind a number: its unit; a variation in percent, too; from where on a share of the power counts."""
     base, at, target = name.partition("@")
     if base == "coefficient_of_variation":
-        return f"= {100 * table[name].value:.3g} %"
+        return f"{'' if at else '= '}{100 * table[name].value:.3g} %"
     rhythm = table.get(f"tremor_frequency{at}{target}")
     if base == "tremor_share" and rhythm is not None:
         return f"> {0.5 * rhythm.value:.2g} Hz"

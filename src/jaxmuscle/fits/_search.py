@@ -86,12 +86,12 @@ def search(plan: Plan, answer: Callable[[FitResult], None] | None = None, models
                 anew = models.renewed(_reached(plan, stages)) if richer and models.renewed is not None else None
                 if anew is None:
                     break
-                before = plan, models, known, ladder, list(stages)
-                plan, models = anew
-                ladder = climb(plan, models, _descended, keep)
-                if not any(rung.chosen for rung in ladder):  # no start is finite: what was found before stays
-                    plan, models, known, ladder, stages[:] = before
+                better: list[Climbed] = []  # until they have been tried, what was found before stays
+                tried = climb(*anew, _descended, better.append)
+                if not better:
                     break
+                ladder, models = tried, anew[1]
+                keep(better[-1])
         if known is not None:
             _polished(plan, known, stages)
     except KeyboardInterrupt:

@@ -218,12 +218,12 @@ def _row_jvp(order, interval, primals, tangents):
     return _row(order, interval, rows, t), slope
 
 
-def as_signal(value: AbstractSignal | Scalar) -> AbstractSignal:
+def as_signal(value: "AbstractSignal | Scalar") -> AbstractSignal:
     """A signal as it is; a number as a smooth step to that level."""
     return value if isinstance(value, AbstractSignal) else SmoothStep(as_level(value))
 
 
-def as_held(value: AbstractSignal | Scalar) -> AbstractSignal:
+def as_held(value: "AbstractSignal | Scalar") -> AbstractSignal:
     """A signal as it is; a number as that level from the start."""
     return value if isinstance(value, AbstractSignal) else Constant(as_level(value))
 

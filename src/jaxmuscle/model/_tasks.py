@@ -47,16 +47,16 @@ class PrescribedMotion(AbstractTask):
 
     def __init__(
         self,
-        x_z: AbstractSignal | Scalar = PARAMETERS["x_z"].default,
-        F_ext: AbstractSignal | Scalar = 10.0,
+        x_z: "AbstractSignal | Scalar" = PARAMETERS["x_z"].default,
+        F_ext: "AbstractSignal | Scalar" = 10.0,
         *,
         muscle: AbstractMuscle | None = None,
         noise: AbstractNoise | str | None = None,
         harmonic: Harmonic | None = None,
         activation: Activation | None = None,
         settings: SpectrumSettings | None = None,
-        initial: tuple[Scalar, ...] | None = None,
-        **parameters: Scalar,
+        initial: "tuple[Scalar, ...] | None" = None,
+        **parameters: "Scalar",
     ):
         fields = dict(x_z=x_z, F_ext=F_ext, muscle=muscle, noise=noise, harmonic=harmonic, activation=activation,
                       settings=settings, initial=initial)  # fmt: skip
@@ -111,8 +111,8 @@ class PrescribedForce(AbstractTask):
 
     def __init__(
         self,
-        P_w: AbstractSignal | Scalar = PARAMETERS["P_w"].default,
-        F_ext: AbstractSignal | Scalar = PARAMETERS["F_ext"].default,
+        P_w: "AbstractSignal | Scalar" = PARAMETERS["P_w"].default,
+        F_ext: "AbstractSignal | Scalar" = PARAMETERS["F_ext"].default,
         *,
         observe: Observed = "displacement",
         muscle: AbstractMuscle | None = None,
@@ -120,8 +120,8 @@ class PrescribedForce(AbstractTask):
         harmonic: Harmonic | None = None,
         activation: Activation | None = None,
         settings: SpectrumSettings | None = None,
-        initial: tuple[Scalar, ...] | None = None,
-        **parameters: Scalar,
+        initial: "tuple[Scalar, ...] | None" = None,
+        **parameters: "Scalar",
     ):
         fields = dict(P_w=P_w, F_ext=F_ext, observe=observe, muscle=muscle, noise=noise, harmonic=harmonic,
                       activation=activation, settings=settings, initial=initial)  # fmt: skip
@@ -189,16 +189,16 @@ class PrescribedLength(AbstractTask):
 
     def __init__(
         self,
-        P_w: AbstractSignal | Scalar = PARAMETERS["P_w"].default,
-        x_z: AbstractSignal | Scalar = PARAMETERS["x_z"].default,
+        P_w: "AbstractSignal | Scalar" = PARAMETERS["P_w"].default,
+        x_z: "AbstractSignal | Scalar" = PARAMETERS["x_z"].default,
         *,
         muscle: AbstractMuscle | None = None,
         noise: AbstractNoise | str | None = None,
         harmonic: Harmonic | None = None,
         activation: Activation | None = None,
         settings: SpectrumSettings | None = None,
-        initial: tuple[Scalar, ...] | None = None,
-        **parameters: Scalar,
+        initial: "tuple[Scalar, ...] | None" = None,
+        **parameters: "Scalar",
     ):
         fields = dict(P_w=P_w, x_z=x_z, muscle=muscle, noise=noise, harmonic=harmonic, activation=activation,
                       settings=settings, initial=initial)  # fmt: skip
@@ -247,16 +247,16 @@ class Isometric(PrescribedLength):
 
     def __init__(
         self,
-        P_w: AbstractSignal | Scalar = PARAMETERS["P_w"].default,
-        x_z: Scalar = PARAMETERS["x_z"].default,
+        P_w: "AbstractSignal | Scalar" = PARAMETERS["P_w"].default,
+        x_z: "Scalar" = PARAMETERS["x_z"].default,
         *,
         muscle: AbstractMuscle | None = None,
         noise: AbstractNoise | str | None = None,
         harmonic: Harmonic | None = None,
         activation: Activation | None = None,
         settings: SpectrumSettings | None = None,
-        initial: tuple[Scalar, ...] | None = None,
-        **parameters: Scalar,
+        initial: "tuple[Scalar, ...] | None" = None,
+        **parameters: "Scalar",
     ):
         fields = dict(P_w=P_w, x_z=x_z, muscle=muscle, noise=noise, harmonic=harmonic, activation=activation,
                       settings=settings, initial=initial)  # fmt: skip
