@@ -898,11 +898,13 @@ def test_a_designed_motion(tmp_path):
     np.testing.assert_allclose(signal[:, 1], 1e3 * found.displacement, rtol=1e-6, atol=1e-9)
     assert (tmp_path / "out" / "design.png").stat().st_size > 10_000
     said = run("design", preset, *asked, "--out", tmp_path / "out", "--force").stdout
-    assert "fit RECORD.csv --task prescribed-length --window 10:30 --out out/moved. The errors above count" in said
+    assert "    jaxmuscle fit RECORD.csv --task prescribed-length --window 10:30 --out out/moved\n" in said
+    assert "    jaxmuscle fit RECORD.csv --hold HOLD.csv --window 10:30,auto --out out/both\n" in said
+    assert "Play the motion for 30 s: motor.csv holds one period of 20 s" in " ".join(said.split())
     said = run("design", preset, *asked, "--error", "10", "--out", tmp_path / "out", "--force").stdout
     end = 10 + 20 * np.ceil(table["needed"]["seconds"] / 20)
     assert end > 30 and f"Play {end:.3g} s and analyse the last {end - 10:.3g} s" in " ".join(said.split())
-    assert f"--window 10:{end:g} --out out/moved." in said  # as long as is said above
+    assert f"--window 10:{end:g} --out out/moved\n" in said  # as long as is said above
     for arguments, message in (
         (("--out", tmp_path / "out"), "motor.csv: is there already; overwrite it with --force"),
         (("--band", "5", "--out", tmp_path / "new"), "--band 5: give lowest and highest frequency in Hz, as --band 0.5:5"),

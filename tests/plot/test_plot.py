@@ -731,8 +731,8 @@ def identified():
     )  # fmt: skip
 
 
-def judged():
-    """A fit against replicates of it."""
+def judged(points=0):
+    """A fit against replicates of it, also of a dynamic stiffness at so many points."""
     rng, aim = np.random.default_rng(5), load_target("vastus-lateralis-26mvc")
     reference = {
         "chi2_per_bin": rng.gamma(9, 0.09, 999),
@@ -743,7 +743,17 @@ def judged():
         target=aim, residual=np.resize([0.5, -1.5, 2.5, -0.5], 30), residuals=rng.normal(size=(999, 30)),
         reference=reference, observed={"chi2_per_bin": 1.18, "runs": 14, "largest": 2.37}, foretold=True,
         p_values={"chi2_per_bin": 0.0791, "runs": 0.66, "largest": 0.0251, "all": 0.0412},
+        stiffness_residual=np.resize([0.5 + 1j, -2.5 + 1j], points), stiffness_residuals=np.zeros((999, points), complex),
     )  # fmt: skip
+    if points:
+        known = types.SimpleNamespace(frequency=np.geomspace(0.1, 10, points))
+        part.target = types.SimpleNamespace(
+            name=aim.name, frequency=aim.frequency, stiffness=types.SimpleNamespace(known=known)
+        )
+        part.stiffness_residuals = rng.normal(size=(999, points)) + 1j * rng.normal(size=(999, points))
+        part.observed |= {"chi2_per_point": 2.4, "largest_point": 2.7}
+        reference |= {"chi2_per_point": rng.gamma(20, 0.05, 999), "largest_point": rng.gamma(30, 0.08, 999)}
+        part.p_values |= {"chi2_per_point": 0.001, "largest_point": 0.2}
     return types.SimpleNamespace(parts={"a": part})
 
 
@@ -771,12 +781,14 @@ def refitted(names=("corner_frequency", "high_frequency_floor", "coefficient_of_
         lambda: plot.designed_input(designed()),
         lambda: plot.identifiability(identified()),
         lambda: plot.goodness(judged()),
+        lambda: plot.goodness(judged(points=40)),
         lambda: plot.bootstrap(refitted()),
         lambda: plot.static(static_characteristics(Isometric()))[0].figure,
         lambda: plot.coverage({"corner_frequency": np.arange(20), "k_w": np.arange(20)}, draws=19).figure,
     ],
     ids=["simulation", "fit", "components", "groups", "long groups", "unlike bins", "cohort", "cells", "study",
-         "steadiness", "designed_input", "identifiability", "goodness", "bootstrap", "static", "coverage"],
+         "steadiness", "designed_input", "identifiability", "goodness", "goodness of a response", "bootstrap", "static",
+         "coverage"],
 )  # fmt: skip
 def test_words_are_legible_in_a_column_of_a_journal_and_do_not_touch(draw):
     assert small_words(draw()) == ([], [], [])

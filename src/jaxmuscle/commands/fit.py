@@ -177,8 +177,9 @@ def fit(
         fixed = fixed_values(fix)
         names = names_in(free)
         read = {"quantity": quantity, "segments": segments, "dataset": dataset, "axis": "linear" if axis is None else axis}
-        require_files(target)
         recorded = [jm.data.is_recording(name) for name in target]
+        if len(target) == 1 or any(recorded):  # of several spectra the others are fitted all the same
+            require_files(target)
         if any(recorded) and not all(recorded):
             raise ValueError(f"{target[recorded.index(True)]} is a recording, {target[recorded.index(False)]} a spectrum. "
                              "They cannot be fitted together: fit one at a time, or first make a spectrum of each recording "
