@@ -247,11 +247,11 @@ def richer(count: int) -> None:
             _search.RENEWALS = kept
             print(f"{words}, subtracted {how}")
             told(fits, TASK.replace(**{name: true[name] for name in ("k_w", "k_z", "c_w", "c_z")}))
-            held = {n: sum(f[n].interval is not None and f[n].interval[0] < t < f[n].interval[1] for f in fits)
-                    for n, t in truth(muscle).items()}  # fmt: skip
-            print(
-                "  95 % intervals that hold the truth: " + ", ".join(f"{n} {k}/{count}" for n, k in held.items()), flush=True
-            )
+            print("  95 % intervals that hold the truth:", end="")
+            for name, value in truth(muscle).items():
+                known = [fit[name].interval for fit in fits if fit[name].interval is not None]
+                print(f" {name} {sum(low < value < high for low, high in known)} of {len(known)} known;", end="")
+            print(flush=True)
 
 
 def seconds(count: int) -> None:
