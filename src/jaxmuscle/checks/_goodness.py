@@ -1,11 +1,10 @@
 """Is the fit as good as the scatter of the data allows? Chi², runs and largest residuals, by bootstrap with refits."""
 
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import jax
 import numpy as np
-from jax import Array
 from jaxtyping import Complex, Float
 
 from jaxmuscle import plot
@@ -20,14 +19,10 @@ from jaxmuscle.data._target import Target
 from jaxmuscle.fits._part import FittedPart
 from jaxmuscle.fits._reopened import reopened
 from jaxmuscle.fits._result import FitResult
-from jaxmuscle.objective._consequences import expand
-from jaxmuscle.objective._least_squares import least_squares
-from jaxmuscle.objective._likelihood import Likelihood, drawn_spectra, repeated, require_spread
-from jaxmuscle.objective._problem import FitProblem
-from jaxmuscle.objective._residuals import Data, Residuals
-from jaxmuscle.objective._starts import frequency_names
-from jaxmuscle.response._expected import Moments
+from jaxmuscle.objective._likelihood import Likelihood, drawn_spectra, require_spread
 from jaxmuscle.spectra._bin_law import bin_statistics
+
+from ._refits import Rows, drawn_about, refitted
 
 if TYPE_CHECKING:
     import pandas
@@ -35,12 +30,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure, SubFigure
 
 
-Rows = Float[np.ndarray, "rows bins"]
-ELSEWHERE = 3
-LINE_SHAPE = np.array([0.25, 1.0, 0.25])
 SMALL_P, LARGE_P = 0.05, 0.975
-CHECKS = ("chi2_per_bin", "runs", "largest")
-AT_POINTS = ("chi2_per_point", "largest_point")
 COUNTED = {2: "both", 3: "all three", 5: "all five"}
 
 
@@ -113,17 +103,21 @@ class GoodnessPart(Printed, Result, eqx.Module):
     def _points(self) -> int:
         return len(self.stiffness_residual)
 
+    def _chi2(self, name: str, worse: str, usual: str, better: str, why: str) -> str:
+        """The chi² of bins or points in words."""
+        p, (low, high) = self.p_values[name], np.quantile(self.reference[name], [0.05, 0.95])
+        said = (f"{name.replace('_', ' ')} {self.observed[name]:.2f}, expected {low:.2f} to {high:.2f}, "
+                f"{probability(p)}")  # fmt: skip
+        if p > LARGE_P:
+            return f"{better}: {said}; {why}"
+        return f"{worse if p < SMALL_P else usual}: {said}"
+
     def _of_stiffness(self) -> tuple[str, str]:
-        p, seen = self.p_values, self.observed
-        low, high = np.quantile(self.reference["chi2_per_point"], [0.05, 0.95])
-        chi2 = (f"chi2 per point {seen['chi2_per_point']:.2f}, expected {low:.2f} to {high:.2f}, "
-                f"{probability(p['chi2_per_point'])}")  # fmt: skip
-        if p["chi2_per_point"] < SMALL_P:
-            first = f"the dynamic stiffness is further from the fit than expected: {chi2}"
-        elif p["chi2_per_point"] > LARGE_P:
-            first = f"the dynamic stiffness is nearer to the fit than it should be: {chi2}; are its errors too large?"
-        else:
-            first = f"the dynamic stiffness is as near to the fit as expected: {chi2}"
+        p = self.p_values
+        first = self._chi2("chi2_per_point", "the dynamic stiffness is further from the fit than expected",
+                           "the dynamic stiffness is as near to the fit as expected",
+                           "the dynamic stiffness is nearer to the fit than it should be",
+                           "are its errors too large?")  # fmt: skip
         measured, size = self.target.stiffness, np.abs(self.stiffness_residual)
         assert measured is not None  # or it would have no residuals
         worst = int(np.argmax(size))
@@ -135,15 +129,14 @@ class GoodnessPart(Printed, Result, eqx.Module):
     def _of_spectrum(self) -> tuple[str, str, str]:
         p, seen = self.p_values, self.observed
         thing = "prediction" if self.foretold else "fit of the spectrum" if self._points else "fit"
-        low, high = np.quantile(self.reference["chi2_per_bin"], [0.05, 0.95])
         said = {name: probability(value) for name, value in p.items()}
-        chi2 = f"chi2 per bin {seen['chi2_per_bin']:.2f}, expected {low:.2f} to {high:.2f}, {said['chi2_per_bin']}"
-        if p["chi2_per_bin"] < SMALL_P:
-            first = f"the {thing} is worse than expected: {chi2}"
-        elif p["chi2_per_bin"] > LARGE_P:
-            first = f"the {thing} is better than it should be: {chi2}; more segments than stated, or a smoothed spectrum?"
-        else:
-            first = f"the {thing} is as good as expected: {chi2}"
+        first = self._chi2(
+            "chi2_per_bin",
+            f"the {thing} is worse than expected",
+            f"the {thing} is as good as expected",
+            f"the {thing} is better than it should be",
+            "more segments than stated, or a smoothed spectrum?",
+        )
         usual, runs = float(np.mean(self.reference["runs"])), f"{seen['runs']:.0f} runs of equal sign"
         if p["runs"] < SMALL_P:
             second = (f"the residuals have fewer runs than expected: {runs} where {usual:.1f} are usual, {said['runs']}; "
@@ -250,7 +243,7 @@ def goodness(result: FitResult, target: Target | None = None, *, replicates: int
     _check(result, target)
     with fitting():
         problem = reopened(result, key=key)
-        drawn, moments = _drawn(problem, result, replicates)
+        drawn, moments = drawn_about(problem, result, replicates)
         refits = refitted(problem, problem.theta_of(tuple(result.tasks.values())), drawn)
         power = drawn.power
         if target is not None:
@@ -297,102 +290,3 @@ def residuals_of(power: Rows, expected: Rows, target: Target, share: Rows) -> Ro
     law = bin_statistics(target, share)
     z = np.log(power) - np.log(expected) - law.bias
     return (z - z.mean(axis=1, keepdims=True)) / law.sd
-
-
-class Drawn(NamedTuple):
-    """Of every part: spectra drawn from the fit, what they scatter about, and their further data (None without)."""
-
-    power: tuple[Rows, ...]
-    expected: tuple[Float[np.ndarray, " bins"], ...]
-    variation: tuple[Any, ...]
-    mean: tuple[Any, ...]
-    stiffness: tuple[Any, ...]
-
-
-class Refits(NamedTuple):
-    """Where every drawn set's fit ended; of every part the `expected` proportional power, the `share` of the line, and the
-    `stiffness` at the points of a measured one, real and imaginary part along the second axis."""
-
-    theta: Float[np.ndarray, "rows free"]
-    cost: Float[np.ndarray, " rows"]
-    expected: tuple[Rows, ...]
-    share: tuple[Rows, ...]
-    stiffness: tuple[Any, ...]
-
-
-def _drawn(problem: FitProblem, result: FitResult, count: int) -> tuple[Drawn, tuple[Moments, ...]]:
-    moments = repeated(problem, tuple(result.tasks.values()), count)
-    found = []
-    for i, (part, bins, seen) in enumerate(zip(problem.parts, Likelihood.of(problem).bins, moments, strict=True)):
-        key = jax.random.fold_in(problem.key, 21)
-        key = jax.random.fold_in(key, i) if i else key
-        keys = jax.random.split(key, 3)
-
-        def scattered(given: Any, values: np.ndarray, key: Array) -> Any:
-            if given is None:
-                return None
-            return values + given[1] * np.asarray(jax.random.normal(key, (count,))), np.full(count, float(given[1]))
-
-        power = drawn_spectra(bins, part.target, seen, keys[0])
-        variation = scattered(part.variation, np.log(seen.variation), keys[1])
-        mean = scattered(part.mean, np.asarray(seen.mean), keys[2])
-        stiffness = None
-        if part.target.stiffness is not None:
-            sd = np.tile(part.target.stiffness.known.stderr, (count, 1))
-            normal = np.asarray(jax.random.normal(jax.random.fold_in(key, 3), np.shape(seen.stiffness)))
-            stiffness = np.asarray(seen.stiffness) + sd[:, None] * normal, sd
-        found.append((power, seen.power[0] / np.sum(seen.power[0]), variation, mean, stiffness))
-    return Drawn(*zip(*found, strict=True)), moments
-
-
-def refitted(problem: FitProblem, theta: Float[np.ndarray, " free"], drawn: Drawn) -> Refits:
-    """Every drawn set fitted: all bins scattering alike first, then again with the line's share of each known."""
-    objective, count = problem.linear(), len(drawn.power[0])
-    starts = _starts(problem, theta, drawn)
-    each = starts.shape[1]
-    data = _data(problem, objective, drawn, tuple(np.zeros_like(power) for power in drawn.power))
-    first = least_squares(objective, problem.coordinates.from_theta(starts.reshape(count * each, -1)), 40,
-                          data=jax.tree.map(lambda x: np.repeat(x, each, axis=0), data))  # fmt: skip
-    cost = np.where(np.isfinite(first.cost), first.cost, np.inf).reshape(count, each)
-    s = first.s.reshape(count, each, -1)[np.arange(count), np.argmin(cost, axis=1)]
-    share = _seen(objective, s)[1]
-    second = least_squares(objective, s, 40, data=_data(problem, objective, drawn, share))
-    return Refits(np.asarray(objective.theta(second.s)), second.cost, *_seen(objective, second.s))
-
-
-def _starts(problem: FitProblem, theta: np.ndarray, drawn: Drawn) -> Float[np.ndarray, "rows starts free"]:
-    """The fit's own values; and each harmonic, as strong as its prior has it, in the highest excesses of each spectrum."""
-    c, count = problem.coordinates, len(drawn.power[0])
-    starts = [np.broadcast_to(theta, (count, len(theta)))]
-    for name in frequency_names(c):
-        strengths = [i for i, n in enumerate(c.names) if n in ("harmonic_amplitude", name.replace("frequency", "amplitude"))]
-        for part, power, expected in zip(problem.parts, drawn.power, drawn.expected, strict=True):
-            if c.names.index(name) not in part.columns:
-                continue
-            excess = np.log(power / expected)
-            score = np.stack([np.convolve(row - row.mean(), LINE_SHAPE, "same") for row in excess])
-            for _ in range(ELSEWHERE):
-                best, points = np.argmax(score, axis=1), np.array(starts[0])
-                points[:, c.names.index(name)] = c.theta_of(name, np.asarray(part.target.frequency)[best])
-                points[:, strengths] = 0.0
-                starts.append(points)
-                score = np.where(np.abs(np.arange(score.shape[1]) - best[:, None]) <= 1, -np.inf, score)
-    return np.stack(starts, axis=1)
-
-
-def _data(problem: FitProblem, objective: Residuals, drawn: Drawn, share: tuple[Rows, ...]) -> tuple[Data, ...]:
-    made = []
-    for i, (part, own) in enumerate(zip(problem.parts, objective.data, strict=True)):
-        law = bin_statistics(part.target, share[i])
-        sigma = np.broadcast_to(np.asarray(own.sigma), (len(drawn.power[i]), *np.shape(own.sigma)))
-        made.append(Data(drawn.power[i], law.bias, law.sd, sigma, drawn.variation[i], drawn.mean[i], drawn.stiffness[i]))
-    return tuple(made)
-
-
-def _seen(objective: Residuals, s: np.ndarray) -> tuple[tuple[Rows, ...], tuple[Rows, ...], tuple[Any, ...]]:
-    """Of every part, at every row of coordinates: proportional power, share of the line, dynamic stiffness."""
-    moments = expand(objective, np.asarray(objective.theta(s))).moments
-    power = [np.asarray(m.power) for m in moments]
-    share = tuple(np.clip(np.nan_to_num(np.asarray(m.line) / p), 0.0, 1.0) for m, p in zip(moments, power, strict=True))
-    whole = tuple(p / p.sum(axis=1, keepdims=True) for p in power)
-    return whole, share, tuple(np.asarray(m.stiffness) for m in moments)

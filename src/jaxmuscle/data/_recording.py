@@ -30,6 +30,7 @@ AS_RECORDED: dict[str, Any] = {"filter_direction": "both", "sampling": "filtered
 RECORDED = SpectrumSettings(**AS_RECORDED)
 LOWEST_RATE = 24.0  # Hz; half of it lies above bin 30
 SEGMENTS = 2  # a steady part holds at least this many
+SHORTEST = (RECORDED.length + (SEGMENTS - 1) * RECORDED.step) / RECORDED.rate  # s, which these take
 
 
 class Recording(Shown, eqx.Module):
@@ -202,24 +203,20 @@ class Recording(Shown, eqx.Module):
         notices, found = self.notices, None
         if window is None:
             even = self.resampled(RECORDED.rate)
-            level = self.quantity != "acceleration"
-            found = plateau(even.whole, even.rate) if level else (0, even.whole.size)
+            everything = (0, even.whole.size)
+            found = everything if self.quantity == "acceleration" else plateau(even.whole, even.rate)
             if found is None:
-                raise ValueError(
-                    f"{self.name}: no plateau found: the force did not stay within 10 % of one level for half of the time "
-                    f"that it was above half of that level; give the window, {self.start:g} <= a < b <= {self.stop:g} s, as "
-                    "steady((a, b)), or --window a:b"
-                )
+                raise ValueError(f"{self.name}: no plateau found: the force did not stay within 10 % of one level for half of "
+                                 "the time that it was above half of that level; give the window, "
+                                 f"{self.start:g} <= a < b <= {self.stop:g} s, as steady((a, b)), or --window a:b")  # fmt: skip
             window = (self.start + found[0] / even.rate, min(self.start + found[1] / even.rate, self.stop))
-            whole = found == (0, even.whole.size)
             words = "steady part: no ramp found, so all of the recording is used"
-            notices = (*notices, words if whole else f"{FOUND}{window[0]:.2f} s to {window[1]:.2f} s")
+            notices = (*notices, words if found == everything else f"{FOUND}{window[0]:.2f} s to {window[1]:.2f} s")
         part = self._with(self.whole, self.rate, window, notices)
-        held, needed = part.segments(), RECORDED.length + (SEGMENTS - 1) * RECORDED.step
-        if held < SEGMENTS:
+        if (held := part.segments()) < SEGMENTS:
             what = f"window={part.window!r}" if found is None else f"its steady part of {part.duration:.3g} s"
-            raise ValueError(f"{self.name}: {what} holds {held} of the {SEGMENTS} Welch segments needed; give at least "
-                             f"{needed / RECORDED.rate:g} s")  # fmt: skip
+            words = f"holds {held} of the {SEGMENTS} Welch segments needed; give at least {SHORTEST:g} s"
+            raise ValueError(f"{self.name}: {what} {words}")
         return part
 
     def segments(self, settings: SpectrumSettings | str | None = None) -> int:

@@ -23,7 +23,7 @@ from jaxmuscle.spectra._settings import require
 
 from ._measure import Measure, log_interval, logit_interval, student_interval
 from ._pooled import unlike
-from ._recording import RECORDED, SEGMENTS, Recording
+from ._recording import RECORDED, SEGMENTS, SHORTEST, Recording
 
 if TYPE_CHECKING:
     import pandas
@@ -201,8 +201,7 @@ def steadiness(recordings: Recording | Iterable[Recording]) -> Steadiness:
     for recording in each:
         require(isinstance(recording, Recording), "recordings", recording, "load_recording(...) reads a file")
         recording._require_change()
-        shortest = (RECORDED.length + (SEGMENTS - 1) * RECORDED.step) / RECORDED.rate
-        remedy = f"{recording.name} lasts {recording.duration:.3g} s; give at least {shortest:g} s"
+        remedy = f"{recording.name} lasts {recording.duration:.3g} s; give at least {SHORTEST:g} s"
         require(recording.segments() >= SEGMENTS, "window", recording.window, remedy)
     _same_unit(each)
     names = [recording.name for recording in each]

@@ -170,11 +170,10 @@ class FitResult(Result, eqx.Module):
             told[0] += f". Measured, and so not widened: {', '.join(sorted(measured))}"
         if "harmonic_frequency" in self.free:
             told.append("no p-value of the harmonic: where the model misses the data, any harmonic improves the fit")
-        may = ("Report that the model does not describe the data, and no number of it. What needs no model (mean, "
-               "variation, power by band, the peak of a tremor) comes from `jaxmuscle steadiness`")  # fmt: skip
-        further = ("To go on, look at the residuals in the figure, and whether the recording drifts. `jaxmuscle compare "
-                   "fit.json` tries other noises; it takes as long as all fits so far")  # fmt: skip
-        return (*told, f"what to do: do not interpret the parameters. {may}. {further}")
+        return (*told, "what to do: do not interpret the parameters. Report that the model does not describe the data, and "
+                "no number of it. What needs no model (mean, variation, power by band, the peak of a tremor) comes from "
+                "`jaxmuscle steadiness`. To go on, look at the residuals in the figure, and whether the recording drifts. "
+                "`jaxmuscle compare fit.json` tries other noises; it takes as long as all fits so far")  # fmt: skip
 
     @property
     def per_newton(self) -> dict[str, float]:
