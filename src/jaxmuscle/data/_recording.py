@@ -30,6 +30,7 @@ AS_RECORDED: dict[str, Any] = {"filter_direction": "both", "sampling": "filtered
 RECORDED = SpectrumSettings(**AS_RECORDED)
 LOWEST_RATE = 24.0  # Hz; half of it lies above bin 30
 SEGMENTS = 2  # a steady part holds at least this many
+UNRAMPED = "steady part: no ramp found, so all of the recording is used"
 SHORTEST = (RECORDED.length + (SEGMENTS - 1) * RECORDED.step) / RECORDED.rate  # s, which these take
 
 
@@ -206,12 +207,12 @@ class Recording(Shown, eqx.Module):
             everything = (0, even.whole.size)
             found = everything if self.quantity == "acceleration" else plateau(even.whole, even.rate)
             if found is None:
-                raise ValueError(f"{self.name}: no plateau found: the force did not stay within 10 % of one level for half of "
-                                 "the time that it was above half of that level; give the window, "
-                                 f"{self.start:g} <= a < b <= {self.stop:g} s, as steady((a, b)), or --window a:b")  # fmt: skip
+                raise ValueError(f"{self.name}: no plateau found: the force did not stay within 10 % of one level for half "
+                                 "of the time that it was above half of that level; give the window, "
+                                 f"{self.start:g} <= a < b <= {self.stop:g} s, as steady((a, b)), or "
+                                 "--window a:b")  # fmt: skip
             window = (self.start + found[0] / even.rate, min(self.start + found[1] / even.rate, self.stop))
-            words = "steady part: no ramp found, so all of the recording is used"
-            notices = (*notices, words if found == everything else f"{FOUND}{window[0]:.2f} s to {window[1]:.2f} s")
+            notices = (*notices, UNRAMPED if found == everything else f"{FOUND}{window[0]:.2f} s to {window[1]:.2f} s")
         part = self._with(self.whole, self.rate, window, notices)
         if (held := part.segments()) < SEGMENTS:
             what = f"window={part.window!r}" if found is None else f"its steady part of {part.duration:.3g} s"
