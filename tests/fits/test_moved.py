@@ -162,8 +162,8 @@ def test_a_file_of_both_channels_is_fitted_from_the_command_line_alone_and_with_
     plt.close(figure)
     hold = tmp_path / "hold.csv"
     force = np.asarray(jm.simulate(jm.Isometric(), jax.random.key(2), duration=40.0, rate=100.0).output)
-    table = np.stack([np.arange(force.size) / 100, force], axis=1)[300:]
-    np.savetxt(hold, table, delimiter=",", header="time,force_N", comments="", fmt="%.8g")
+    table = np.stack([np.arange(force.size) / 100, 1e3 * force], axis=1)[300:]
+    np.savetxt(hold, table, delimiter=",", header="time,force_mN", comments="", fmt="%.8g")  # newtons all the same
     said = CliRunner().invoke(app, ["fit", str(path), "--hold", str(hold), *options[4:], "--force"], env={"COLUMNS": "1000"})
     assert said.exit_code == 0, said.output
     joint = jm.load_result(folder / "fit.json")
@@ -200,8 +200,7 @@ def test_a_file_of_both_channels_is_fitted_from_the_command_line_alone_and_with_
         ),
         (["PULL", "--hold", "PULL"], "its column x_m moves by 0.996 mm rms, and in a hold"),
         (["PULL", "--hold", "HOLD", "--window", "1:9,2:9,3:9"], "3 windows for 2 recordings"),
-        (["PULL", "--hold", "TORQUE"], "Give the hold in newtons (a torque over the lever arm"),
-        (["PULL", "--hold", "HOLD", "--units", "mN"], "--hold hold: is in mN, and a moved record is fitted in N"),
+        (["PULL", "--hold", "TORQUE"], "Give the hold in N, mN, kN (a torque over the lever arm"),
         (["PULL", "--hold", "HOLD", "--task", "isometric"], "leave out --task and --quantity"),
         (["PULL", "--hold", "HOLD", "--segments", "5"], "--segments and --dataset belong to spectra"),
         (["PULL", "--hold", "none.csv"], "none.csv"),

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import jaxmuscle as jm
+from jaxmuscle._common.units import NEWTONS
 
 from .options import PERTURBED, READING
 
@@ -97,10 +98,10 @@ def read_with_holds(
     for recording in held:
         if recording.unit == "1":
             raise ValueError(f"--hold {recording.name}: has no unit. Give --units N if all files are in newtons")
-        if recording.unit != "N":
+        if recording.unit not in NEWTONS:
             torque = " (a torque over the lever arm; --lever-arm serves the moved records alone)" * (recording.unit == "N m")
             raise ValueError(f"--hold {recording.name}: is in {recording.unit}, and a moved record is fitted in N. Give the "
-                             f"hold in newtons{torque}")  # fmt: skip
+                             f"hold in {', '.join(NEWTONS)}{torque}")  # fmt: skip
     return moved, held
 
 
