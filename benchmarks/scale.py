@@ -53,12 +53,9 @@ def against(label: str, noise: Any, by_hand: Any, repetitions: int) -> list[Row]
 
     @eqx.filter_jit
     def ours(task, key, draws, states):
-        def one(i):
-            stream = Stream.of(jax.random.fold_in(key, i), draws)
-            found = integrated((task,), stream, grid, "instant", states=states)
-            return found.states if states else found.outputs[0]
-
-        return jax.vmap(one)(jnp.arange(SEEDS))
+        streams = jax.vmap(lambda i: Stream.of(jax.random.fold_in(key, i), draws))(jnp.arange(SEEDS))
+        found = integrated((task,), streams, grid, "instant", states=states)
+        return found.states if states else found.outputs[0]
 
     kinds = {OURS: Draws(), WEAK: Draws(increments="weak"), THREEFRY: Draws(generator="threefry")}
     programs: dict[str, Any] = {name: partial(ours, task, key, draws, False) for name, draws in kinds.items()}

@@ -84,6 +84,8 @@ class Stream(eqx.Module):
     def normals(self, step: Int[Array, "*steps"] | np.uint32, first: int, count: int) -> tuple[Float[Array, "..."], ...]:
         """Standard normals of a step, or of steps, an array for each; of single precision in either precision."""
         dtype = jnp.result_type(float)
+        if step is START and count:  # once in a run: all together are compiled sooner
+            return tuple(_normal(jnp.stack(self._words(step, first, count))).astype(dtype))
         return tuple(_normal(word).astype(dtype) for word in self._words(step, first, count))
 
     def _words(self, step: Array | np.uint32, first: int, count: int) -> tuple[UInt32[Array, "..."], ...]:

@@ -9,7 +9,6 @@ import numpy as np
 import scipy
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from jaxmuscle.model._noises import with_noise_times
 from jaxmuscle.model._resonant_noise import ResonantNoise
 from jaxmuscle.model._stream import Draws, Stream
 from jaxmuscle.model._tasks import AbstractTask
@@ -128,11 +127,7 @@ class MonteCarlo(eqx.Module):
         start, stop = (round(edge * settings.rate) for edge in self.window)
 
         def outputs(loud, *tasks):
-            def one(stream, loud):
-                own = tasks if loud is None else tuple(with_noise_times(each, lambda _: loud) for each in tasks)
-                return integrated(own, stream, self.grid, settings.sampling, states=False).outputs
-
-            return jax.vmap(one)(self.streams, loud)
+            return integrated(tasks, self.streams, self.grid, settings.sampling, states=False, loud=loud).outputs
 
         def swing(seen):
             return jnp.var(lowpass(seen, settings)[..., start:stop], axis=-1)

@@ -61,24 +61,22 @@ def respond(task: AbstractTask, source: Stream | Realisation, grid: Grid, sampli
     """States (samples, states), at instants, and sampled output (samples) of one noise path, drawn or given."""
     from ._integrator import integrated  # and diffrax, which a program that is loaded does without
 
-    states, (output,) = integrated((task,), source, grid, sampling, states=True)
+    states, (output,) = integrated((task,), jax.tree.map(lambda x: x[None], source), grid, sampling, states=True)
     assert states is not None
-    return states, output
+    return states[0], output[0]
 
 
 def _responses(task: AbstractTask, linear: Any, sources: Stream, recipe: Recipe) -> dict[str, Any]:
     """Of all seeds' random numbers along a leading axis."""
     from ._integrator import integrated
 
-    def one(source):
-        tasks = (task,) if linear is None else (task, linear)
-        states, outputs = integrated(tasks, source, recipe.grid, recipe.sampling, states=recipe.states)
-        finite = jnp.all(jnp.isfinite(outputs[0]))
-        if states is not None:
-            finite &= jnp.all(jnp.isfinite(states))
-        return {"output": outputs[0], "finite": finite, "linear": None if linear is None else outputs[1], "states": states}
-
-    found = jax.vmap(one)(sources)
+    tasks = (task,) if linear is None else (task, linear)
+    states, outputs = integrated(tasks, sources, recipe.grid, recipe.sampling, states=recipe.states)
+    finite = jnp.all(jnp.isfinite(outputs[0]), axis=1)
+    if states is not None:
+        finite &= jnp.all(jnp.isfinite(states), axis=(1, 2))
+    found: dict[str, Any] = {"output": outputs[0], "finite": finite, "linear": None if linear is None else outputs[1],
+                             "states": states}  # fmt: skip
     if recipe.edges is not None:
         found["power"], found["variation"] = _seen(found["output"], recipe)
         found["linear_power"] = None if linear is None else _seen(found["linear"], recipe)[0]

@@ -21,10 +21,10 @@ from ._perturbation import Perturbation
 
 
 class Moving(NamedTuple):
-    """The state of the equation: those of every task and of what perturbs them, a number each.
+    """The state of the equation: those of every task and of what perturbs them, a vector along the seeds each.
 
-    Under `vmap` each is a vector along the seeds, which stays in a cache. `seen`: every task's output after every step of
-    the last interval, where it is not sampled at instants.
+    So they stay in a cache. `seen`: every task's output after every step of the last interval, where it is not sampled at
+    instants.
     """
 
     tasks: tuple[tuple[Array, ...], ...]
@@ -61,66 +61,79 @@ class SubcycledHeun(dfx.AbstractStratonovichSolver):
 class GridTerm(dfx.AbstractTerm):
     """Tasks on the same perturbation, a step after the other: `dy = f(t, y, u) dt + (∂f/∂u) dW`, u by its own recursion.
 
-    The noise filters and the activation are linear, and advanced exactly. Its control is the numbers of the steps of an
-    interval, and what the path has made for them ahead. Sub-steps share the noise of their step: u is interpolated, dW
-    divided. The steps take the tasks with their inputs `looked_up` in tables, the outputs the tasks themselves, since they
-    may need higher derivatives.
+    The noise filters and the activation are linear, and advanced exactly. Its control is the number of an interval's first
+    step. Sub-steps share the noise of their step: u is interpolated, dW divided. The steps take the tasks with their inputs
+    `looked_up` in tables, the outputs the tasks themselves, since they may need higher derivatives.
+
+    Many seeds at once, what is `own` to each along a leading axis: an interval is mapped over the seeds. Were the whole
+    solution mapped, JAX would trace every loop in it anew for the mapping, which took longer than all the rest.
     """
 
     tasks: tuple[AbstractTask, ...]
     looked_up: tuple[AbstractTask, ...]
-    perturbation: Perturbation
+    own: Perturbation
+    shared: Perturbation
     grid: Grid = eqx.field(static=True)
     instants: bool = eqx.field(static=True)
 
     def vf(self, t, y, args):
-        """Drift of every task [1/s], under the perturbation as it is."""
-        u = jnp.stack(self.perturbation.inputs(y.perturbation, self._harmonic(t)))
-        each = zip(self.looked_up, y.tasks, strict=True)
-        return tuple(task.vector_field(t * self.grid.dt, jnp.stack(state), u) for task, state in each)
+        return y  # diffrax asks for its shape only
 
     def prod(self, vf, control):
         raise NotImplementedError("GridTerm moves whole intervals")
 
+    def _mapped(self, function, *each):
+        """A function of a seed's perturbation and of what else has an axis of seeds."""
+        return jax.vmap(lambda own, *rest: function(eqx.combine(own, self.shared), *rest))(self.own, *each)
+
     def contr(self, t0, t1, **kwargs):
         # diffrax rounds t0, a fraction of the run; step numbers must be whole to find their noise.
-        first = jnp.clip(jnp.round(t0).astype(jnp.int32), 0, self.grid.steps - self.grid.every)
-        return first + jnp.arange(self.grid.every, dtype=jnp.int32), self.perturbation.path.ahead(first, self.grid.every)
+        return jnp.clip(jnp.round(t0).astype(jnp.int32), 0, self.grid.steps - self.grid.every)
 
     def start(self) -> Moving:
         """The state at t = 0."""
         states = tuple(tuple(task.initial_state()) for task in self.tasks)
         none = jnp.zeros(self.grid.every, jnp.result_type(float))
-        return Moving(states, self.perturbation.start(), () if self.instants else (none,) * len(self.tasks))
 
+        def one(perturbation):
+            return Moving(states, perturbation.start(), () if self.instants else (none,) * len(self.tasks))
+
+        return self._mapped(one)
+
+    @eqx.filter_jit  # diffrax asks several times, and so it is traced once
     def vf_prod(self, t, y, args, control):
         """The state after an interval, not its change: what is advanced exactly has no need of a difference."""
 
-        def step(state, given):
-            state = self._step(*state, *given)
-            seen = () if self.instants else self.outputs(Moving(*state, ()), (given[0] + 1).astype(state[0][0][0].dtype))
-            return state, seen
+        def one(perturbation, y):
+            def step(state, given):
+                state = self._step(perturbation, *state, *given)
+                number = (given[0] + 1).astype(state[0][0][0].dtype)
+                return state, () if self.instants else self._outputs(perturbation, Moving(*state, ()), number)
 
-        (tasks, perturbation), seen = jax.lax.scan(step, (y.tasks, y.perturbation), control)
-        return Moving(tasks, perturbation, seen)
+            numbers = control + jnp.arange(self.grid.every, dtype=jnp.int32)
+            made = perturbation.path.ahead(control, self.grid.every)
+            (tasks, path), seen = jax.lax.scan(step, (y.tasks, y.perturbation), (numbers, made))
+            return Moving(tasks, path, seen)
+
+        return self._mapped(one, y)
 
     def _harmonic(self, step: Scalar) -> Array:
         return self.looked_up[0].harmonic(step * self.grid.dt)
 
-    def _step(self, tasks: tuple, perturbation: Any, number: Array, made: Any) -> tuple[tuple, Any]:
+    def _step(self, perturbation: Perturbation, tasks: tuple, path: Any, number: Array, made: Any) -> tuple[tuple, Any]:
         parts, begun = self.grid.substeps, number.astype(tasks[0][0].dtype)
         wave, later = self._harmonic(begun), self._harmonic(begun + 1)
-        after, kicks = self.perturbation.advance(perturbation, made, wave, later)
+        after, kicks = perturbation.advance(path, made, wave, later)
         if parts == 1:
-            u = self.perturbation.inputs(perturbation, wave), self.perturbation.inputs(after, later)
+            u = perturbation.inputs(path, wave), perturbation.inputs(after, later)
             return tuple(self._heun(task, y, begun, *u, kicks) for task, y in zip(self.looked_up, tasks, strict=True)), after
-        noise, noise_later = (self.perturbation.inputs(state, jnp.zeros_like(wave)) for state in (perturbation, after))
+        noise, noise_later = (perturbation.inputs(state, jnp.zeros_like(wave)) for state in (path, after))
         parted = [None if kick is None else kick / parts for kick in kicks]
 
         def inputs(share: Array) -> list[Array]:
             still = self._harmonic(begun + share)
             found = [a + share * (b - a) for a, b in zip(noise, noise_later, strict=True)]
-            return [x if i in self.perturbation.passing else x + self.perturbation.base[i] * still
+            return [x if i in perturbation.passing else x + perturbation.base[i] * still
                     for i, x in enumerate(found)]  # fmt: skip
 
         def part(tasks, i):
@@ -147,12 +160,16 @@ class GridTerm(dfx.AbstractTerm):
         second = change(at + 1 / self.grid.substeps, [a + b for a, b in zip(y, first, strict=True)], later)
         return tuple(a + 0.5 * (b + c) for a, b, c in zip(y, first, second, strict=True))
 
+    @eqx.filter_jit
     def outputs(self, y: Moving, number: Array) -> tuple[Array, ...]:
         """Every task's output at a grid point."""
+        return self._mapped(lambda perturbation, y: self._outputs(perturbation, y, number), y)
+
+    def _outputs(self, perturbation: Perturbation, y: Moving, number: Array) -> tuple[Array, ...]:
         t = number * self.grid.dt
         wave, slope = jax.jvp(self.tasks[0].harmonic, (t,), (jnp.ones_like(t),))
-        u = jnp.stack(self.perturbation.inputs(y.perturbation, wave))
-        du = jnp.stack(self.perturbation.slopes(y.perturbation, slope))
+        u = jnp.stack(perturbation.inputs(y.perturbation, wave))
+        du = jnp.stack(perturbation.slopes(y.perturbation, slope))
         return tuple(task.output(t, jnp.stack(state), u, du) for task, state in zip(self.tasks, y.tasks, strict=True))
 
 
@@ -172,22 +189,25 @@ def tabulated(task: AbstractTask, grid: Grid) -> AbstractTask:
 
 
 class Response(NamedTuple):
-    """Of one noise path: the first task's states at the samples (None if not asked for), and every task's output."""
+    """Of noise paths: the first task's states at the samples (None if not asked for), and every task's output."""
 
-    states: Float[Array, "samples states"] | None
-    outputs: tuple[Float[Array, " samples"], ...]
+    states: Float[Array, "seeds samples states"] | None
+    outputs: tuple[Float[Array, "seeds samples"], ...]
 
 
 def integrated(
-    tasks: tuple[AbstractTask, ...], source: Stream | Realisation, grid: Grid, sampling: str, *, states: bool
-) -> Response:
-    """Tasks that share a perturbation (a task and its linearisation), on a seed's random numbers or on a given unit path.
+    tasks: tuple[AbstractTask, ...], sources: Stream | Realisation, grid: Grid, sampling: str, *, states: bool,
+    loud: Float[Array, " seeds"] | None = None,
+) -> Response:  # fmt: skip
+    """Tasks that share a perturbation (a task and its linearisation), on the seeds' random numbers or on given unit paths.
 
-    What overflows is not finite, never an exception.
+    `sources` have a leading axis of seeds; `loud` multiplies the noise of each. What overflows is not finite, never an
+    exception.
     """
     instants = sampling == "instant"
     looked_up = (tabulated(tasks[0], grid), *tasks[1:])
-    term = GridTerm(tasks, looked_up, Perturbation.of(tasks[0], source, grid.dt), grid, instants)
+    own, shared = Perturbation.of(tasks[0], sources, grid.dt).apart(loud)
+    term = GridTerm(tasks, looked_up, own, shared, grid, instants)
     begun = term.start()
 
     def kept(number: Array, y: Moving, args: None) -> dict[str, tuple]:
@@ -207,12 +227,13 @@ def integrated(
         adjoint=dfx.DirectAdjoint() if grid.reverse else dfx.ForwardMode(),
         throw=False,
     )
-    found = jax.tree.map(lambda rows: rows[: grid.steps // grid.every + 1], solution.ys)
-    seen, path = found["seen"], jnp.stack(found["states"], axis=1) if states else None
+    found = jax.tree.map(lambda rows: jnp.moveaxis(rows[: grid.steps // grid.every + 1], 0, 1), solution.ys)
+    seen, path = found["seen"], jnp.stack(found["states"], axis=2) if states else None
     if instants:
         return Response(path, seen)
     started = term.outputs(begun, jnp.zeros((), begun.tasks[0][0].dtype))
-    return Response(path, tuple(_sampled(one, rows[1:], grid, sampling) for one, rows in zip(started, seen, strict=True)))
+    sampled = jax.vmap(lambda start, rows: _sampled(start, rows[1:], grid, sampling))
+    return Response(path, tuple(sampled(one, rows) for one, rows in zip(started, seen, strict=True)))
 
 
 def _sampled(start: Array, seen: Float[Array, "intervals every"], grid: Grid, sampling: str) -> Float[Array, " samples"]:

@@ -127,7 +127,7 @@ class Perturbation(eqx.Module):
 
     @classmethod
     def of(cls, task: AbstractTask, source: Stream | Realisation, dt: float) -> "Perturbation":
-        """Of a task on the random numbers of a seed, or on a unit path of its noise."""
+        """Of a task on the random numbers of a seed, or on a unit path of its noise; of one seed or of all, see `apart`."""
         parts = task.noise.components
         path = Drawn.of(task.noise, source, dt) if isinstance(source, Stream) else Given.of(source)
         acts_on, activation = tuple(part.acts_on for part in parts), task.activation
@@ -137,6 +137,19 @@ class Perturbation(eqx.Module):
         rate = None if activation is None else 1 / jnp.asarray(activation.time)
         scale = tuple(task.noise_scale(part) for part in parts)
         return cls(path, scale, task.harmonic_base(), transition, rate, acts_on, passing, dt)
+
+    def apart(self, loud: Float[Array, " seeds"] | None) -> tuple["Perturbation", "Perturbation"]:
+        """What each seed has of its own, along a leading axis, and what all share; `loud` multiplies the noise of each.
+
+        `equinox.combine` of both is the perturbation of a seed.
+        """
+        mine = jax.tree.map(lambda _: False, self)
+        mine = eqx.tree_at(lambda p: p.path.stream if isinstance(p.path, Drawn) else p.path.parts, mine, True)
+        if loud is None:
+            return eqx.partition(self, mine)
+        scale = tuple(own * jnp.expand_dims(loud, range(1, 1 + own.ndim)) for own in self.scale)
+        changed = eqx.tree_at(lambda p: p.scale, self, scale)
+        return eqx.partition(changed, eqx.tree_at(lambda p: p.scale, mine, True))
 
     def start(self) -> tuple[Any, Any]:
         """Its state at t = 0, with the activation at rest."""
