@@ -115,6 +115,10 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         items.sort(key=lambda item: timing.rank(item.path.stem))
 
 
+def pytest_collection_finish() -> None:
+    gc.freeze()  # what is imported stays: no later collection looks at it again
+
+
 def pytest_runtest_setup(item: pytest.Item) -> None:
     shapes.begin_anew()
     # A command that ran here before keeps only what took long to compile: single operations would be compiled ever again.

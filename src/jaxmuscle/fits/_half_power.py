@@ -9,11 +9,13 @@ from jaxtyping import Array, Float
 
 from jaxmuscle._common.programs import kept
 from jaxmuscle.data._target import Target
+from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.objective._consequences import Expansion, expand
-from jaxmuscle.objective._coordinates import task_at
+from jaxmuscle.objective._coordinates import Coordinates, task_at
 from jaxmuscle.objective._moment_models import Linear
 from jaxmuscle.objective._problem import FitProblem
-from jaxmuscle.objective._residuals import PartResiduals, Residuals
+from jaxmuscle.objective._residuals import Residuals
+from jaxmuscle.response._equilibrium import mechanics
 from jaxmuscle.response._linearised import linearise
 from jaxmuscle.response._transfer import half_power_level
 
@@ -207,18 +209,22 @@ def _levels_of(
     """
     model = objective.parts[part].model
     shift = float(np.log(model.correction.half)) if isinstance(model, Linear) else 0.0
-    levels, slopes = _levels(objective.parts[part], np.asarray(objective.own(theta, part)), log_f - shift)
+    own = objective.parts[part]
+    levels, slopes = _levels(mechanics(own.task), own.coordinates, np.asarray(objective.own(theta, part)), log_f - shift)
     return np.asarray(levels), objective.spread(np.asarray(slopes), part)
 
 
 @kept
 def _levels(
-    part: PartResiduals, theta: Float[Array | np.ndarray, "rows own"], log_f: Float[Array | np.ndarray, "rows points"]
+    task: AbstractTask,
+    coordinates: Coordinates,
+    theta: Float[Array | np.ndarray, "rows own"],
+    log_f: Float[Array | np.ndarray, "rows points"],
 ) -> tuple[Any, Any]:
     def one(theta, log_f):
         def levels(theta):
-            task = task_at(part.task, part.coordinates, theta)
-            levels = half_power_level(task, linearise(task), log_f)
+            there = task_at(task, coordinates, theta)
+            levels = half_power_level(there, linearise(there), log_f)
             return levels, levels
 
         slopes, levels = jax.jacfwd(levels, has_aux=True)(theta)

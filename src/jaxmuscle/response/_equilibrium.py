@@ -8,14 +8,16 @@ from jaxtyping import Array, Float
 from jaxmuscle._common.arrays import as_arrays
 from jaxmuscle._common.errors import OperatingPointError
 from jaxmuscle._common.programs import kept
+from jaxmuscle._common.types import Scalar
 from jaxmuscle.model._signals import AbstractSignal
 from jaxmuscle.model._tasks import AbstractTask
+from jaxmuscle.spectra._settings import SpectrumSettings
 
 HOLD = 15.0
 GUESS = 1e-3
 
 
-def equilibrium(task: AbstractTask, time: float = HOLD) -> Float[Array, " states"]:
+def equilibrium(task: AbstractTask, time: Scalar | float = HOLD) -> Float[Array, " states"]:
     """State y of `task` with `vector_field(time, y, 0) = 0` [m, m/s], by Newton's method; differentiable (implicitly).
 
         state = jm.response.equilibrium(jm.Isometric())
@@ -53,7 +55,12 @@ def equilibrium(task: AbstractTask, time: float = HOLD) -> Float[Array, " states
     return jax.lax.custom_root(at_rest, start, newton, lambda g, y: jnp.linalg.solve(jax.jacfwd(g)(y), y))
 
 
-def jacobian(task: AbstractTask, y: Float[Array, " states"], time: float = HOLD) -> Float[Array, "states states"]:
+def mechanics(task: AbstractTask) -> AbstractTask:
+    """The task as arrays, with the usual spectrum settings: a program that needs none serves tasks of any settings."""
+    return as_arrays(task.with_parts(settings=SpectrumSettings()))
+
+
+def jacobian(task: AbstractTask, y: Float[Array, " states"], time: Scalar | float = HOLD) -> Float[Array, "states states"]:
     """Jacobian [1/s] of the vector field with respect to the state at y."""
     task = as_arrays(task)
     return jax.jacfwd(lambda y: task.vector_field(jnp.asarray(time, y.dtype), y, jnp.zeros(5)))(y)
@@ -72,7 +79,7 @@ def slowest(system: Float[Array, "states states"]) -> Float[Array, ""]:
 def operating_point(task: AbstractTask, time: float = HOLD) -> tuple[np.ndarray, np.ndarray]:
     """Equilibrium and its eigenvalues as numbers. Raises `OperatingPointError` if there is no equilibrium."""
     with jax.enable_x64(True):
-        points, jacobians = _linearisations(as_arrays(task), (time,))
+        points, jacobians = _linearisations(mechanics(task), np.full(2, time))  # as many as for `fastest_rate`: one program
         if not np.all(np.isfinite(points[-1])):
             raise OperatingPointError(
                 f"{type(task).__name__} has no equilibrium at t = {time} s under its inputs "
@@ -84,12 +91,14 @@ def operating_point(task: AbstractTask, time: float = HOLD) -> tuple[np.ndarray,
 def fastest_rate(task: AbstractTask, duration: float) -> float:
     """Largest |eigenvalue| [1/s] at the start and under the inputs at mid-run and end, for the stability of a step."""
     with jax.enable_x64(True):
-        _, jacobians = _linearisations(as_arrays(task), (duration / 2, duration))
+        _, jacobians = _linearisations(mechanics(task), np.array([duration / 2, duration]))
         return float(max(np.abs(np.linalg.eigvals(j)).max() for j in np.asarray(jacobians) if np.all(np.isfinite(j))))
 
 
 @kept
-def _linearisations(task, times):
-    """Initial state and equilibria at the given times, with the Jacobians there."""
-    points = jnp.stack([task.initial_state(), *(equilibrium(task, t) for t in times)])
-    return points, jnp.stack([jacobian(task, y, t) for y, t in zip(points, (times[-1], *times), strict=True)])
+def _linearisations(
+    task: AbstractTask, times: Float[np.ndarray | Array, " times"]
+) -> tuple[Float[Array, "points states"], Float[Array, "points states states"]]:
+    """Initial state and equilibria at the given times, with the Jacobians there; that of the start at the last time."""
+    points = jnp.concatenate([task.initial_state()[None], jax.vmap(lambda t: equilibrium(task, t))(times)])
+    return points, jax.vmap(lambda y, t: jacobian(task, y, t))(points, jnp.concatenate([times[-1:], times]))

@@ -23,6 +23,7 @@ from ._harmonic_line import harmonic_line
 from ._linearised import Linearisation, linearise
 
 TAIL = 1e-13
+LAGS = 4096  # at least so many samples, or four times as many, ... share a program
 
 
 class Moments(NamedTuple):
@@ -146,7 +147,6 @@ def expected_moments(
     return _compiled_response(as_arrays(task), settings, window, as_arrays(samples, int))
 
 
-@kept
 def log_variation_sd(task: AbstractTask, settings: SpectrumSettings, samples: int) -> Float[Array, ""]:
     """Standard deviation of the log of the coefficient of variation of so many successive samples, in linear response.
 
@@ -156,16 +156,27 @@ def log_variation_sd(task: AbstractTask, settings: SpectrumSettings, samples: in
 
     and sd(ln CV) = √(Var s²) / (2 s²). How the mean scatters is left out: it counts as CV² beside this.
     """
+    most = LAGS
+    while most < samples:
+        most *= 4
+    return _log_variation_sd(as_arrays(task), settings, as_arrays(samples, int), most)
+
+
+@kept
+def _log_variation_sd(
+    task: AbstractTask, settings: SpectrumSettings, samples: Int[Array | np.ndarray, ""], most: int
+) -> Float[Array, ""]:
+    """Of any number of samples up to the `most`, in one program: trials are rarely of one length."""
     system = linearise(task)
     spread = jnp.asarray(low_pass_spread(settings), system.A.dtype)
     reach = len(spread) // 2
-    each, _ = autocovariances(task, system, settings, samples + reach)
-    r = jnp.sum(jax.vmap(lambda own: own.lagged(samples + reach))(each), axis=0)
+    each, _ = autocovariances(task, system, settings, most + reach)
+    r = jnp.sum(jax.vmap(lambda own: own.lagged(most + reach))(each), axis=0)
     slow = jnp.sum(jax.vmap(lambda own: own.mean_variance(samples))(each))
     r = jnp.convolve(jnp.concatenate([r[reach:0:-1], r]), spread, mode="valid") - slow
     _, swing = harmonic_line(task, system, settings, WINDOW, samples)
-    lag = jnp.arange(samples, dtype=r.dtype)
-    weight = jnp.where(lag > 0, 2.0, 1.0) * (1 - lag / samples) / samples
+    lag, n = jnp.arange(most, dtype=r.dtype), jnp.asarray(samples, r.dtype)
+    weight = jnp.where(lag > 0, 2.0, 1.0) * jnp.maximum(1 - lag / n, 0.0) / n
     turning = jnp.cos(2 * np.pi * task.harmonic.frequency * lag / settings.rate)
     variance = jnp.sum(weight * (2 * r**2 + 4 * swing * r * turning))
     return 0.5 * jnp.sqrt(variance) / (r[0] + swing)
