@@ -1,5 +1,7 @@
 """Commands that take recordings: several trials make one target, spectra and recordings are not mixed."""
 
+import contextlib
+import io
 import json
 
 import numpy as np
@@ -11,6 +13,8 @@ from jaxmuscle.commands.main import app
 from jaxmuscle.commands.options import PERTURBED, READING
 from jaxmuscle.commands.recordings import read_recordings
 from jaxmuscle.data import _recording_files
+from jaxmuscle.data._as_target import as_target
+from jaxmuscle.fits._perturbed import recordings_of
 
 RATE, LEVEL = 200, 40.5
 
@@ -134,3 +138,29 @@ def test_two_commands_from_raw_trials_to_a_fit(folder, tmp_path):
     assert run("fit", *paths(folder), *options, "--out", tmp_path / "one").exit_code == 0
     again = jm.load_result(tmp_path / "one" / "fit.json")
     assert again["mean"].value == pytest.approx(mean.value) and again.chi2_per_bin == pytest.approx(result.chi2_per_bin)
+
+
+def with_angle(path, moves):
+    """A trial as a dynamometer writes it: torque, and the angle of the joint, which moves by so many degrees."""
+    torque = force(3)
+    time = np.arange(torque.size)
+    columns = [time / RATE, torque, 30 + moves * np.sqrt(2) * np.sin(time / 5)]
+    np.savetxt(path, np.stack(columns, axis=1), delimiter=",", header="Time (s),Torque (Nm),Position (deg)", comments="")
+    return str(path)
+
+
+def test_a_joint_that_is_held_needs_no_lever_arm(tmp_path):
+    """A dynamometer records the angle of a held joint, too."""
+    reading = {name: default for name, (_, default) in (READING | PERTURBED).items()}
+    held, moved = with_angle(tmp_path / "held.csv", 0.05), with_angle(tmp_path / "moved.csv", 1.0)
+    with contextlib.redirect_stderr(io.StringIO()):
+        found = read_recordings([held], reading, None, None)
+    assert isinstance(found, jm.Trials) and found[0].unit == "N m"
+    assert recordings_of(held) == () and as_target(held).unit == "N m"
+    with pytest.raises(
+        ValueError, match=r"held.csv: its column Position .deg. rests .* and that of .*moved.csv moves by 1 deg"
+    ):
+        read_recordings([moved, held], reading, None, None)
+    for paths, task in (([moved], None), ([held], "prescribed-length")):
+        with pytest.raises(ValueError, match="give the distance from the axis to the insertion in m"):
+            read_recordings(paths, reading, None, task)

@@ -7,7 +7,7 @@ import jaxmuscle as jm
 from jaxmuscle.data._as_target import as_target, is_recording
 from jaxmuscle.data._frequency_response_files import is_frequency_response
 from jaxmuscle.data._recording_files import read_table
-from jaxmuscle.data._two_channels import perturbed_recordings, two_channels
+from jaxmuscle.data._two_channels import movement, perturbed_recordings, two_channels
 
 ROWS = 3000
 FORCE = 40 + np.sin(np.arange(ROWS) / 7.0)
@@ -88,3 +88,21 @@ def test_a_frequency_response_is_recognised(tmp_path):
     spectrum = tmp_path / "spectrum.csv"
     spectrum.write_text("frequency_hz,power\n0.5,1\n1,2\n", encoding="utf-8")
     assert not is_frequency_response(spectrum) and not is_frequency_response(tmp_path / "none.csv")
+
+
+@pytest.mark.parametrize(("column", "factor", "size", "unit", "rests"), [
+    ("displacement_mm", 1e3, 1 / np.sqrt(2), "mm", False), ("displacement_mm", 30.0, 0.03 / np.sqrt(2), "mm", True),
+    ("displacement_m", 0.1, 0.1 / np.sqrt(2), "mm", False), ("angle_deg", 150.0, 0.15 / np.sqrt(2), "deg", False),
+    ("angle_deg", 130.0, 0.13 / np.sqrt(2), "deg", True), ("angle_rad", 1.0, 0.18 / np.pi / np.sqrt(2), "deg", True),
+    ("position", 1.0, 1e-3 / np.sqrt(2), "", False), ("position", 0.0, 0.0, "", True),
+])  # fmt: skip
+def test_how_much_the_insertion_moves(tmp_path, column, factor, size, unit, rests):
+    """The sine of 1e-3 by its rms; what happens before and after the middle half, and gaps, do not count."""
+    moved = 7.0 + factor * MOVED
+    moved[: ROWS // 5], moved[-ROWS // 5 :], moved[ROWS // 2] = -20.0, 50.0, np.nan
+    table = np.stack([np.arange(ROWS) / 100, FORCE, moved], axis=1)
+    np.savetxt(tmp_path / "x.csv", table, delimiter=",", header=f"time_s,force_N,{column}", comments="", fmt="%.9g")
+    found = movement(tmp_path / "x.csv", column)
+    assert found.size == pytest.approx(size, rel=0.02, abs=1e-12) and (found.unit, found.rests) == (unit, rests)
+    alone = perturbed_recordings(tmp_path / "x.csv", files=True, held=True) if unit and rests else ()
+    assert alone == ()

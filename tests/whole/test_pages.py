@@ -27,7 +27,7 @@ BELOW = {"docs/gallery.md"}  # its program is read instead
 RUN_HERE = {
     "README.md", "docs/coming-from-diffrax.md", "docs/coming-from-matlab.md", "docs/ensembles.md", "docs/fit-a-csv.md",
     "docs/fitting.md", "docs/force.md", "docs/how-to/own-optimiser.md", "docs/how-to/report-results.md",
-    "docs/identifiability.md", "docs/index.md", "docs/recordings.md",
+    "docs/identifiability.md", "docs/index.md", "docs/python.md", "docs/recordings.md",
     "docs/reference/figures.md", "docs/scaling.md", "docs/tutorial.md", "docs/uncertainty.md",
 }  # fmt: skip
 FEWER_SEEDS = {"seeds=100_000": "seeds=1_000"}
@@ -111,7 +111,7 @@ def once():
 
 @pytest.fixture(scope="module")
 def readme(once, tmp_path_factory):
-    """What the README leaves behind."""
+    """What the README leaves behind, and the page that goes on from it."""
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(tmp_path_factory.mktemp("readme"))
         for number, name in enumerate(("trial.csv", "trial1.csv", "trial2.csv", "trial3.csv")):
@@ -119,13 +119,13 @@ def readme(once, tmp_path_factory):
         for seed, name in enumerate("abc"):
             write_spectrum(f"{name}.csv", seed)
         with contextlib.redirect_stdout(io.StringIO()) as printed:
-            names = pages.run("README.md", {"printed": printed}, FEWER_SEEDS | NO_LADDER)
+            names = pages.run("docs/python.md", pages.run("README.md", {"printed": printed}, NO_LADDER), FEWER_SEEDS)
     return names | {"returned": dict(once.last)}
 
 
 @pytest.mark.slow
 def test_readme(readme):
-    """The programs of the design document, as the README has them."""
+    """The programs of the design document, as the README and its page for Python have them."""
     result, mine, found = readme["result"], readme["mine"], readme["found"]
     assert result.success and result.chi2_per_bin <= 1.3
     assert mine.success and abs(mine.parameters["harmonic_frequency"].value - 6.0) < 0.25 * 0.390625

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import jaxmuscle as jm
 from jaxmuscle._common.units import NEWTONS
 
+from .console import err, plain
 from .options import PERTURBED, READING
 
 if TYPE_CHECKING:
@@ -18,7 +19,6 @@ if TYPE_CHECKING:
 
 NO_MOTION = ("--hold belongs to records of a moved insertion, with a column of force and one of displacement: fit a hold "
              "alone as `jaxmuscle fit HOLD`")  # fmt: skip
-STILL = 3e-5  # m rms: less moves no force that one could see
 
 
 def reads_recordings(command: Callable[..., None], options: Mapping[str, tuple[Any, Any]] = READING) -> Callable[..., None]:
@@ -72,7 +72,10 @@ def read_recordings(
     if task not in (None, "prescribed-length") or reading["column"] is not None:
         return read_trials(paths, reading, window)
     tables = [table_of(path, reading) for path in paths]
-    both = all(channels(table, reading) for table in tables)
+    found = [channels(table, reading) for table in tables]
+    both = all(found)
+    if task is None and both and _held(tables, found):
+        return read_trials(tables, reading | {"column": found[0]["force"]}, window)
     if task == "prescribed-length" and not both:
         raise ValueError(f"{paths[0]}: no displacement was found beside the force, and --task prescribed-length fits both: "
                          "name the columns with --force-column and --displacement; a hold is fitted with --task "
@@ -80,6 +83,21 @@ def read_recordings(
     if both:
         return read_perturbed(tables, reading, windows_of(window, len(tables)))
     return read_trials(tables, reading, window)
+
+
+def _held(tables: "Sequence[Table]", found: Sequence[dict[str, Any]]) -> bool:
+    """Whether the insertion rests in all files, though they have a column of where it is; said if so."""
+    moves = [jm.data.movement(table, names["displacement"]) for table, names in zip(tables, found, strict=True)]
+    if not any(each.rests for each in moves):
+        return False
+    least, most = moves.index(min(moves)), moves.index(max(moves))
+    if not all(each.rests for each in moves):
+        raise ValueError(f"{tables[least].file}: its column {found[least]['displacement']} rests (it moves by "
+                         f"{moves[least]}), and that of {tables[most].file} moves by {moves[most]}. Give the files of a "
+                         "moved insertion first, and those of a held one with --hold")  # fmt: skip
+    err.print(f"[yellow]notice:[/] {plain(found[most]['displacement'])} rests (it moves by {moves[most]}), so the force is "
+              "fitted as that of a hold. If a motor moved it, give --task prescribed-length", highlight=False)  # fmt: skip
+    return True
 
 
 def read_with_holds(
@@ -109,11 +127,10 @@ def _hold(path: str, reading: dict[str, Any], edges: Any) -> Any:
     """The force in a file, in the column that it has in the moved records, if there is one."""
     table, named = table_of(path, reading), reading["force_column"]
     if both := channels(table, reading | {"force_column": None, "displacement": None}):
-        others = {name: value for name, value in reading.items() if name not in ("force_column", "displacement")}
-        size = float(jm.load_recording(table, **others, **both).displacement.samples.std())
-        if size > STILL:
-            raise ValueError(f"--hold {path}: its column {both['displacement']} moves by {1e3 * size:.3g} mm rms, and in a "
-                             "hold the insertion rests. Name this file among the moved records, before --hold")  # fmt: skip
+        moves = jm.data.movement(table, both["displacement"])
+        if not moves.rests:
+            raise ValueError(f"--hold {path}: its column {both['displacement']} moves by {moves}, and in a hold the "
+                             "insertion rests. Name this file among the moved records, before --hold")  # fmt: skip
     options = {name: reading[name] for name in READING}
     return read(table, options | {"column": named if named in table.columns else None, "reference": None}, edges)
 

@@ -18,4 +18,6 @@ from ._target import Target as Target
 from ._target import load_target as load_target
 from ._trials import Trials as Trials
 from ._trials import load_recordings as load_recordings
+from ._two_channels import Movement as Movement
+from ._two_channels import movement as movement
 from ._two_channels import two_channels as two_channels

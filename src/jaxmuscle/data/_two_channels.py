@@ -1,9 +1,12 @@
 """Which columns of a file are the force and the displacement of a perturbation experiment."""
 
+import math
 import os
 import re
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
+
+import numpy as np
 
 from jaxmuscle.spectra._settings import require
 
@@ -11,14 +14,55 @@ from ._as_target import is_recording
 from ._perturbed import PerturbedRecording
 from ._recording_choice import FORCE, Reading, perturbed_of, signals
 from ._recording_files import read_table
-from ._recording_table import Table, bare, find, listed
-from ._units import quantity_of
+from ._recording_table import Table, bare, find, listed, values
+from ._units import quantity_of, scale_to_si
 
 CALLED = {
     "force": FORCE,
     "displacement": re.compile(r"disp(lacement)?|length|position|pos|angle|way|weg|auslenkung|winkel|x_z"),
 }
 MEASURED = {"force": ("force", "torque"), "displacement": ("displacement", "angle")}
+# Standard deviations below which the insertion was held: it moves no force that one could see. In mm, and in degrees.
+STILL = {"mm": 0.03, "deg": 0.1}
+
+
+class Movement(NamedTuple):
+    """By how much the insertion moves: standard deviation `size` in `unit`. It `rests` if that is as good as nothing."""
+
+    size: float
+    unit: str
+    rests: bool
+
+    def __str__(self) -> str:
+        return f"{self.size:.3g} {self.unit}".rstrip() + " rms"
+
+
+def movement(path: str | os.PathLike[str] | Table, displacement: str | int, *, skip_rows: int = 0) -> Movement:
+    """How much a displacement or an angle moves in the middle half of a recording.
+
+        channels = jaxmuscle.data.two_channels(path)
+        print(jaxmuscle.data.movement(path, channels["displacement"]))
+
+    A dynamometer records the angle of a held joint, too. With a standard deviation below 0.03 mm, or 0.1 degrees, the
+    insertion counts as held. One of unknown unit rests if it does not change at all.
+
+    **Arguments:** `path`, `skip_rows` as in `load_recording`; `displacement`, the column.
+
+    **Raises:** `ValueError` as `load_recording` does.
+    """
+    table = read_table(path, skip_rows)
+    name = find(table, displacement, "displacement")
+    samples = values(table, [name])[:, 0]
+    middle = samples[samples.size // 4 : samples.size - samples.size // 4]
+    size = float(np.std(middle[np.isfinite(middle)])) if np.isfinite(middle).any() else math.nan
+    unit = table.units.get(name, "")
+    if quantity_of(unit) not in MEASURED["displacement"]:
+        return Movement(size, unit, size == 0)
+    turned = quantity_of(unit) == "angle"
+    scale, _ = scale_to_si(unit, "displacement_units", "displacement", 1.0)
+    size *= scale * (180 / math.pi if turned else 1e3)
+    shown = "deg" if turned else "mm"
+    return Movement(size, shown, size < STILL[shown])
 
 
 def two_channels(
@@ -59,8 +103,11 @@ def _found_in(table: Table, force: str | int | None, displacement: str | int | N
     return {role: names[0] for role, names in found.items()}
 
 
-def perturbed_recordings(given: Any, *, files: bool) -> tuple[PerturbedRecording, ...]:
-    """Perturbed recordings: one, several, or with `files` the paths of such, their steady parts found; none of else."""
+def perturbed_recordings(given: Any, *, files: bool, held: bool = False) -> tuple[PerturbedRecording, ...]:
+    """Perturbed recordings: one, several, or with `files` the paths of such, their steady parts found; none of else.
+
+    `held`: nor of files in which the insertion rests.
+    """
     several = given if isinstance(given, Sequence) and not isinstance(given, str) else (given,)
     if len(several) > 0 and all(isinstance(one, PerturbedRecording) for one in several):
         return tuple(several)
@@ -69,6 +116,8 @@ def perturbed_recordings(given: Any, *, files: bool) -> tuple[PerturbedRecording
     tables = [read_table(one, 0) for one in several]
     channels = [_found_in(table, None, None, None) for table in tables]
     if not channels or not all(channels):
+        return ()
+    if held and all(movement(table, names["displacement"]).rests for table, names in zip(tables, channels, strict=True)):
         return ()
     found = (perturbed_of(PerturbedRecording.from_array, table, Reading(), names, None)
              for table, names in zip(tables, channels, strict=True))  # fmt: skip

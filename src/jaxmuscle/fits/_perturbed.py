@@ -81,9 +81,9 @@ def alike(one: Target, other: Target) -> bool:
 def recordings_of(given: object, task: AbstractTask | None = None) -> tuple[PerturbedRecording, ...]:
     """The perturbed recordings that a fit was given, for that or any task; none of anything else.
 
-    Files of two channels are read as such only where the task does not say that the insertion is held.
+    Files of two channels are read as such only where neither the task nor the displacement says that the insertion is held.
     """
-    return perturbed_recordings(given, files=task is None or type(task) is PrescribedLength)
+    return perturbed_recordings(given, files=task is None or type(task) is PrescribedLength, held=task is None)
 
 
 def analysed(recordings: Sequence[PerturbedRecording], task: AbstractTask, options: FitOptions) -> Target:
