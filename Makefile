@@ -18,7 +18,7 @@ help:
 	@echo "make mutants    random faults in the package: which of them a test notices; out/mutants.json"
 	@echo "make bench      measure speed; writes out/bench.json"
 	@echo "make docs       write the documentation; open site/index.html"
-	@echo "make clean      remove outputs and caches, but not .venv and .venv-minimum"
+	@echo "make clean      remove caches and what make itself wrote, but not .venv, .venv-minimum and other results in out/"
 	@echo "Another interpreter: make PYTHON=python3.12 fit"
 
 install: .venv/.stamp-run
@@ -60,7 +60,7 @@ docs: .venv/.stamp-docs
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 
 clean:
-	rm -rf out site dist build .test-out .pytest_cache .ruff_cache .hypothesis
+	rm -rf out/fit out/bench.json out/mutants.json site dist build .test-out .pytest_cache .ruff_cache .hypothesis
 	find . -path './.venv*' -prune -o -type d -name __pycache__ -prune -exec rm -rf {} +
 
 .venv/.stamp-run: pyproject.toml

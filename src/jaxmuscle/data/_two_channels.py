@@ -34,7 +34,7 @@ class Movement(NamedTuple):
     rests: bool
 
     def __str__(self) -> str:
-        return f"{self.size:.3g} {self.unit}".rstrip() + " rms"
+        return f"{round(self.size, 9):.3g} {self.unit}".rstrip() + " rms"  # rounding error is no movement
 
 
 def movement(path: str | os.PathLike[str] | Table, displacement: str | int, *, skip_rows: int = 0) -> Movement:
