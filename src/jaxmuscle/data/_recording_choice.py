@@ -88,7 +88,8 @@ def perturbed_of(
     moved = table.units.get(displacement) if displacement_units is None else displacement_units
     if moved is None:
         raise ValueError(f"{table.file}: does not say in which unit {displacement} is; give `displacement_units`, as "
-                         "displacement_units='mm'")  # fmt: skip
+                         "displacement_units='mm'; or, if nothing moved the insertion, the force alone, as "
+                         "`column`")  # fmt: skip
     file = Path(table.file)
     source = f"{file.name}, columns {force} and {displacement}, {found:.6g} Hz"
     try:

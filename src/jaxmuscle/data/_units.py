@@ -67,7 +67,8 @@ def scale_to_si(unit: str, argument: str, quantity: str, lever_arm: Any) -> tupl
     require(known in _SI[quantity] or known in _SI[turned], argument, unit, remedy)
     if known in _SI[quantity]:
         return _SI[quantity][str(known)], False
-    remedy = f"`{argument}` is {known}: give the distance from the axis to the insertion in m, as lever_arm=0.1"
+    remedy = (f"`{argument}` is {known}: give the distance from the axis to the insertion in m, as lever_arm=0.1; or, if "
+              "nothing moved the insertion, the force alone, as `column`")  # fmt: skip
     number = isinstance(lever_arm, int | float | np.number) and not isinstance(lever_arm, bool)
     require(number and 0 < lever_arm < math.inf, "lever_arm", lever_arm, remedy)
     scale, arm = _SI[turned][str(known)], float(lever_arm)
