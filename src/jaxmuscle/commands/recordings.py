@@ -75,7 +75,8 @@ def read_recordings(
     found = [channels(table, reading) for table in tables]
     both = all(found)
     if task is None and both and _held(tables, found):
-        return read_trials(tables, reading | {"column": found[0]["force"]}, window)
+        called = {names["force"] for names in found}
+        return read_trials(tables, reading | {"column": called.pop() if len(called) == 1 else None}, window)
     if task == "prescribed-length" and not both:
         raise ValueError(f"{paths[0]}: no displacement was found beside the force, and --task prescribed-length fits both: "
                          "name the columns with --force-column and --displacement; a hold is fitted with --task "

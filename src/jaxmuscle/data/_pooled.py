@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 
 DRIFT = 0.5  # share of the variance
 UNLIKE = 1.1  # ratio of the means of two trials
+UNRAMPED = "steady part: no ramp found, so all of the recording is used"
 FOUND = "steady part found by itself: "
 
 

@@ -18,7 +18,7 @@ from jaxmuscle.spectra._measures import peaks, regularity
 from jaxmuscle.spectra._settings import SpectrumSettings, require
 from jaxmuscle.spectra._welch import Spectrum, lowpass, spectrum_of
 
-from ._pooled import FOUND, pooled_target
+from ._pooled import FOUND, UNRAMPED, pooled_target
 from ._recording_choice import Reading, recording_of
 from ._recording_quality import RecordingSummary, checked, clipping, plateau
 from ._recording_table import frame_table
@@ -30,7 +30,6 @@ AS_RECORDED: dict[str, Any] = {"filter_direction": "both", "sampling": "filtered
 RECORDED = SpectrumSettings(**AS_RECORDED)
 LOWEST_RATE = 24.0  # Hz; half of it lies above bin 30
 SEGMENTS = 2  # a steady part holds at least this many
-UNRAMPED = "steady part: no ramp found, so all of the recording is used"
 SHORTEST = (RECORDED.length + (SEGMENTS - 1) * RECORDED.step) / RECORDED.rate  # s, which these take
 
 

@@ -23,7 +23,7 @@ from ._harmonic_line import harmonic_line
 from ._linearised import Linearisation, linearise
 
 TAIL = 1e-13
-LAGS = 4096  # at least so many samples, or four times as many, ... share a program
+LAGS = 4096  # a program is made for so many samples, for 4 times, 16 times ... as many, and serves all below
 
 
 class Moments(NamedTuple):
