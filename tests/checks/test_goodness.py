@@ -164,7 +164,7 @@ def test_smooth_misfit_is_found_by_the_runs():
     found = jm.goodness(fits([expected() * wave])[0], replicates=199)
     assert found.p_values["runs"] <= 0.01
     assert found.p_values["largest"] > 0.5  # nothing but the order of the signs is odd
-    assert "something slow in frequency is missing" in found.sentences[1]
+    assert "the fit is too high or too low over whole ranges of frequency" in found.sentences[1]
 
 
 @pytest.mark.slow

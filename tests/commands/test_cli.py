@@ -223,7 +223,7 @@ def test_a_preset_with_a_mean_force_is_simulated_at_it(tmp_path):
 def test_what_is_observed_of_a_motion(tmp_path):
     arguments = ["simulate", "zagrodny-slifkin", "--observe", "acceleration", "--seeds", 4, "--out", tmp_path]
     refused = run(*arguments)
-    assert refused.exit_code == 2 and "no motion is the output; add --task prescribed-force" in refused.stderr
+    assert refused.exit_code == 2 and "the output of Isometric is no motion; add --task prescribed-force" in refused.stderr
     outcome = run(*arguments, "--task", "prescribed-force")
     assert outcome.exit_code == 0 and "a_z: mean" in outcome.stdout and "m/s^2, standard deviation" in outcome.stdout
 
@@ -675,6 +675,13 @@ def test_a_fit_that_is_taken_up_is_no_obstacle(tmp_path, monkeypatch):
     assert "posterior.json: is there already" in run("posterior", tmp_path / "fit.json", "--out", tmp_path).stderr
 
 
+@pytest.mark.parametrize("option", [("--noise", "pink"), ("--free", "k_w"), ("--fix", "k_w=4e5"), ("--segments", "9")])
+def test_what_a_fit_has_settled_cannot_be_asked_for_again(option, tmp_path):
+    made_result().save(tmp_path / "fit.json")
+    refused = run("posterior", tmp_path / "fit.json", *option, "--out", tmp_path / "out")
+    assert refused.exit_code == 2 and f"stay as they are, so leave out {option[0]}" in refused.stderr
+
+
 def made_comparison(target, *, success):
     """Two models; the search of the second one ended as told."""
     task = jm.on_rung(jm.Isometric(), 2)
@@ -693,7 +700,7 @@ def made_comparison(target, *, success):
 @pytest.mark.slow
 @pytest.mark.parametrize("success", [True, False])
 def test_the_spectrum_of_a_fit_is_compared(success, tmp_path, monkeypatch):
-    """`compare` takes a fit.json and says which search did not come to its end, in words and in the figure."""
+    """`compare` takes a fit.json and says which search did not converge, in words and in the figure."""
     result, asked = made_result(), []
 
     def compared(task, target, **options):
@@ -706,12 +713,12 @@ def test_the_spectrum_of_a_fit_is_compared(success, tmp_path, monkeypatch):
     ((task, target),) = asked
     assert_equal(target, result.target)
     assert type(task) is type(result.task)
-    unsettled = "the search did not come to its end for tremor, no harmonic. Do not use these rows"
+    unsettled = "the search did not converge for tremor, no harmonic. Do not use these rows"
     assert (outcome.exit_code, unsettled in outcome.output) == ((0, False) if success else (1, True))
-    assert success or "Hold a parameter of theirs, for example --fix resonance_width=" in outcome.output
+    assert success or "fix a parameter of these models, for example --fix resonance_width=" in outcome.output
     figure = made_comparison(target, success=success).plot()
     marks = [text.get_text() for ax in figure.axes for text in ax.texts]
-    assert ("not settled" in marks) is not success
+    assert ("not converged" in marks) is not success
     refused = run("compare", tmp_path / "fit.json", "--segments", "12", "--out", tmp_path / "out", "--force")
     assert refused.exit_code == 2 and "--segments: the spectrum of a fit states this already" in refused.stderr
 

@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 import jaxmuscle as jm
 from jaxmuscle.commands.main import app
 from jaxmuscle.commands.options import PERTURBED, READING
-from jaxmuscle.commands.recordings import read_recordings
+from jaxmuscle.commands.recordings import read_recordings, read_with_holds
 from jaxmuscle.data import _recording_files
 from jaxmuscle.data._as_target import as_target
 from jaxmuscle.fits._perturbed import recordings_of
@@ -64,7 +64,7 @@ def test_trials_are_analysed_together(folder, tmp_path):
     assert list(target.dispersion) == record["dispersion"] and target.mvc_fraction == pytest.approx(np.mean(means) / 300)
     np.testing.assert_allclose(record["spectrum"]["proportional_power"], target.proportional_power, rtol=1e-9)
     assert (tmp_path / "analysis.png").stat().st_size > 20_000
-    assert "differ" in found.output and "times as much as their segments explain" in " ".join(found.output.split())
+    assert "scatters" in found.output and "times as much as their segments explain" in " ".join(found.output.split())
 
 
 @pytest.mark.slow
@@ -149,6 +149,13 @@ def with_angle(path, moves):
     return str(path)
 
 
+def save_newtons(path, recording):
+    np.savetxt(
+        path, np.stack([recording.time, recording.samples], axis=1), delimiter=",", header="time,force_N", comments=""
+    )
+    return str(path)
+
+
 def test_a_joint_that_is_held_needs_no_lever_arm(tmp_path):
     """A dynamometer records the angle of a held joint, too."""
     reading = {name: default for name, (_, default) in (READING | PERTURBED).items()}
@@ -161,6 +168,21 @@ def test_a_joint_that_is_held_needs_no_lever_arm(tmp_path):
         ValueError, match=r"held.csv: its column Position .deg. rests .* and that of .*moved.csv moves by 1 deg"
     ):
         read_recordings([moved, held], reading, None, None)
+    with contextlib.redirect_stderr(io.StringIO()):
+        (force,) = read_recordings([held], reading | {"lever_arm": 0.25}, None, None)
+    assert force.unit == "N" and np.allclose(force.whole, found[0].whole / 0.25)
+    reading |= {
+        "force_column": "Torque (Nm)",
+        "displacement": "Position (deg)",
+        "lever_arm": 0.25,
+        "positive": "lengthening",
+    }
+    newtons = save_newtons(tmp_path / "newtons.csv", force)
+    for path in (held, newtons):  # a torque is divided, a force stays as it is
+        pulls, (hold,) = read_with_holds([moved], [path], reading, "all")
+        assert pulls[0].force.unit == hold.unit == "N"
+        np.testing.assert_allclose(hold.whole, force.whole, rtol=1e-6)
+    reading = {name: default for name, (_, default) in (READING | PERTURBED).items()}
     for paths, task in (([moved], None), ([held], "prescribed-length")):
         with pytest.raises(ValueError, match="give the distance from the axis to the insertion in m"):
             read_recordings(paths, reading, None, task)

@@ -43,7 +43,8 @@ def test_of_a_fit(tmp_path):
         == sorted(text.index(words) for words in ("What the data determine", "What the data do not determine",
                                                   "What was fixed"))  # fmt: skip
     first, second = text.split("What the data do not determine", 1)
-    assert "corner_frequency | 0.333 ± 0.010 | above 0.31 | Hz" in first and "k_w" not in first.split("What it means")[0]
+    assert "corner_frequency | 0.333 ± 0.010 | above 0.31 | Hz" in first
+    assert "What to know about this fit" in first and "k_w" not in first.split("What to know about this fit")[0]
     assert "k_w" in second and "m_w" in second.split("What was fixed", 1)[1]
     assert text.count(HOSTILE) >= 4 and "jaxmuscle fit '<script>" in text  # in the shell, too, it is one word
     assert "dt | 0.0025" in text and "jaxmuscle 0.1, jax 0.8" in text

@@ -69,7 +69,7 @@ def test_colours_that_differ_are_told_apart(colour):
             assert found.between(other, colour).winner == colour
     assert found.harmonic.winner == "a harmonic"
     assert found.tasks[colour, True]["harmonic_frequency"] == pytest.approx(5.3, abs=0.1)
-    assert any(f"{colour} rather than band-limited" in sentence for sentence in found.verdict)
+    assert any(f"the data prefer {colour} to band-limited" in sentence for sentence in found.verdict)
 
 
 @pytest.mark.slow
@@ -93,7 +93,7 @@ def test_a_tremor_is_told_from_a_line():
     assert found.between("tremor", "band-limited").winner == "tremor" == found.best.noise
     assert [row.adequate for row in found.rows] == [False, False, True]
     assert found.tasks["tremor", False]["resonance_amplitude"] == pytest.approx(0.1, rel=0.2)
-    assert "tremor rather than band-limited" in found.verdict[0] and found.harmonic.b == "no harmonic"
+    assert "the data prefer tremor to band-limited" in found.verdict[0] and found.harmonic.b == "no harmonic"
 
 
 @pytest.mark.slow
@@ -323,23 +323,24 @@ def test_six_and_the_same_sign_are_needed():
     assert decided(("a", "b"), Evidence(np.nan, up), Evidence(6.0, down)).winner is None
     open_ = decided(("a", "b"), Evidence(0.0, up), Evidence(60.0, down, settled=False))
     assert open_.winner is None and str(open_) == (
-        "a and b are not compared: the search of b did not come to its end")  # fmt: skip
+        "a and b are not compared: the search of b did not converge")  # fmt: skip
 
 
 def test_verdict_in_words():
     found = made()
     said = found.verdict
     assert said[0].startswith(
-        "pink and ornstein-uhlenbeck cannot be told apart: AIC lower by 3.0, held-out score higher by 3.0"
+        "pink and ornstein-uhlenbeck cannot be told apart (for pink: AIC lower by 3.0, held-out score higher by 3.0"
     )
-    assert said[1].startswith("pink rather than band-limited: AIC lower by 8.0, held-out score higher by 8.0")
+    assert said[1].startswith("the data prefer pink to band-limited: AIC lower by 8.0, held-out score higher by 8.0")
     assert said[2].startswith("a harmonic and no harmonic cannot be told apart") and said[2].endswith(
-        "12.8 in AIC is needed"
+        "to tell them apart, the AIC must differ by 12.8 or more"
     )
     tremor = dataclasses.replace(found.best, noise="tremor", aic=-1e3, harmonic=False)
     richer = dataclasses.replace(found, rows=(*found.rows, tremor)).verdict
     assert richer[-1] == f"among the models without tremor, {said[2]}"
-    assert "the two measures disagree, AIC lower by 8.0, held-out score lower by 8.0" in made(disagree=True).verdict[1]
+    split = "AIC and held-out score disagree (for pink: AIC lower by 8.0, held-out score lower by 8.0"
+    assert split in made(disagree=True).verdict[1]
     alone = made(sigma=True)
     assert alone.verdict[-1] == "the target states no segments: nothing was held out, the AIC decides alone"
     assert alone.between("pink", "band-limited").winner == "pink"

@@ -124,7 +124,7 @@ def test_clicked_figure_gives_its_spectrum(name, request, tmp_path):
     assert_recovered(target, drawn.error(GRID, spectrum(GRID)))
     assert (target.name, target.provenance, target.segments) == ("figure", "digitised", (6,))
     assert target.source == "WebPlotDigitizer project figure.json, dataset 'curve'"
-    assert target.notices[0].startswith("dataset 'curve': taken as points of a figure, frequency in Hz")
+    assert target.notices[0].startswith("dataset 'curve': read as points of a figure, frequency in Hz")
     target.save(tmp_path / "copy.toml")
     assert load_target(tmp_path / "copy.toml") == target
 
@@ -141,7 +141,7 @@ def test_extracted_image_gives_its_spectrum(linear, tmp_path):
     target = load_target(write(tmp_path, project(dataset(pixels), axes=linear.axes())))
     # The line is 3 pixels wide where it is level, as wide as it is high where it is steep: one pixel more.
     assert_recovered(target, linear.error(GRID, spectrum(GRID)) * (1 + 1 / PIXELS))
-    assert "interpolated onto the bins in log power (widest gap" in target.notices[1]
+    assert "so the log power was interpolated (widest gap" in target.notices[1]
 
 
 def test_decades_as_values_are_log_log(loglog, tmp_path):
@@ -172,14 +172,16 @@ def test_power_law_is_straight_between_points_of_a_log_log_figure(kind, loglog, 
         rows = "".join(f"{np.log10(x)};{np.log10(0.2 / x**1.7)}\n" for x in f)
         target = load_target(write(tmp_path, rows, "points.csv"), axis="log-log")
     np.testing.assert_allclose(target.proportional_power, GRID**-1.7 / np.sum(GRID**-1.7), rtol=1e-6)
-    assert any("in log power and frequency (widest gap 11 Hz)" in notice for notice in target.notices)
+    assert any("the log power was interpolated over log frequency (widest gap 11 Hz)" in notice for notice in target.notices)
 
 
 def test_ends_within_a_pixel_are_not_lost(tmp_path):
     rows = "".join(f"{f + 0.03},{p}\n" for f, p in zip(GRID, spectrum(GRID), strict=True))
     target = load_target(write(tmp_path, rows, "points.csv"))
     np.testing.assert_array_equal(target.bins, np.arange(1, 31))
-    assert target.notices[1] == "points up to 0.077 bins off the grid: taken as on the bins, within a pixel of a figure"
+    assert target.notices[1] == (
+        "some frequencies lie up to 0.077 bins beside a bin, and count as that bin: a figure cannot be read more finely"
+    )
     stated = "frequency_hz,proportional_power\n" + rows
     np.testing.assert_array_equal(load_target(write(tmp_path, stated, "stated.csv")).bins, np.arange(2, 31))
 

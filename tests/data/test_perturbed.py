@@ -225,7 +225,7 @@ def test_sign():
     np.testing.assert_array_equal(recorded(moved[0], heavy).displacement.whole, moved[0])
     assert any("mean force is negative" in notice for notice in recorded(moved[0], -force[0]).notices)
     unrelated = recorded(moved[0], force[0, ::-1])
-    assert any("positive='lengthening' or 'shortening'" in notice for notice in unrelated.notices)
+    assert any("--positive lengthening or --positive shortening" in notice for notice in unrelated.notices)
     short = recorded(moved[0, :300], force[0, :300])
     assert any("sign of the displacement is not checked" in notice for notice in short.notices)
     with pytest.raises(ValueError, match="positive='up'"):
@@ -256,7 +256,7 @@ def test_the_hold_of_a_weak_force_that_answers_with_half_of_itself():
     ramp = np.linspace(0, weak, 300)
     whole = recorded(np.concatenate([still, moved[0], still]), np.concatenate([ramp, force[0] - MEAN + weak, ramp[::-1]]))
     assert np.std(force[0]) > 0.3 * weak
-    with pytest.raises(ValueError, match="no plateau found"):
+    with pytest.raises(ValueError, match="no steady part was found"):
         whole.force.steady()
     held = whole.steady()
     assert held.window is not None and held.window == held.displacement.window
@@ -343,7 +343,7 @@ REFUSED = {
     "force in mm": ({"force": "displacement_mm", "displacement": "plain", "displacement_units": "m"}, "unit of a force"),
     "constant": ({"force": "force_N", "displacement": "still_mm"}, "displacement: samples: constant at"),
     "column as well": ({"column": "force_N", "force": "force_N", "displacement": "displacement_mm"}, "column='force_N'"),
-    "lever arm alone": ({"column": "force_N", "lever_arm": 0.1}, "belongs to recordings of two channels"),
+    "lever arm of a force": ({"column": "force_N", "lever_arm": 0.1}, "it turns a torque into a force, and column force_N"),
     "delay too long": ({"force": "force_N", "displacement": "displacement_mm", "delay": 40.0}, "delay=40.0"),
 }  # fmt: skip
 

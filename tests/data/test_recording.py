@@ -127,7 +127,7 @@ NO_PLATEAU = {
 
 @pytest.mark.parametrize("case", NO_PLATEAU)
 def test_no_plateau_is_said(case):
-    with pytest.raises(ValueError, match=r"no plateau found.* give the window|Welch segments needed"):
+    with pytest.raises(ValueError, match=r"no steady part was found.* Give the part yourself|Welch segments needed"):
         Recording(NO_PLATEAU[case], 100, name=case).steady()
 
 
@@ -160,8 +160,8 @@ def test_a_target_says_that_most_of_its_variation_is_drift():
     assert not any("drift" in notice for notice in steady.notices)
     (said,) = (notice for notice in drifting.notices if "drift" in notice)
     with_it, without = (target.coefficient_of_variation[0] for target in (drifting, steady))
-    assert f"{with_it:.3g} with it" in said and with_it > 2 * without
-    assert float(said.split(" with it, ")[1].split(" ")[0]) == pytest.approx(without, rel=0.01)
+    assert f"{with_it:.3g} with the drift" in said and with_it > 2 * without
+    assert float(said.split(" with the drift, ")[1].split(" ")[0]) == pytest.approx(without, rel=0.01)
 
 
 def test_a_recording_that_begins_later_has_the_same_window_later():

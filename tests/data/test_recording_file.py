@@ -20,6 +20,7 @@ from jaxmuscle.data._recording_files import load_recording
 from jaxmuscle.data._recording_formats import read_c3d
 from jaxmuscle.data._recording_table import channels_table
 from jaxmuscle.data._target import load_target
+from jaxmuscle.data._trials import load_recordings
 
 X = np.round(10 + np.random.default_rng(0).normal(size=40), 3)
 TIME = np.arange(X.size) / 1000
@@ -333,6 +334,19 @@ BAD = {
 }
 
 
+@pytest.mark.parametrize(("unit", "scale"), [("Nm", 1.0), ("Ncm", 1e-2), ("Nmm", 1e-3)])
+def test_a_torque_over_its_lever_arm_is_a_force(tmp_path, unit, scale):
+    path = write(tmp_path, text(TIME, X, header=f"time,torque ({unit})"))
+    torque, force = load_recording(path), load_recording(path, lever_arm=0.25)
+    assert torque.quantity == "torque" and force.unit == "N" and force.quantity == "force"
+    np.testing.assert_allclose(force.whole, scale * torque.whole / 0.25, rtol=1e-12)
+    assert any("divided by the lever arm of 0.25 m: a force in N" in notice for notice in force.notices)
+    (trial,) = load_recordings([path], lever_arm=0.25)
+    assert trial.unit == "N" and np.array_equal(trial.whole, force.whole)
+    with pytest.raises(ValueError, match=r"trial.csv: lever_arm=-1: .*give the distance from the axis"):
+        load_recording(path, lever_arm=-1)
+
+
 @pytest.mark.parametrize("case", BAD)
 def test_bad_text(case, tmp_path):
     content, arguments, message = BAD[case]
@@ -447,7 +461,7 @@ def test_command(tmp_path):
     assert (saved.name, saved.provenance) == ("held", "measured")
     assert matplotlib.image.imread(out / "analysis.png").shape[1] == 4.4 * 300
     found = run(path, "--out", out, "--force", "--json", "--format", "pdf", "--format", "svg")
-    assert found.exit_code == 0 and "found by itself" in found.stderr
+    assert found.exit_code == 0 and "found automatically" in found.stderr
     assert json.loads(found.stdout) == json.loads((out / "analysis.json").read_text()) != record
     assert {file.name for file in out.iterdir()} == {"analysis.json", "analysis.pdf", "analysis.svg", "spectrum.csv"}
     slow = run(

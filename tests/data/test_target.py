@@ -253,7 +253,7 @@ def test_interpolation_is_linear_in_log_power(tmp_path):
     np.testing.assert_allclose(target.proportional_power, expected, rtol=1e-12)
     assert target.sigma is not None
     np.testing.assert_allclose(target.sigma, 0.1 * expected, rtol=1e-12)
-    assert "interpolated onto the bins in log power (widest gap 4 Hz)" in target.notices[0]
+    assert "so the log power was interpolated (widest gap 4 Hz)" in target.notices[0]
 
 
 def test_no_extrapolation(tmp_path):
@@ -261,7 +261,7 @@ def test_no_extrapolation(tmp_path):
     np.testing.assert_array_equal(target.bins, np.arange(3, 11))
     np.testing.assert_array_equal(target.frequency, GRID[2:10])
     assert target.proportional_power.sum() == pytest.approx(1, abs=1e-12)
-    assert any("left out: 1 to 2, 11 to 30" in notice for notice in target.notices)
+    assert any("no value in the bins 1 to 2, 11 to 30, so these are left out" in notice for notice in target.notices)
 
 
 def test_bins_missing_on_the_grid_stay_missing(tmp_path):
@@ -271,9 +271,16 @@ def test_bins_missing_on_the_grid_stay_missing(tmp_path):
     np.testing.assert_array_equal(target.bins, bins[:-1])
     np.testing.assert_allclose(target.proportional_power, [0.4, 0.2, 0.2, 0.1, 0.1], rtol=1e-12)
     assert target.notices == (
-        "rows outside bins 1 to 30 left out: 1",
-        "bins not covered and left out: 4 to 6, 8, 10 to 30 (bin spacing 0.390625 Hz)",
+        "1 row lies outside bins 1 to 30 and is left out",
+        "the spectrum has no value in the bins 4 to 6, 8, 10 to 30, so these are left out "
+        "(bin k lies at k times 0.390625 Hz)",
     )
+
+
+def test_trials_that_scatter_more_than_their_segments_explain_are_told():
+    now = Target("now", np.full(29, 1 / 29), bins=np.delete(np.arange(1, 31), 1), segments=(6, 6), dispersion=(3.0, 0.5))
+    assert now.notices[0].startswith("the spectrum has no value in bin 2, so it is left out")
+    assert now.notices[1].startswith("the mean of the trials scatters 3.00 ± 0.50 times as much as their segments explain")
 
 
 @pytest.mark.parametrize(("scale", "count"), [(1.0005, 0), (0.9995, 0), (1.002, 1), (100.0, 1)])

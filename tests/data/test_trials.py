@@ -61,9 +61,9 @@ def test_what_several_trials_say_is_said_once():
         jm.Recording(x, RATE, name=f"t{i}", notices=own) for i, (x, own) in enumerate(zip(held, said, strict=True))
     ).steady()
     windows = ", ".join(f"{a:.2f} s to {b:.2f} s in {r.name}" for r in found for a, b in [r.window])
-    assert found.target().notices[:3] == ("taken as N", "t0, t2: cut off", f"steady part found by itself: {windows}")
+    assert found.target().notices[:3] == ("taken as N", "t0, t2: cut off", f"steady part found automatically: {windows}")
     alone = found[0].target().notices
-    assert alone[-1].startswith("steady part found by itself: ") and alone[-1].endswith(" s")
+    assert alone[-1].startswith("steady part found automatically: ") and alone[-1].endswith(" s")
 
 
 def scatter(made):

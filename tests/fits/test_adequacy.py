@@ -194,7 +194,7 @@ def test_what_was_measured_is_as_certain_as_its_measurement():
     mean = result.derived["mean"]
     assert mean.stderr == pytest.approx(error, rel=0.05)
     assert mean.interval[1] - mean.interval[0] == pytest.approx(2 * 1.96 * error, rel=0.07)
-    assert result.advice[0].endswith(". Measured, and so not widened: mean")
+    assert result.advice[0].endswith(". Not widened, since measured directly: mean")
 
 
 @pytest.mark.slow

@@ -3,6 +3,7 @@
 import functools
 import io
 from pathlib import Path
+from types import SimpleNamespace
 
 import jax
 import matplotlib.pyplot as plt
@@ -97,13 +98,26 @@ def test_groups_differ_by_what_they_were_given():
 def test_a_member_says_what_was_not_done():
     member = cohort().results["person0"]
     assert (member.settings["seeds"], member.settings["check_seeds"]) == (0, 0)
-    assert any(notice.startswith("in linear response alone") for notice in member.notices)
+    assert any(notice.startswith("fitted by the formula alone") for notice in member.notices)
     figure = member.plot()
     try:
         said = {text.get_text() for ax in figure.axes for text in ax.texts}
         assert "not simulated" in said and "no finite simulation" not in said
     finally:
         plt.close(figure)
+
+
+def test_the_verdict_names_what_is_missed_and_what_cannot_be_judged():
+    def verdict(*fits: tuple[bool, bool | None]) -> str:
+        results = {f"t{i}": SimpleNamespace(success=found, adequate=fine) for i, (found, fine) in enumerate(fits)}
+        return jm.fits.CohortResult.verdict.fget(SimpleNamespace(results=results))
+
+    assert verdict((True, True), (True, True)) == "the model describes 2 of 2 targets"
+    assert verdict((True, True), (True, False), (True, None)) == (
+        "the model describes 1 of 2 targets; it does not describe t1, whose errors are widened"
+    )
+    assert verdict((True, None), (False, None)).startswith("whether the model describes the targets cannot be judged")
+    assert verdict((False, None)) == verdict() == "no target could be fitted"
 
 
 def test_a_cohort_has_one_method():

@@ -287,7 +287,7 @@ def test_directions_of_single_targets_are_named():
     flat = np.zeros((2, 7))
     flat[0, 1:4] = flat[1, 4:] = 1 / np.sqrt(3)
     found = identifiability(10 * (np.eye(7) - flat.T @ flat))
-    scale = "all noise amplitudes and the harmonic's can be multiplied by one number"
+    scale = "all amplitudes of noise and harmonic can be multiplied by one number, and the fit stays as good"
     assert common_scales(names, found) == (f"{scale} (a)", f"{scale} (b)")
 
 
@@ -368,8 +368,8 @@ def test_a_fit_that_fails_is_a_result(tmp_path):
     still = dict.fromkeys(("noise_K_w", "noise_K_z", "harmonic_amplitude"), 0.0) | {"noise_C_w": 0.1}
     targets = {"a": expected(ISOMETRIC), "b": expected(ISOMETRIC.replace(P_w=9.0))}
     joint = jm.fit_joint(targets, fix=still, free=("k_w",), starts=2)
-    assert not joint.success and "no start has a finite spectrum of every target" in joint.message
-    assert str(joint).startswith("Not fitted: no start has a finite spectrum of every target")
+    assert not joint.success and "none of the starts gives a spectrum of every target" in joint.message
+    assert str(joint).startswith("Not fitted: none of the starts gives a spectrum of every target")
     joint.save(tmp_path / "failed.json")
     assert_equal(jm.load_result(tmp_path / "failed.json"), joint)
     plt.close(joint.plot())

@@ -40,7 +40,7 @@ def made_result(**changes: Any) -> jm.fits.FitResult:
     rng = np.random.default_rng(0)
     fields: dict[str, Any] = {
         "success": True,
-        "message": "converged: 1 of 2 starts end at this fit",
+        "message": "converged: 1 of 2 starts reach a fit as good as this (cost within 5 %)",
         "adequacy": Adequacy(26.1, 25.0, 0.4, "the data have more power than the model at 4.3 Hz (1.2 standard errors)"),
         "task": task,
         "target": TARGET,
@@ -53,7 +53,7 @@ def made_result(**changes: Any) -> jm.fits.FitResult:
         },
         "products": ("k_w / c_w",),
         "correlation": {"parameters": ["k_w", "c_w"], "matrix": [[1.0, -0.5], [-0.5, 1.0]]},
-        "undetermined": ("stiffness and damping can all be multiplied by one number",),
+        "undetermined": ("all stiffness and damping can be multiplied by one number",),
         "singular_values": np.array([12.0, 1 / 3]),
         "chi2_per_bin": 0.9,
         "rms_log_error": 0.2,
@@ -241,14 +241,14 @@ def test_text_shows_what_is_known_and_what_is_not():
     assert second == "  made (user), Isometric, BandLimitedNoise, method montecarlo"
     words = " ".join(text.split())
     for part in (
-        "converged: 1 of 2 starts end at this fit",
+        "converged: 1 of 2 starts reach a fit as good as this (cost within 5 %)",
         "c_w 6.667 ± 0.013",  # 16.667 N over a mean of 2.5 N
         "corner_frequency 0.333 ± 0.010 above 0.31 Hz",
-        "products and ratios known roughly: k_w / c_w",
+        "products and ratios that the data determine, though not each factor alone: k_w / c_w",
         "not determined: do not interpret these values (per newton of mean force): k_w",
-        "the data leave open: - stiffness and damping can all be multiplied by one number",
-        "stiffness and damping are stated per newton of mean force. In newtons, as in result['K_w0'], in to_dataframe() and "
-        "in fit.json, they are those of a model muscle that pulls with 2.5 N: divide by that",
+        "the data leave open: - all stiffness and damping can be multiplied by one number",
+        "stiffness and damping are stated here per newton of mean force. In fit.json (Python: result['K_w0'], "
+        "to_dataframe()) they are those of a model muscle that pulls with 2.5 N: divide them by 2.5 N",
         "note: a notice",
     ):
         assert part in words
@@ -281,12 +281,14 @@ def test_numbers_that_are_read_in_two_ways_are_said_in_both():
         "tremor_share": Estimate(0.0133, "1", 0.0033),
         "coefficient_of_variation": Estimate(0.02013, "1", 0.00078),
     }
-    rows = {line.split()[0]: line for line in str(made_result(derived=derived)).splitlines() if "±" in line}
-    assert rows["tremor_share"].endswith("> 4.6 Hz")
+    text = str(made_result(derived=derived))
+    rows = {line.split()[0]: line for line in text.splitlines() if "±" in line}
+    assert rows["tremor_share"].endswith("0.0133 ± 0.0033")
+    assert "\n  tremor_share: counted from 4.6 Hz on, half of the tremor's frequency\n" in text
     assert rows["coefficient_of_variation"].endswith("= 2.01 %")
     assert rows["tremor_frequency"].endswith(" Hz")
     alone = {"tremor_share": Estimate(0.0133, "1", 0.0033)}  # the frequency is not determined
-    assert "above" not in str(made_result(derived=alone))
+    assert not any(word in str(made_result(derived=alone)) for word in ("above", "counted from"))
 
 
 def test_a_fit_that_misses_the_data_says_so_first():
@@ -298,7 +300,7 @@ def test_a_fit_that_misses_the_data_says_so_first():
     words = " ".join(" ".join(rest).split())
     for part in (
         f"errors are widened by a factor of {np.sqrt(145 / 25):.2g}",
-        "Measured, and so not widened: coefficient of variation",
+        "Not widened, since measured directly: coefficient of variation",
         "what to do: do not interpret",
         "would be determined if the model held (per newton of mean force):",
     ):
@@ -691,4 +693,5 @@ def test_a_harmonic_that_may_be_elsewhere_says_with_which_probability(share, wor
     """A small one is not rounded to nothing, and the limit stands beside it."""
     said = may_be_elsewhere(share)
     assert f"a probability of {words} it is more than a bin" in said
-    assert said.endswith("no errors (none are stated above 0.1 %)" if share < 0.1 else "no errors")
+    stated = "So no standard errors are stated for the harmonic"
+    assert said.endswith(f"{stated} (a probability above 0.1 % is enough for that)" if share < 0.1 else stated)

@@ -190,13 +190,14 @@ def test_every_part_of_the_chosen_model_says_what_it_gains_over_the_poorer_one()
         "with activation the AIC falls by 50.0 (chi2 per bin 4.00 instead of 9.00)",
         "with tremor instead of the harmonic the AIC rises by 0.5 (chi2 per bin 4.05 instead of 4.00)",
     )
-    assert f"2 or less says nothing. jaxmuscle compare asks for at least {NEEDED:g}, and" in said[-1]
+    assert f"2 or less says nothing. jaxmuscle compare is stricter: it needs at least {NEEDED:g}, and" in said[-1]
     assert "no p-value" in said[-1] and "No model" not in said[-1]
 
 
 def test_a_model_that_is_missing_in_the_table_is_explained():
     (said,) = passed_over(tried((0, -10.0), (2, -60.0), chosen=2))
-    assert said.startswith("model 1 was not tried: model 0 describes the data without it") and "model 2 was tried" in said
+    assert said.startswith("model 1 was not tried, since model 0 already describes the data. ")
+    assert "the harmonic of model 0 may be a tremor" in said and "model 2 was tried" in said
     assert passed_over(tried((0, -10.0), (1, -20.0), chosen=1)) == ()
     failed = tuple(rung._replace(p=0.001) for rung in tried((0, -10.0), (2, -60.0), chosen=2))
     assert passed_over(failed) == ()  # it was tried, and had no finite spectrum
@@ -223,9 +224,9 @@ def test_where_no_model_describes_the_data_a_lower_aic_does_not_show_a_part():
 
 
 @pytest.mark.parametrize(("interval", "words"), [
-    ((0.15, 0.31), "(0.15 to 0.31 s) is longer than in human muscle, 0.05 to 0.11 s: it also takes up"),
+    ((0.15, 0.31), "(0.15 to 0.31 s) is longer than in human muscle, 0.05 to 0.11 s. It also stands for"),
     ((0.111, None), "(above 0.111 s) is longer"),
-    ((0.01, 0.049), "(0.01 to 0.049 s) is shorter than in human muscle, 0.05 to 0.11 s: the relaxation"),
+    ((0.01, 0.049), "(0.01 to 0.049 s) is shorter than in human muscle, 0.05 to 0.11 s. The relaxation"),
     ((None, 0.03), "(below 0.03 s) is shorter"),
     ((0.09, 0.31), ""),
     ((0.01, 0.06), ""),

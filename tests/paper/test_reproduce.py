@@ -155,12 +155,12 @@ def test_only_what_tests_the_model_is_counted_for_it():
     rows = [row(TESTED, v) for v in (AGREES, GRID, DIFFERS, DIFFERS, UNCHECKED)]
     rows += [row(FITTED, v) for v in (AGREES, DIFFERS)] + [row(GIVEN, AGREES)] * 3 + [row(ARITHMETIC, GRID)]
     assert counted(rows) == (
-        "Of 11 statements 5 test the model: 2 agree (1 within the grid), 2 do not, 1 cannot be checked. "
+        "Of 11 statements 5 test the model: 2 agree (1 within our resolution), 2 do not, 1 cannot be checked. "
         "Not counted for it: 2 fitted (1 of them not met), 3 put in, 1 arithmetic."
     )
     assert {row.kind for row in rows} == set(KINDS)
     assert outcome([row(TESTED, GRID), row(TESTED, DIFFERS)]) == (
-        "1 agrees (1 within the grid), 1 does not, 0 cannot be checked"
+        "1 agrees (1 within our resolution), 1 does not, 0 cannot be checked"
     )
 
 

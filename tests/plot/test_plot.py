@@ -254,7 +254,7 @@ def result(**changes):
     residual = np.resize([0.5, -1.5, 2.5, -0.5], f.size)
     fields = {
         "success": True,
-        "message": "converged: 28 of 100 starts end at this fit",
+        "message": "converged: 28 of 100 starts reach a fit as good as this (cost within 5 %)",
         "adequate": True,
         "adequacy_p": 0.2,
         "verdict": "describes the data: chi2 per bin 1.2, p = 0.2",
@@ -279,7 +279,7 @@ def result(**changes):
         "model": "Isometric, BandLimitedNoise",
         "residual": residual,
         "deviation": np.full(f.size, 0.3),
-        "undetermined": ("stiffness and damping can all be multiplied by one number",),
+        "undetermined": ("all stiffness and damping can be multiplied by one number",),
         "per_newton": {},
         "stretch": (10 + np.arange(500) / 100, 5 + 0.01 * np.sin(np.arange(500))),
         "starts": ((), ()),
@@ -824,7 +824,7 @@ def test_numbers_of_axes():
 def test_small_singular_values_are_counted_and_the_legend_says_so():
     figure = plot.identifiability(identified())
     upper = figure.axes[0]
-    assert key(figure) == ["determined", "not determined", "so many below 0.01"]
+    assert key(figure) == ["determined", "not determined", "how many below 0.01"]
     counts = [text.get_text() for text in upper.texts if text.get_text().isdigit()]
     assert counts == ["2", "2", "2", "2"]  # with two measurements together none is too small
     shares = [text.get_text() for text in upper.texts if text.get_text().endswith(" of 7")]

@@ -78,7 +78,7 @@ def test_the_mean_of_a_squared_gaussian(x64):
 def test_linear_numbers_come_with_a_warning_where_first_order_ends():
     loud = jm.Isometric().replace(harmonic_amplitude=0.3)
     for number in (jm.expected_spectrum, jm.sensitivity, lambda task: jm.at_level(task, 0.5)):
-        with pytest.warns(FirstOrderWarning, match=r"first order ends here: the second order adds about .* of the power"):
+        with pytest.warns(FirstOrderWarning, match=r"is not exact here: what it leaves out adds about .* to the power"):
             number(loud)
     target = jm.Target("x", np.ones(30), segments=[12])
     with pytest.warns(FirstOrderWarning):

@@ -19,8 +19,10 @@ from jaxmuscle.spectra._bin_law import bin_statistics, log_power_moments, shares
 BINS = np.arange(1, 31)
 FLAT = np.full(30, 1 / 30)
 NAMES = ("k_w", "k_z", "c_w", "c_z", "harmonic_amplitude", "harmonic_frequency", "noise_K_w", "noise_K_z")
-PERTURBATION = "all noise amplitudes and the harmonic's can be multiplied by one number"
-MECHANICS = "stiffness and damping can all be multiplied by one number"
+PERTURBATION = "all amplitudes of noise and harmonic can be multiplied by one number, and the fit stays as good"
+MECHANICS = (
+    "all stiffness and damping can be multiplied by one number, and the fit stays as good: at most their ratios are known"
+)
 # A published number of two digits stands for everything that rounds to it.
 TWO_DIGITS = 0.005
 

@@ -124,7 +124,7 @@ class GoodnessPart(Printed, Result, eqx.Module):
         place = f"{size[worst]:.1f} standard errors at {measured.known.frequency[worst]:.2f} Hz"
         if p["largest_point"] < SMALL_P:
             return first, f"one point stands out: it is off by {place}, {probability(p['largest_point'])}"
-        return first, f"no point stands out: the one furthest off is so by {place}, {probability(p['largest_point'])}"
+        return first, f"no point stands out: the largest distance is {place}, {probability(p['largest_point'])}"
 
     def _of_spectrum(self) -> tuple[str, str, str]:
         p, seen = self.p_values, self.observed
@@ -135,12 +135,12 @@ class GoodnessPart(Printed, Result, eqx.Module):
             f"the {thing} is worse than expected",
             f"the {thing} is as good as expected",
             f"the {thing} is better than it should be",
-            "more segments than stated, or a smoothed spectrum?",
+            "was the spectrum made of more segments than stated, or smoothed?",
         )
         usual, runs = float(np.mean(self.reference["runs"])), f"{seen['runs']:.0f} runs of equal sign"
         if p["runs"] < SMALL_P:
             second = (f"the residuals have fewer runs than expected: {runs} where {usual:.1f} are usual, {said['runs']}; "
-                      "something slow in frequency is missing")  # fmt: skip
+                      f"the {thing} is too high or too low over whole ranges of frequency")  # fmt: skip
         else:
             second = f"the residuals change sign as often as expected: {runs}, {usual:.1f} usual, {said['runs']}"
         worst = int(np.argmax(np.abs(self.residual)))
@@ -152,10 +152,11 @@ class GoodnessPart(Printed, Result, eqx.Module):
         return first, second, third
 
     def __str__(self) -> str:
-        done = "foretold by fits of replicates" if self.foretold else "each fitted anew"
-        count, law = len(next(iter(self.reference.values()))), f", {self.law} law" * bool(self.residual.size)
+        done = "predicted by fits of simulated data" if self.foretold else "fitted again"
+        count, scatter = len(next(iter(self.reference.values()))), "bins" if self.law == "gamma" else "logarithms of bins"
+        law = f" ({scatter} scatter by a {self.law} distribution)" * bool(self.residual.size)
         what = " and ".join(["spectra"] * bool(self.residual.size) + ["dynamic stiffnesses"] * bool(self._points))
-        head = f"{self.target.name}: against {count} {what} drawn from the fit, {done}{law}"
+        head = f"{self.target.name}: compared with {count} {what} that were drawn from the fit and {done}{law}"
         return folded([head, *(f"- {sentence}" for sentence in self.sentences)])
 
 

@@ -162,7 +162,8 @@ class Bootstrap(Printed, Result, eqx.Module):
         tails = [f"{q.name} ({q.core:.2f})" for q in self.quantities.values()
                  if q.verdict == "error too small" and q.core < 1 + (q.ratio - 1) / 2]  # fmt: skip
         if tails:
-            said.append(f"mostly by a few far refits; the middle 68 % over the stated error: {', '.join(tails)}")
+            said.append("the large scatter comes mostly from a few outlying refits. Without them (middle 68 %), spread over "
+                        f"stated error: {', '.join(tails)}")  # fmt: skip
         biased = [q.name for q in self.quantities.values() if abs(q.bias) > max(0.5 * q.stated, 3 * q.bias_stderr)]
         if biased:
             said.append(f"off by more than half a standard error on average: {', '.join(biased)}")

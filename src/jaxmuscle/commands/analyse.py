@@ -82,9 +82,7 @@ def analyse(
             return _write_perturbed(
                 read_perturbed(paths, reading, windows_of(window, len(paths)))[0], str(spectrum), output, formats_of(formats)
             )
-        unused(
-            reading, *READING, what="recordings with a moved insertion, whose columns --force-column and --displacement name"
-        )
+        unused(reading, *READING, what="recordings of a moved insertion, which need --force-column and --displacement")
         _write(read_trials(paths, reading, window), str(spectrum), mvc, output, formats_of(formats), save_target)
 
 
@@ -161,14 +159,15 @@ def _write_perturbed(recording: "PerturbedRecording", settings: str, folder: Pat
     for line in str(response).splitlines():
         if line.startswith(("  gain", "  phase", "  coherence")):
             out.print(plain(line), highlight=False)
-    table = Table(title="H = K + iωB - ω²I, and a delay", title_justify="left", show_header=False)
+    title = "Spring K, damper B, mass I:\nH = K + iωB - ω²I, and a delay"
+    table = Table(title=title, title_justify="left", show_header=False)
     for name, (value, error, unit) in classical.items():
-        told = name != "delay" or error < VAGUE
-        table.add_row(name, *((" ± ".join(rounded(value, error)), unit) if told else ("not told by this response", "")))
+        told = (" ± ".join(rounded(value, error)), unit)
+        table.add_row(name, *(told if name != "delay" or error < VAGUE else ("not determined by this response", "")))
     out.print(table)
     if misfit > MISSED:
-        out.print(f"This line misses the points: its chi2 is {misfit:.2g} times what it should be. The muscle is more than "
-                  "a spring, a damper and a mass, so do not interpret K, B and I. Fit it: jaxmuscle fit FILE --task "
-                  "prescribed-length", highlight=False)  # fmt: skip
+        out.print(f"A spring, a damper and a mass do not describe these points: their chi2 is {misfit:.2g} times what it "
+                  "should be. Do not interpret K, B and I. Fit a muscle: jaxmuscle fit FILE --task prescribed-length",
+                  highlight=False)  # fmt: skip
     record(found)
     out.print(f"Written: {folder}/{', '.join(['analysis.json', 'response.csv', *figures])}", highlight=False)

@@ -25,7 +25,7 @@ FILES = ("cohort.csv", "differences.csv", "cohort.png", "cohort.pdf", "cohort.sv
 SHOWN = {
     "harmonic_frequency": "harmonic (Hz)",
     "corner_frequency": "corner (Hz)",
-    "harmonic_share": "share",
+    "harmonic_share": "harmonic\nshare",
     "high_frequency_floor": "floor",
 }
 CHI2 = "chi² per bin: squared distance of spectrum and fit in standard deviations, mean over the bins"

@@ -109,12 +109,13 @@ def _write(found: "Comparison", folder: Path, formats: list[str]) -> list[str]:
 def _unsettled(found: "Comparison") -> str:
     """Whose search did not come to its end, and what may help: holding a parameter that the data say little about."""
     rows = [row for row in found.rows if not row.success]
-    words = f"the search did not come to its end for {'; '.join(row.label for row in rows)}. Do not use these rows"
+    words = f"the search did not converge for {'; '.join(row.label for row in rows)}. Do not use these rows"
     tasks = [found.tasks[row.noise, row.harmonic] for row in rows]
     common = set[str].intersection(*(set(task.parameter_names) for task in tasks))
     name = "resonance_width" if "resonance_width" in common else "c_z"
     value = float(tasks[0][name])
-    return f"{words}. Hold a parameter of theirs, for example --fix {name}={value:.2g}, or leave it out of --free"
+    return (f"{words}. To help the search, fix a parameter of these models, for example --fix {name}={value:.2g}, or leave "
+            "that parameter out of --free")  # fmt: skip
 
 
 def _show(found: "Comparison", files: str) -> None:

@@ -41,7 +41,7 @@ def task_of(preset: str, task: TaskName | None, observe: Observed | None = None)
         return model
     if not isinstance(model, jm.PrescribedForce):
         raise ValueError(
-            f"--observe {observe}: in {type(model).__name__} no motion is the output; add --task prescribed-force"
+            f"--observe {observe}: the output of {type(model).__name__} is no motion; add --task prescribed-force"
         )
     return model.with_parts(observe=str(observe))
 
@@ -185,7 +185,7 @@ def fit_into(folder: Path, target: str, read: dict[str, Any], asked: dict[str, A
 def _fitted(target: str, read: dict[str, Any], asked: dict[str, Any], seed: int) -> "FitResult":
     path = Path(target)
     if path.suffix == ".json" and path.is_file() and b'"task_table"' in path.read_bytes():
-        if given := [f"--{name}" for name, value in (asked | read).items() if name != "noise" and value is not None]:
+        if given := [f"--{name}" for name, value in (asked | read).items() if value is not None]:
             raise ValueError(f"{target}: is a fit; its task, parameters and target stay as they are, so leave out "
                              f"{', '.join(given)}")  # fmt: skip
         return jm.load_result(path)

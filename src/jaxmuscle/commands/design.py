@@ -90,9 +90,9 @@ def design(
         fit = f"jaxmuscle fit RECORD.csv --task prescribed-length --window {begin:g}:{end:g}"
         out.print(f"    {fit} --out out/moved", highlight=False, soft_wrap=True)
         out.print(folded([
-            "- The errors above count what is known now. To reach them, fit with it what you have recorded so far: a moved "
-            "record as a second file, a hold with --hold. The window is that of the new record; let the others be found "
-            "(one auto for each):",
+            "- The errors above include what earlier recordings tell, if you design from their fit. To reach them, fit "
+            "these together with the new record: give an earlier moved record as a second file, and a hold with --hold. In "
+            "--window, give the window of the new record first, then one auto for each other file:",
         ]), highlight=False)  # fmt: skip
         out.print(f"    jaxmuscle fit RECORD.csv --hold HOLD.csv --window {begin:g}:{end:g},auto --out out/both",
                   highlight=False, soft_wrap=True)  # fmt: skip

@@ -35,7 +35,7 @@ class Generator(StrEnum):
 
 def ensemble(
     preset: Preset,
-    seeds: Annotated[int, typer.Option(help="How many noise paths to simulate.")],
+    seeds: Annotated[int, typer.Option(help="How many recordings to simulate, each with its own noise.")],
     output: Annotated[
         str,
         typer.Option("--out", metavar="FILE.zarr", help="Where the store is written: a folder, or a URL such as s3://..."),
@@ -49,7 +49,7 @@ def ensemble(
             metavar="NAME=VALUES", help="Simulate several values of a parameter, as k_w=4e5,5e5; give it again for a grid."
         ),
     ] = None,
-    duration: Annotated[float, typer.Option(help="Simulated time of each noise path in s.")] = 15.0,
+    duration: Annotated[float, typer.Option(help="Length of each recording in s.")] = 15.0,
     dt: Annotated[float, typer.Option(help="Time step of the noise in s.")] = 1e-3,
     reduce: Annotated[
         bool, typer.Option("--reduce", help="Keep means, variances, quantiles and the mean spectrum, not the trajectories.")
@@ -63,14 +63,17 @@ def ensemble(
     precision: Annotated[Precision, typer.Option(help="Precision of the simulation.")] = Precision.single,
     increments: Annotated[
         Increments,
-        typer.Option(help="Kind of random numbers; weak ones are faster, with the same means, and need --reduce."),
+        typer.Option(
+            help="Random numbers: gaussian, or weak (cheaper and faster, good for means and spectra, not for single "
+            "traces). weak needs --reduce."
+        ),
     ] = Increments.gaussian,
     generator: Annotated[
         Generator, typer.Option(help="Generator of the random numbers; threefry is that of JAX, and slower.")
     ] = Generator.hash,
     chunk: Annotated[
         int | None,
-        typer.Option(min=1, max=2**32, help="How many noise paths are simulated at once; chosen for you by default."),
+        typer.Option(min=1, max=2**32, help="How many recordings are simulated at once; chosen for you by default."),
     ] = None,
     threads: Threads = None,
     coordinator: Annotated[
@@ -81,7 +84,7 @@ def ensemble(
     force: Force = False,
     as_json: Json = False,
 ) -> None:
-    """Simulate any number of noise paths (seeds) on all cores, into a zarr store; an interrupted run can be continued.
+    """Simulate any number of recordings (seeds) on all cores, into a zarr store; an interrupted run can be continued.
 
     The store is a folder that xarray reads. It has the dimensions seed, time and frequency (and point with --vary). Its
     attribute `complete` is set last.

@@ -66,7 +66,10 @@ def fit(
     task: TargetTask = None,
     method: Annotated[
         MethodName,
-        typer.Option(help="linear: the spectrum follows from a formula and is then corrected. montecarlo: it is simulated."),
+        typer.Option(
+            help="linear: the model's spectrum comes from a formula, corrected by simulations at the end. montecarlo: it is "
+            "simulated."
+        ),
     ] = MethodName.linear,
     noise: Noise = None,
     rungs: Annotated[
@@ -79,7 +82,10 @@ def fit(
         ),
     ] = None,
     residual: Annotated[
-        ResidualName, typer.Option(help="Compare the log of the powers, the powers themselves, or their running sums.")
+        ResidualName,
+        typer.Option(
+            help="What is compared: log, the logarithm of the powers; linear, the powers; cumulative, their running sums."
+        ),
     ] = ResidualName.log,
     free: Free = None,
     fix: Fix = None,
@@ -88,17 +94,23 @@ def fit(
         typer.Option(
             min=1,
             help="How many starting points the search has: 100 by default, 32 with --hold and for each richer model, "
-            "8 if the spectrum has no formula.",
+            "8 if the task has no linear response.",
         ),
     ] = None,
     seeds: Annotated[
         int | None,
-        typer.Option(min=1, help="How many noise paths are simulated: 32 by default, 48 if the spectrum has no formula."),
+        typer.Option(
+            min=1,
+            help="How many recordings are simulated, each with its own noise: 32 by default, 48 if the task has no linear "
+            "response.",
+        ),
     ] = None,
     increments: Annotated[
         Increments | None,
         typer.Option(
-            help="Kind of random numbers in simulations; weak ones are faster, with the same means.", show_default="gaussian"
+            help="Random numbers of simulations: gaussian, or weak (cheaper and faster, good for means and spectra, not for "
+            "single traces).",
+            show_default="gaussian",
         ),
     ] = None,
     seed: Seed = 0,
@@ -140,8 +152,8 @@ def fit(
     DIR/stiffness.csv holds the dynamic stiffness, measured and fitted.
 
     With --hold recordings of the held insertion are fitted together with those of the moved one: same muscle, one P_w for
-    the moved ones and one for the holds. The table comes at the end. The tables of the spectra are DIR/spectrum-moved.csv,
-    DIR/spectrum-held.csv, and DIR/stiffness-moved.csv.
+    the moved ones and one for the holds. Here the table is printed only at the end. The tables of the spectra are
+    DIR/spectrum-moved.csv, DIR/spectrum-held.csv, and DIR/stiffness-moved.csv.
 
     Several spectra are taken as those of several people. They are fitted together, by the formula of the spectrum alone,
     without simulation.

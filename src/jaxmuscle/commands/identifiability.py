@@ -50,6 +50,6 @@ def identifiability(
         out.print(f"Written: {output}/{', '.join(['identifiability.json', *figures, 'fit.json'])}", highlight=False)
         stiffness = found.present.quantities.get("K_w0")
         if stiffness is not None and not stiffness.determined:
-            out.print("How long must a record with a moved insertion be? Ask for the standard error that you want, with an "
-                      f"even motion to begin with: jaxmuscle design {output}/fit.json --quantity K_w0 --error 10 --spread 1",
+            out.print("How long must a record with a moved insertion be? For a standard error of 10 %, beginning with a "
+                      f"flat motion, ask: jaxmuscle design {output}/fit.json --quantity K_w0 --error 10 --spread 1",
                       highlight=False, soft_wrap=True)  # fmt: skip

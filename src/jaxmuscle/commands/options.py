@@ -82,7 +82,11 @@ Noise = Annotated[
 ]
 Free = Annotated[
     str | None,
-    typer.Option(metavar="NAMES", help="Fit these parameters instead of the usual ones; put commas between names."),
+    typer.Option(
+        metavar="NAMES",
+        help="Fit these parameters instead of the usual ones; put commas between names. Then `jaxmuscle fit` tries no "
+        "richer model, unless you give --rungs.",
+    ),
 ]
 Fix = Annotated[
     list[str] | None,
@@ -91,7 +95,7 @@ Fix = Annotated[
 Segments = Annotated[
     int | None,
     typer.Option(
-        min=1, max=10**9, help="How many Welch segments were averaged. From it follows how well the spectrum is known."
+        min=1, max=10**9, help="How many Welch segments were averaged. This number says how much each bin scatters."
     ),
 ]
 Quantity = Annotated[str | None, typer.Option(help="What was measured: force, torque, displacement or acceleration.")]
@@ -99,8 +103,8 @@ Window = Annotated[
     str | None,
     typer.Option(
         metavar="A:B",
-        help="Analyse from A to B in s, or `all`, or `auto` (the default): the steady part is found. One for each file: "
-        "A:B,auto.",
+        help="Part to analyse: A:B (from A to B in s), all, or auto (default: the program finds the steady part). For "
+        "several files, one each: A:B,auto (not in a study).",
     ),
 ]
 Holds = Annotated[
@@ -131,7 +135,17 @@ _Units = Annotated[
     str | None, typer.Option(metavar="U", help="Unit of the signal: N, Nm, mm, m/s^2, % MVC, ...; by default the file's.")
 ]
 _Reference = Annotated[str | None, typer.Option(metavar="NAME", help="Column or point that is subtracted from the signal.")]
-_Time = Annotated[str | None, typer.Option(metavar="NAME", help="Column that holds the time, if it is not found by itself.")]
+_Time = Annotated[
+    str | None, typer.Option(metavar="NAME", help="Column that holds the time, if the program does not find it.")
+]
+_Arm = Annotated[
+    float | None,
+    typer.Option(
+        metavar="M",
+        help="Distance in m from the joint's axis to the point where the force acts. A torque is divided by it and becomes "
+        "a force in N; an angle becomes a displacement.",
+    ),
+]
 READING: dict[str, tuple[Any, Any]] = {  # how a recording is read: annotation and default of each option
     "column": (_Name, None),
     "rate": (_Rate, None),
@@ -155,6 +169,7 @@ READING: dict[str, tuple[Any, Any]] = {  # how a recording is read: annotation a
         ],
         0.2,
     ),
+    "lever_arm": (_Arm, None),
 }
 _Force = Annotated[str | None, typer.Option(metavar="NAME", help="For a moved insertion: the column of the force.")]
 _Displacement = Annotated[
@@ -164,10 +179,6 @@ _Moved = Annotated[
     str | None,
     typer.Option(metavar="U", help="Unit of the displacement: m, cm, mm, um, deg or rad; by default the file's."),
 ]
-_Arm = Annotated[
-    float | None,
-    typer.Option(metavar="M", help="Distance in m from the joint's axis to the insertion, for a torque or an angle."),
-]
 _Positive = Annotated[
     str | None,
     typer.Option(help="What a positive displacement is: lengthening or shortening; by default found from the data."),
@@ -176,7 +187,6 @@ PERTURBED: dict[str, tuple[Any, Any]] = {  # the same for a file of force and di
     "force_column": (_Force, None),
     "displacement": (_Displacement, None),
     "displacement_units": (_Moved, None),
-    "lever_arm": (_Arm, None),
     "positive": (_Positive, None),
     "delay": (
         Annotated[

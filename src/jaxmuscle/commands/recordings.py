@@ -118,9 +118,9 @@ def read_with_holds(
         if recording.unit == "1":
             raise ValueError(f"--hold {recording.name}: has no unit. Give --units N if all files are in newtons")
         if recording.unit not in NEWTONS:
-            torque = " (a torque over the lever arm; --lever-arm serves the moved records alone)" * (recording.unit == "N m")
-            raise ValueError(f"--hold {recording.name}: is in {recording.unit}, and a moved record is fitted in N. Give the "
-                             f"hold in {', '.join(NEWTONS)}{torque}")  # fmt: skip
+            remedy = "Give --lever-arm" if recording.quantity == "torque" else f"Give the hold in {', '.join(NEWTONS)}"
+            raise ValueError(f"--hold {recording.name}: is in {recording.unit}, and a moved record is fitted in N. "
+                             f"{remedy}")  # fmt: skip
     return moved, held
 
 
@@ -132,8 +132,10 @@ def _hold(path: str, reading: dict[str, Any], edges: Any) -> Any:
         if not moves.rests:
             raise ValueError(f"--hold {path}: its column {both['displacement']} moves by {moves}, and in a hold the "
                              "insertion rests. Name this file among the moved records, before --hold")  # fmt: skip
-    options = {name: reading[name] for name in READING}
-    return read(table, options | {"column": named if named in table.columns else None, "reference": None}, edges)
+    options = {name: reading[name] for name in READING} | {"reference": None}
+    options["column"] = named if named in table.columns else None
+    as_it_is = read(table, options | {"lever_arm": None}, edges)  # in newtons, also where the moved records are torques
+    return as_it_is if as_it_is.quantity != "torque" else read(table, options, edges)
 
 
 def channels(table: "Table", reading: dict[str, Any]) -> dict[str, Any]:

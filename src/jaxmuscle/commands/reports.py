@@ -26,7 +26,7 @@ FIGURES = {
     "spectra": "Spectra of all people (thin), and the geometric mean of each group with its standard error (thick).",
     "corner": "What the data determine. Diagonal: density, median and 95 % interval. Below it: regions of 50, 80 and 95 %.",
     "predictive": "The target among spectra that the posterior predicts.",
-    "chains": "Every chain over its draws.",
+    "chains": "Each line is a chain. Lines that lie upon each other agree.",
 }
 
 
@@ -41,7 +41,7 @@ def fit_report(result: "FitResult", figure: Any, folder: Path) -> None:
         pages.table(PARAMETERS, rows["determined"]) if rows["determined"] else pages.paragraph("Nothing."),
         *_tried(result),
         pages.picture(figure, FIGURES["fit" if _has_spectrum(result) else "stiffness"]),
-        pages.heading("What it means"),
+        pages.heading("What to know about this fit"),
         pages.items(card.remarks),
         *([pages.paragraph("The data leave open:"), pages.items(result.undetermined)] if result.undetermined else []),
         pages.heading("What to do next"),
@@ -158,7 +158,7 @@ def posterior_report(found: "Posterior", figures: dict[str, Any], folder: Path, 
         body += [pages.heading("What the data determine"), pages.table(columns, rows[True])]
         body += _pictures(figures, drawn)
         body += [pages.heading("What the data do not determine"),
-                 pages.paragraph("The prior keeps these where they are. Do not interpret them."),
+                 pages.paragraph("These come from the prior. Do not interpret them."),
                  pages.table(columns, rows[False])] if rows[False] else []  # fmt: skip
         after = (
             "Report medians with their 95 % intervals, R-hat and the effective sample sizes.",
@@ -169,9 +169,11 @@ def posterior_report(found: "Posterior", figures: dict[str, Any], folder: Path, 
         after = (
             "Do not use these draws.",
             "Draw longer: `--warmup 2000 --draws 4000`.",
-            "Or fix what the data do not determine: `--fix NAME=VALUE`.",
+            "Or fit again with some of the parameters fixed that the data do not determine "
+            "(`jaxmuscle fit ... --fix NAME=VALUE`), and draw from that fit.",
         )
-    body += [pages.heading("What it means"), pages.code(str(found)), pages.heading("What to do next"), pages.items(after)]
+    body += [pages.heading("What to know about this posterior"), pages.code(str(found))]
+    body += [pages.heading("What to do next"), pages.items(after)]
     body += _data({name: part.target for name, part in found.parts.items()})
     body += _how(found.settings | {"seed": found.seed}, found.versions)
     pages.write_page(folder / REPORT, f"Posterior of {found.title}", body)
@@ -210,7 +212,7 @@ def _after_a_fit(result: "FitResult", path: Path) -> list[str]:
     place, other = shlex.quote(str(path)), shlex.quote(str(path.parent / "compare"))
     if not result.adequate:
         return [
-            "Report that the model does not describe the data, and no number of the model.",
+            "Report that the model does not describe the data, and report none of its numbers.",
             "Mean, variation, bands and peak need no model: `jaxmuscle steadiness RECORDING`.",
             "Look at the residuals: orange-red bars are where the model misses the data.",
             "See whether the recording drifts: `jaxmuscle analyse RECORDING`.",
@@ -240,7 +242,7 @@ def _data(targets: dict[str, Any]) -> list[Html]:
 def _how(settings: dict[str, Any], versions: dict[str, str]) -> list[Html]:
     """The command, settings and versions."""
     return [
-        pages.heading("To make it again"),
+        pages.heading("How to repeat this"),
         pages.code(shlex.join(["jaxmuscle", *sys.argv[1:]])),
         pages.settings_table({SPELT_OUT.get(name, name): value for name, value in settings.items()}),
         pages.paragraph("Versions: " + ", ".join(f"{name} {number}" for name, number in versions.items())),

@@ -18,7 +18,7 @@ def simulate(
     preset: Preset,
     task: OtherTask = None,
     observe: Observe = None,
-    seeds: Annotated[int, typer.Option(min=1, help="How many noise paths to simulate.")] = 50,
+    seeds: Annotated[int, typer.Option(min=1, help="How many recordings to simulate, each with its own noise.")] = 50,
     seed: Seed = 0,
     output: Output = Path("out"),
     formats: Formats = None,

@@ -17,8 +17,8 @@ def speed(
         str | None, typer.Argument(help="A preset or a fit.json; by default the usual isometric task.")
     ] = None,
     task: OtherTask = None,
-    seeds: Annotated[int, typer.Option(min=1, help="How many noise paths to simulate.")] = 2048,
-    duration: Annotated[float, typer.Option(help="Simulated time of each noise path in s.")] = 15.0,
+    seeds: Annotated[int, typer.Option(min=1, help="How many recordings to simulate, each with its own noise.")] = 2048,
+    duration: Annotated[float, typer.Option(help="Length of each recording in s.")] = 15.0,
     precision: Annotated[Precision, typer.Option(help="Precision of the simulation.")] = Precision.single,
     threads: Threads = None,
     as_json: Json = False,

@@ -30,6 +30,8 @@ if TYPE_CHECKING:
 
 FORMAT = 1
 NEEDED = 6.0
+LEGEND = ("  line: with a harmonic. par: effective number of parameters. weight: Akaike weight. p: of the verdict. "
+          "held-out: score for bins left out, minus that of the first row, ± standard error")  # fmt: skip
 NUMBERS = ("log_likelihood", "parameters", "aic", "delta_aic", "weight", "score", "score_difference", "score_stderr",
            "chi2_per_bin", "adequacy_p")  # fmt: skip
 COLUMNS = ("noise", "harmonic", *NUMBERS, "adequate", "success")
@@ -77,14 +79,14 @@ class Decision(Printed, Result, eqx.Module):
             gain = self.score_gain if self.aic_gain >= 0 else -self.score_gain
             numbers += f", held-out score {'higher' if gain >= 0 else 'lower'} by {abs(gain):.1f} ± {self.score_stderr:.1f}"
         if self.winner is not None:
-            return f"{better} rather than {worse}: {numbers}"
+            return f"the data prefer {better} to {worse}: {numbers}"
         open_ = f"{better} and {worse} cannot be told apart"
         if self.unsettled:
             whose = " and of ".join(self.unsettled)
-            return f"{better} and {worse} are not compared: the search of {whose} did not come to its end"
+            return f"{better} and {worse} are not compared: the search of {whose} did not converge"
         if abs(self.aic_gain) >= self.needed:
-            return f"{open_}: the two measures disagree, {numbers}"
-        return f"{open_}: {numbers}; {self.needed:.3g} in AIC is needed"
+            return f"{open_}: AIC and held-out score disagree (for {better}: {numbers})"
+        return f"{open_} (for {better}: {numbers}); to tell them apart, the AIC must differ by {self.needed:.3g} or more"
 
 
 def decided(names: tuple[str, str], a: Evidence, b: Evidence, needed: float = NEEDED) -> Decision:
@@ -231,7 +233,7 @@ class Comparison(Printed, Result, eqx.Module):
         if not known:
             return "whether any model describes the data cannot be judged: the target states neither segments nor sigma"
         if not fine:
-            return "none of the models describes the data (p < 0.01 for each): the best of them is still not to be believed"
+            return "none of the models describes the data (p < 0.01 for each): do not believe the best of them either"
         every = len(fine) == len(self.rows)
         return "every model describes the data" if every else f"these describe the data (p >= 0.01): {'; '.join(fine)}"
 
@@ -323,6 +325,7 @@ class Comparison(Printed, Result, eqx.Module):
             line += f"{_short(row.delta_aic):>9}{row.weight:>7.2f}"
             line += f"{'' if p is None else probability(p).removeprefix('p ').removeprefix('= '):>9}"
             lines.append(f"{line}  {held if row.success else 'failed'}")
+        lines.append(LEGEND)
         said = [f"left out: {noise}: {why}" for noise, why in self.left_out.items()]
         for sentence in (self.adequate, *self.verdict, *said):
             lines.append(f"- {sentence}")

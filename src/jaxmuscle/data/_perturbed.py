@@ -316,7 +316,8 @@ def _sign(force: Recording, displacement: Recording, positive: str | None) -> tu
         return 1.0, [f"the sign of the displacement is not checked: {error}"]
     if abs(found) < SURE**2:
         return 1.0, ["the sign of the displacement is not found, since the force hardly follows it: lengthening is taken as "
-                     "positive. If you know the sign, say so: positive='lengthening' or 'shortening'"]  # fmt: skip
+                     "positive. If you know the sign, give --positive lengthening or --positive shortening (Python: "
+                     "positive=)"]  # fmt: skip
     if found < 0:
         return -1.0, ["the displacement counts shortening as positive: its sign is turned"]
     return 1.0, []

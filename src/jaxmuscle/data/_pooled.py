@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 DRIFT = 0.5  # share of the variance
 UNLIKE = 1.1  # ratio of the means of two trials
 UNRAMPED = "steady part: no ramp found, so all of the recording is used"
-FOUND = "steady part found by itself: "
+FOUND = "steady part found automatically: "
 
 
 def pooled_target(
@@ -96,6 +96,6 @@ def _drift(x: Float[np.ndarray, " times"]) -> tuple[str, ...]:
     if after**2 > DRIFT * before**2:
         return ()
     mean = abs(float(np.mean(x)))
-    return (f"a straight drift makes {100 * (1 - (after / before) ** 2):.0f} % of the variance: coefficient of variation "
-            f"{before / mean:.3g} with it, {after / mean:.3g} without; the model knows no drift, so remove it first "
-            "(scipy.signal.detrend, and add the mean), or choose a steadier window",)  # fmt: skip
+    return (f"a straight drift makes {100 * (1 - (after / before) ** 2):.0f} % of the variance. The coefficient of "
+            f"variation is {before / mean:.3g} with the drift, {after / mean:.3g} without. The model has no drift: remove "
+            "it first (scipy.signal.detrend, and add the mean), or choose a steadier window",)  # fmt: skip

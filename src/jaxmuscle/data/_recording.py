@@ -85,19 +85,10 @@ class Recording(Shown, eqx.Module):
         self.window = None if window is None else self._checked(window)
 
     @classmethod
-    def from_dataframe(
-        cls,
-        frame: Any,
-        *,
-        column: str | int | None = None,
-        rate: float | int | None = None,
-        units: str | None = None,
-        axis: str | None = None,
-        reference: str | int | None = None,
-        time: str | int | None = None,
-        max_gap: float | int = 0.2,
-        name: str = "recording",
-    ) -> "Recording":
+    def from_dataframe(cls, frame: Any, *, column: str | int | None = None, rate: float | int | None = None,
+                       units: str | None = None, axis: str | None = None, reference: str | int | None = None,
+                       time: str | int | None = None, max_gap: float | int = 0.2, lever_arm: float | int | None = None,
+                       name: str = "recording") -> "Recording":  # fmt: skip
         """A recording from a pandas table, by the rules for tables in files.
 
         **Arguments:** `frame`, a `pandas.DataFrame`. Its times are a column, or the index: numbers in s, a `DatetimeIndex`
@@ -105,7 +96,8 @@ class Recording(Shown, eqx.Module):
 
         **Raises:** `ValueError` naming column, row or argument, and the remedy.
         """
-        return recording_of(cls, frame_table(frame), Reading(column, rate, units, axis, reference, time, max_gap), name)
+        reading = Reading(column, rate, units, axis, reference, time, max_gap, lever_arm)
+        return recording_of(cls, frame_table(frame), reading, name)
 
     @classmethod
     def from_array(cls, samples: Any, rate: float | int, *, column: int = 0, unit: str = "N", name: str = "recording",
@@ -206,10 +198,10 @@ class Recording(Shown, eqx.Module):
             everything = (0, even.whole.size)
             found = everything if self.quantity == "acceleration" else plateau(even.whole, even.rate)
             if found is None:
-                raise ValueError(f"{self.name}: no plateau found: the force did not stay within 10 % of one level for half "
-                                 "of the time that it was above half of that level; give the window, "
-                                 f"{self.start:g} <= a < b <= {self.stop:g} s, as steady((a, b)), or "
-                                 "--window a:b")  # fmt: skip
+                raise ValueError(f"{self.name}: no steady part was found: the signal must stay within 10 % of one level for "
+                                 "at least half of the time under load, and longer than 2 s. Give the part yourself: "
+                                 "--window a:b (in Python steady((a, b))), between "
+                                 f"{self.start:g} and {self.stop:g} s")  # fmt: skip
             window = (self.start + found[0] / even.rate, min(self.start + found[1] / even.rate, self.stop))
             notices = (*notices, UNRAMPED if found == everything else f"{FOUND}{window[0]:.2f} s to {window[1]:.2f} s")
         part = self._with(self.whole, self.rate, window, notices)

@@ -15,7 +15,7 @@ from jaxmuscle.spectra._settings import require
 from ._recording_quality import filled
 from ._recording_table import AXES, Table, bare, find, listed, points, triple, values
 from ._recording_time import clock, sampling
-from ._units import UNITS, known_unit, quantity_of
+from ._units import UNITS, known_unit, quantity_of, scale_to_si
 
 FORCE = re.compile(r"force|torque|moment|kraft|drehmoment|f_?[xyz]?")  # what a column of force is called
 
@@ -36,11 +36,12 @@ class Reading(NamedTuple):
     reference: str | int | None = None
     time: str | int | None = None
     max_gap: float | int = 0.2
+    lever_arm: float | int | None = None
 
 
 def recording_of(make: Callable[..., Any], table: Table, reading: Reading, name: str | None = None) -> Any:
     """What `make`, the class of a recording, makes of a column, called `name` or as its file."""
-    column, rate, units, axis, reference, time, max_gap = reading
+    column, rate, units, axis, reference, time, max_gap, lever_arm = reading
     require(axis in (None, *AXES, "principal"), "axis", axis, "choose one of x, y, z, principal")
     require(isinstance(max_gap, int | float) and 0 <= max_gap < math.inf, "max_gap", max_gap, "give a time in s")
     times = clock(table, time)
@@ -51,6 +52,8 @@ def recording_of(make: Callable[..., Any], table: Table, reading: Reading, name:
     found, notices = sampling(table, chosen.columns[0], times, signal.shape[0], rate)
     notices = [*([chosen.told] if chosen.told else []), *notices]
     unit = _unit(table, chosen, units, axis, notices)
+    if lever_arm is not None:
+        signal, unit = _as_force(table, chosen.name, signal, unit, lever_arm, notices)
     file = Path(table.file)
     words = [file.name, f"column {chosen.name}" if axis is None else f"point {chosen.name}, axis {axis}"]
     words += [f"minus {reference}"] * (reference is not None) + [f"{found:.6g} Hz"]
@@ -98,6 +101,18 @@ def perturbed_of(
                     source=printable(source), notices=(*notices, *closed), **options)  # fmt: skip
     except ValueError as error:
         raise ValueError(f"{table.file}: {error}") from None
+
+
+def _as_force(table: Table, name: str, signal: Any, unit: str, lever_arm: Any, notices: list[str]) -> tuple[Any, str]:
+    """A torque over its lever arm, in N."""
+    try:
+        remedy = f"leave it out: it turns a torque into a force, and column {name} is in {unit}"
+        require(quantity_of(unit) == "torque", "lever_arm", lever_arm, remedy)
+        scale, _ = scale_to_si(unit, "units", "force", lever_arm)
+    except ValueError as error:
+        raise ValueError(f"{table.file}: {error}") from None
+    notices.append(f"the torque in {unit} was divided by the lever arm of {float(lever_arm):g} m: a force in N")
+    return scale * signal, "N"
 
 
 def signals(table: Table, time: str | int | None) -> list[str]:

@@ -68,19 +68,22 @@ def load_recording(  # pyright: ignore[reportInconsistentOverload]
     - `column`: name (case and unit may be left out) or number from 0; needed if there are several.
     - `force`, `displacement`: instead of `column`, the two channels of a perturbation experiment.
     - `rate` [Hz]: needed if the file does not state it.
-    - `units`: as in `Recording`; by default what the file states, else N. Nothing is converted.
+    - `units`: as in `Recording`; by default what the file states, else N. Nothing is converted but a torque with a
+      `lever_arm`.
     - `axis`: which coordinate of the point `column`: x, y, z or principal.
     - `reference`: a column or point to subtract (finger minus stand).
     - `time`: the column that holds the time, if it is not found by itself.
     - `skip_rows`: lines of a text, or rows of a sheet, to leave out at the top.
     - `max_gap` [s]: gaps (NaN, empty, C3D residual below 0) up to this long are closed by straight lines, with a notice.
     - `displacement_units`: m, cm, mm, um, deg or rad; by default what the file states. `units` is that of the force.
-    - `lever_arm` [m], `positive`, `delay` [s]: of two channels, see `PerturbedRecording.from_array`.
+    - `lever_arm` [m]: from the joint's axis to the point where the force acts. A torque is divided by it and becomes a force
+      in N; of two channels, an angle is multiplied by it and becomes a displacement.
+    - `positive`, `delay` [s]: of two channels, see `PerturbedRecording.from_array`.
 
     **Raises:** `ValueError` naming file, line or argument, and the remedy; `ImportError` that says what to install.
     """
-    reading = Reading(column, rate, units, axis, reference, time, max_gap)
-    options = {"displacement_units": displacement_units, "lever_arm": lever_arm, "positive": positive, "delay": delay}
+    reading = Reading(column, rate, units, axis, reference, time, max_gap, lever_arm)
+    options = {"displacement_units": displacement_units, "positive": positive, "delay": delay}
     if force is None or displacement is None:
         given = {"force": force, "displacement": displacement, **options, "delay": delay or None}
         for name, value in given.items():
@@ -90,7 +93,8 @@ def load_recording(  # pyright: ignore[reportInconsistentOverload]
         value = getattr(reading, name)
         require(value is None, name, value, "leave it out: `force` and `displacement` name the columns")
     columns = {"force": force, "displacement": displacement}
-    return perturbed_of(PerturbedRecording.from_array, read_table(path, skip_rows), reading, columns, **options)
+    table = read_table(path, skip_rows)
+    return perturbed_of(PerturbedRecording.from_array, table, reading, columns, lever_arm=lever_arm, **options)
 
 
 def load_columns(

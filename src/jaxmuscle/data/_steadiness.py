@@ -114,11 +114,12 @@ class Steadiness(Printed, Result, eqx.Module):
 def _of_errors(count: int) -> str:
     """What the errors contain."""
     if count < ENOUGH:
-        return ("± is the standard error, from within the recording: of entropies and DFA from its four parts, of the peak "
-                "from its Welch segments, of all else from its spectrum.")  # fmt: skip
-    return (f"± is the standard error, from the scatter between the {count} trials. Only the peak is that of their average "
-            "spectrum. A fit's errors may be larger: it takes the trials to scatter at least as much as chance makes "
-            "them.")  # fmt: skip
+        return (f"± is the standard error. It is estimated within {'the' if count == 1 else 'each'} recording: for "
+                "entropies and DFA from its four parts, for the peak from its Welch segments, for all else from its "
+                "spectrum.")  # fmt: skip
+    return (f"± is the standard error, from the scatter between the {count} trials. The peak alone is that of the averaged "
+            "spectrum. A fit may state larger errors, because it assumes that trials scatter at least as much as by "
+            "chance.")  # fmt: skip
 
 
 def _plain(measures: dict[str, Measure]) -> dict[str, Any]:

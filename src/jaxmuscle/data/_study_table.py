@@ -26,7 +26,7 @@ TABLES = "the table of a study (.csv, .tsv, .txt or .toml)"
 LABELS = (*NEEDED, "group", "condition", "trial")
 FILES, SPECTRA = (*Reading._fields, "skip_rows"), ("spectrum", "mvc")  # of `load_recording`, of `Trials.target`
 EDGES = ("window_start", "window_stop")
-NUMBERS = ("rate", "max_gap", "skip_rows", "mvc", *EDGES)
+NUMBERS = ("rate", "max_gap", "lever_arm", "skip_rows", "mvc", *EDGES)
 COLUMNS = (*LABELS, *FILES, *SPECTRA, *EDGES)
 READING = (*FILES, *SPECTRA, "window")
 OPTIONS = (*READING, "rung", "noise", "quantities", "alpha", "correction")
@@ -49,6 +49,7 @@ class ReadingTable(Table, kw_only=True):
     reference: Annotated[str | int | None, _told("Column or point that is subtracted")] = None
     time: Annotated[str | int | None, _told("Column of the time")] = None
     max_gap: Annotated[Annotated[float, Meta(ge=0)] | None, _told("Longest gap that is closed [s]")] = None
+    lever_arm: Annotated[Above0 | None, _told("From the axis to where the force acts [m]: turns a torque into N")] = None
     skip_rows: Annotated[Annotated[int, Meta(ge=0)] | None, _told("Lines to leave out at the top")] = None
     spectrum: Annotated[str | None, _told("standard, slow, multitaper or pwelch; the same for all")] = None
     mvc: Annotated[Above0 | None, _told("Maximal voluntary contraction, in the recording's unit")] = None

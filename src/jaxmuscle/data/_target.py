@@ -247,7 +247,7 @@ class Target(Shown, eqx.Module):
         if self.mean is not None:
             known.append(("mean", f"{np.mean(self.mean):.4g} {self.unit or '(unit unknown)'}"))
         if self.dispersion:
-            known.append(("trials", _dispersion_in_words(self.dispersion)))
+            known.append(("trials", f"their mean {_dispersion_in_words(self.dispersion)}"))
         known += [("notice", notice) for notice in self.notices]
         what = "proportional power" if f.size else "dynamic stiffness"
         return facts(f"{self.name}: {what} of {self.quantity}, {self.provenance}", known)
@@ -300,7 +300,7 @@ def load_target(
 
 def _dispersion_in_words(dispersion: Sequence[float]) -> str:
     value = " ± ".join(f"{number:.2f}" for number in dispersion[:2])
-    return f"differ {value} times as much as their segments explain"
+    return f"scatters {value} times as much as their segments explain"
 
 
 def _words(value: str | tuple[int, ...]) -> str:
@@ -322,12 +322,14 @@ def _own_notices(target: Target, total: float) -> list[str]:
     if missing.size and target.bins.size:
         runs = np.split(missing, np.flatnonzero(np.diff(missing) > 1) + 1)
         spans = ", ".join(f"{run[0]}" if run.size == 1 else f"{run[0]} to {run[-1]}" for run in runs)
-        notices.append(f"bins not covered and left out: {spans} (bin spacing {settings.resolution:g} Hz)")
+        which, they = ("bin", "it is") if missing.size == 1 else ("the bins", "these are")
+        notices.append(f"the spectrum has no value in {which} {spans}, so {they} left out (bin k lies at k times "
+                       f"{settings.resolution:g} Hz)")  # fmt: skip
     if target.bins.size and abs(total - 1) > SUM_TOLERANCE:
         notices.append(f"proportional power summed to {total:.4g} over the bins covered: rescaled to 1")
     if target.overdispersion > UNUSUAL and target.dispersion is not None:
-        notices.append(f"the trials {_dispersion_in_words(target.dispersion)}: all errors are widened by that. Did the "
-                       "person tire, drift or change the grip?")  # fmt: skip
+        notices.append(f"the mean of the trials {_dispersion_in_words(target.dispersion)} (1 if all are alike), and all "
+                       "errors are widened by this factor. Did the person tire, drift or change the grip?")  # fmt: skip
     if target.provenance == "reconstructed":
         if target.reason is None:
             raise TargetError("a reconstructed target needs a reason: a sentence that says what was assumed")

@@ -122,7 +122,7 @@ def _digitised(points: Points, file: str, axis: str, source: str) -> Raw:
     averaged = len(columns.places) - len(merged.places)
     origin = "no header" if points.dataset is None else f"dataset {points.dataset!r}"
     what = "log10 of frequency in Hz and of power" if axis == "log-log" else "frequency in Hz and proportional power"
-    notice = f"{origin}: taken as points of a figure, {what}, sorted by frequency"
+    notice = f"{origin}: read as points of a figure, {what}, sorted by frequency"
     notice += f", {averaged} near-duplicates averaged" if averaged else ""
     source = source if points.dataset is None else f"{source}, dataset {points.dataset!r}"
     fields = {
@@ -260,9 +260,11 @@ def on_grid(raw: Raw) -> tuple[OnBins, list[str]]:
         sigma = None if columns.sigma is None else columns.sigma[inside]
         points = OnBins(bins[inside], columns.power[inside], sigma, None if trials is None else _columns(trials, inside))
         if (off := np.max(np.abs(position - bins)[inside], initial=0)) > GRID_TOLERANCE:
-            notices.append(f"points up to {off:.2g} bins off the grid: taken as on the bins, within a pixel of a figure")
+            notices.append(f"some frequencies lie up to {off:.2g} bins beside a bin, and count as that bin: a figure cannot "
+                           "be read more finely")  # fmt: skip
         if not np.all(inside):
-            notices.append(f"rows outside bins {first} to {last} left out: {np.sum(~inside)}")
+            rows, are = ("1 row lies", "is") if np.sum(~inside) == 1 else (f"{np.sum(~inside)} rows lie", "are")
+            notices.append(f"{rows} outside bins {first} to {last} and {are} left out")
     elif trials is not None:
         raise TargetError("trial_power: needs frequencies that lie on the bins of the settings")
     else:
@@ -272,8 +274,9 @@ def on_grid(raw: Raw) -> tuple[OnBins, list[str]]:
         logs = [np.log(values) for values in (columns.power, columns.sigma) if values is not None]
         at, known = (np.log(covered), np.log(position)) if raw.log_frequency else (covered, position)
         points = OnBins(covered, *(np.exp(np.interp(at, known, log)) for log in logs))
-        gap, scale = f"{np.max(np.diff(columns.frequency), initial=0):.3g}", " and frequency" * raw.log_frequency
-        notices.append(f"frequencies off the grid: interpolated onto the bins in log power{scale} (widest gap {gap} Hz)")
+        gap, scale = f"{np.max(np.diff(columns.frequency), initial=0):.3g}", " over log frequency" * raw.log_frequency
+        notices.append(f"the frequencies are not those of the bins, so the log power was interpolated{scale} (widest gap "
+                       f"{gap} Hz)")  # fmt: skip
     if points.bins.size < 2:
         raise TargetError(
             f"covers {points.bins.size} of the bins {first} to {last} ({settings.frequency[0]:.4g} to "

@@ -124,6 +124,7 @@ def load_recordings(
     time: str | int | None = None,
     skip_rows: int = 0,
     max_gap: float | int = 0.2,
+    lever_arm: float | int | None = None,
 ) -> Trials:
     """Load the trials of one person in one condition.
 
@@ -134,13 +135,13 @@ def load_recordings(
     - `paths`: a list of files, or the path of one file that has a column for each trial (or what `jaxmuscle.data.read_table`
       read of them)
     - `columns`: which columns of this one file are trials (by default all with numbers but the time)
-    - `column`, `rate`, `units`, `axis`, `reference`, `time`, `skip_rows`, `max_gap`: as in `load_recording`, the same for
-      all files
+    - `column`, `rate`, `units`, `axis`, `reference`, `time`, `skip_rows`, `max_gap`, `lever_arm`: as in `load_recording`,
+      the same for all files
 
     **Returns:** `Trials`, in the order given. **Raises:** `ValueError` as `load_recording` does, and for different units.
     """
     options: dict[str, Any] = {"rate": rate, "units": units, "axis": axis, "reference": reference, "time": time,
-                               "skip_rows": skip_rows, "max_gap": max_gap}  # fmt: skip
+                               "skip_rows": skip_rows, "max_gap": max_gap, "lever_arm": lever_arm}  # fmt: skip
     if isinstance(paths, str | os.PathLike | Table):
         require(column is None, "column", column, "one file holds all trials here; name several with `columns`")
         return Trials(load_columns(paths, columns, **options))

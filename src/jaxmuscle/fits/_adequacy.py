@@ -169,8 +169,9 @@ def judged(ended: Endpoint) -> tuple[Adequacy | None, tuple[str, ...]]:
     kinds = _kinds(problem, objective)
     alone = {words: _tested(found.residuals[rows], rest[:, rows]) for words, rows in kinds.items()}
     hidden = {words: each for words, each in alone.items() if each[2] < ADEQUATE / len(kinds)} if p >= ADEQUATE else {}
-    said = tuple(f"{words} alone is missed: chi2 {chi2:.3g}, expected {mean:.3g}, {probability(own)}. The verdict counts "
-                 "all data together, and the rest hides it. What to do: look at its residuals in the figure"
+    said = tuple(f"the model does not describe {words}, taken alone: chi2 {chi2:.3g}, expected {mean:.3g}, "
+                 f"{probability(own)}. The verdict counts all data together and does not show this. What to do: look at the "
+                 f"residuals of {words} in the figure"
                  for words, (chi2, mean, own) in hidden.items())  # fmt: skip
     return Adequacy(here, expected, p, misfit), said
 

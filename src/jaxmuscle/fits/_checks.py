@@ -26,9 +26,10 @@ NONLINEAR = 0.1
 LEFT = 1e-3
 RISEN = 1.5
 TWITCH = (0.05, 0.11)  # s; its source stands in the row of activation_time in the parameter table
-SLOW = ("it also takes up what else is slow: the nervous drive, the relaxation of the muscle, a low-pass filter of the "
+SLOW = ("It also stands for other slow things: the nervous drive, the relaxation of the muscle, a low-pass filter of the "
         "recording")  # fmt: skip
-FAST = ("the relaxation of the muscle smooths the force in the same way and may have taken its place. Or power at high "
+BY_SIMULATION = "Check with a fit by simulation, of one target at a time (--method montecarlo, method='montecarlo')"
+FAST = ("The relaxation of the muscle smooths the force in the same way and may have taken its place. Or power at high "
         "frequencies comes from elsewhere, as from the sensor")  # fmt: skip
 
 
@@ -97,8 +98,8 @@ def polish_notices(check: dict[str, float | int]) -> tuple[str, ...]:
     """The notice of a correction that matters."""
     if not check.get("polish_moved_se", 0.0) > 1:
         return ()
-    return (f"the nonlinear correction moved a determined quantity by {check['polish_moved_se']:.1f} standard errors: check "
-            "with method='montecarlo'",)  # fmt: skip
+    return (f"the correction by simulation moved a determined quantity by {check['polish_moved_se']:.1f} of its standard "
+            f"errors. {BY_SIMULATION}",)  # fmt: skip
 
 
 def unsettled(problem: FitProblem, moments: Moments) -> float:
@@ -141,8 +142,9 @@ def rivals(problem: FitProblem, stage: Stage, stated: Mapping[str, Estimate]) ->
            and np.max(np.abs(values[n] - values[n][0])) > OTHER * p.stderr}  # fmt: skip
     if far:
         others = ", ".join(f"{n} {far[n]:.3g} instead of {values[n][0]:.3g}" for n in far)
-        said += (f"another solution fits almost as well (log-likelihood lower by at most {AMBIGUOUS:g}): {others}. What "
-                 "differs has no error",)  # fmt: skip
+        these, them = ("these quantities", "them") if len(far) > 1 else ("this quantity", "it")
+        said += (f"another solution fits almost as well (log-likelihood lower by at most {AMBIGUOUS:g}): {others}. No "
+                 f"standard error is stated for {these}. Treat {them} as not determined",)  # fmt: skip
     return said, moved | set(far)
 
 
@@ -171,7 +173,7 @@ def convergence(
     gain = -0.5 * gradient @ step / max(cost, 1e-300)
     finite = [s.cost for s in starts if s.cost is not None]
     near = sum(c <= 1.05 * min(finite) for c in finite) if finite else 0
-    census = f"{near} of {len(starts)} starts end at this fit"
+    census = f"{near} of {len(starts)} starts reach a fit as good as this (cost within 5 %)"
     if final.settled[final.best] or gain < SMALL:
         return True, f"converged: {census}"
     along = known.directions[~known.determined] @ step
@@ -180,15 +182,16 @@ def convergence(
             True,
             f"stopped after {max_steps} steps: further ones change only what the data do not determine; {census}",
         )
-    return False, (f"did not converge: after {max_steps} steps one more would still lower the cost by {100 * gain:.2g} %; "
-                   f"raise max_steps or give more starts")  # fmt: skip
+    return False, (f"did not converge: after {max_steps} steps a further step would still improve the fit by "
+                   f"{100 * gain:.2g} %. Give more starts (--starts), or in Python raise max_steps")  # fmt: skip
 
 
 def further_notices(further: Mapping[str, float]) -> tuple[str, ...]:
     """The notice of a datum that the fit misses."""
     words = {"coefficient_of_variation": "coefficient of variation", "mean": "mean"}
     return tuple(f"the fitted {words[name]} is {abs(off):.1f} standard deviations {'above' if off > 0 else 'below'} the "
-                 "given one: the model cannot have both it and the spectrum" for name, off in further.items()
+                 "given one. The model cannot meet this value and the other data together: check how the value was "
+                 "measured" for name, off in further.items()
                  if name not in met(further))  # fmt: skip
 
 
@@ -204,21 +207,25 @@ def twitch_notices(found: Mapping[str, Estimate]) -> tuple[str, ...]:
         slow, fast = low is not None and low > TWITCH[1], high is not None and high < TWITCH[0]
         if slow or fast:
             said.append(f"{name} ({p.interval_in_words()} s) is {'longer' if slow else 'shorter'} than in human muscle, "
-                        f"{TWITCH[0]:g} to {TWITCH[1]:g} s: {SLOW if slow else FAST}. Do not report it as that of the "
-                        f"muscle. What to do: {instead}hold activation_time at a value that you know")  # fmt: skip
+                        f"{TWITCH[0]:g} to {TWITCH[1]:g} s. {SLOW if slow else FAST}. Do not report it as the muscle's "
+                        f"contraction time. What to do: {instead}hold activation_time at a value that you know")  # fmt: skip
     return tuple(said)
 
 
-def notices_of(target: Any, statistics: BinStatistics, check: dict[str, float | int], left: float) -> tuple[str, ...]:
+def notices_of(
+    target: Any, statistics: BinStatistics, check: dict[str, float | int], left: float, method: str
+) -> tuple[str, ...]:
     """What has to be said of one target and its task."""
     notices = list(target.notices)
     if not statistics.known:
         notices.append("the target states neither segments nor sigma, so every bin counts alike and there is no chi2")
     if check.get("largest_deviation", 0.0) > NONLINEAR:
-        notices.append(f"the response is not linear here: simulation and linear response differ by up to "
-                       f"{100 * check['largest_deviation']:.0f} % of a bin (the fit is corrected for it); large noise or "
-                       "harmonic: check with method='montecarlo'")  # fmt: skip
+        corrected = "corrected" if "polish_turns" in check else "not corrected"
+        notices.append(f"formula and simulation differ by up to {100 * check['largest_deviation']:.0f} % of a bin's power, "
+                       "so noise or harmonic are large here"
+                       + f". The fit is {corrected} for it. {BY_SIMULATION}" * (method == "linear"))  # fmt: skip
     if left > LEFT:
-        notices.append(f"slow task: {100 * left:.1g} % of the input's rise is left when the analysed window begins; the fit "
-                       "is about the settled task, simulate that with jaxmuscle.settled(task)")  # fmt: skip
+        notices.append("slow muscle: when the analysed part of a simulation begins, "
+                       f"{100 * left:.1g} % of the start-up is still left. The fit assumes a settled muscle. To simulate "
+                       "that in Python, use jaxmuscle.settled(task)")  # fmt: skip
     return tuple(notices)

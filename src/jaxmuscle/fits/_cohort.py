@@ -56,9 +56,14 @@ class CohortResult(Result, eqx.Module):
     def verdict(self) -> str:
         """How many of the fits describe their data, and which do not."""
         judged = {name: result.adequate for name, result in self.results.items() if result.adequate is not None}
+        if not judged and not any(result.success for result in self.results.values()):
+            return "no target could be fitted"
+        if not judged:
+            return ("whether the model describes the targets cannot be judged: they state neither segments nor sigma "
+                    "(--segments)")  # fmt: skip
         bad = [name for name, adequate in judged.items() if not adequate]
         said = f"the model describes {len(judged) - len(bad)} of {len(judged)} targets"
-        return said + (f"; not {', '.join(bad)}: their errors are widened" if bad else "")
+        return said + (f"; it does not describe {', '.join(bad)}, whose errors are widened" if bad else "")
 
     def _card(self) -> Card:
         columns = ("target", "group", "in words")

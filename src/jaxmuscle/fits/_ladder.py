@@ -29,7 +29,7 @@ STARTS = 32
 ALIKE = 2.0
 TREMOR = 2  # the rung whose rhythm is no line
 DESCENDED = 0.6  # a fit's progress when its descents have ended
-HEAD = "models tried (-> result), before simulation"
+HEAD = "models tried, by formula alone (-> the result)"
 
 
 class Rung(NamedTuple):
@@ -69,7 +69,7 @@ class Climbed(NamedTuple):
 
 def heading(datum: str) -> str:
     """The head of the table of models; `datum`, what chi² is counted for: a bin, or else any number of the data."""
-    return f"{HEAD:<47}{'chi2/bin' if datum == 'bin' else 'chi2/n':>9}{'p':>9}{'AIC':>9}"
+    return f"{HEAD:<46}{f'chi2/{datum}':>10}{'p':>9}{'AIC':>9}"
 
 
 def gains(ladder: tuple[Rung, ...], *, describes: bool | None, datum: str = "bin") -> tuple[str, ...]:
@@ -82,9 +82,9 @@ def gains(ladder: tuple[Rung, ...], *, describes: bool | None, datum: str = "bin
     said = tuple(_gain(before, after, datum) for before, after in itertools.pairwise(climbed))
     if not said:
         return ()
-    meaning = ("the AIC weighs the fit against the number of parameters; the lower, the better. A difference of "
-               f"{ALIKE:g} or less says nothing. jaxmuscle compare asks for at least 6, and that the richer model foretells "
-               "left-out bins better. It is no p-value")  # fmt: skip
+    meaning = ("the AIC weighs how well a model fits against its number of parameters: lower is better. A difference of "
+               f"{ALIKE:g} or less says nothing. jaxmuscle compare is stricter: it needs at least 6, and the richer model "
+               "must also predict bins better that were left out of its fit. The AIC is no p-value")  # fmt: skip
     if describes is False:
         meaning += (". No model that was tried describes the data: then a lower AIC says that a model misses less, not that "
                     "the muscle has this part")  # fmt: skip
@@ -93,8 +93,8 @@ def gains(ladder: tuple[Rung, ...], *, describes: bool | None, datum: str = "bin
 
 def passed_over(ladder: tuple[Rung, ...]) -> tuple[str, ...]:
     """Which models between those of a table are missing there, and why, in sentences."""
-    return tuple(f"model {number} was not tried: model {before.number} describes the data without it. Its harmonic may be "
-                 f"tremor, so model {after.number} was tried"
+    return tuple(f"model {number} was not tried, since model {before.number} already describes the data. But the harmonic "
+                 f"of model {before.number} may be a tremor, so model {after.number} was tried"
                  for before, after in itertools.pairwise(ladder) if before.p >= ADEQUATE
                  for number in range(before.number + 1, after.number))  # fmt: skip
 

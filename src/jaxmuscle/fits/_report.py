@@ -55,18 +55,22 @@ from ._tables import (
 
 STRETCH = 5.0
 UNSETTLED = 1e-3
-UNCHECKED = "not checked on simulated seeds; no profile over the harmonic's frequency and no p-value (check_seeds=0)"
+UNCHECKED = (
+    "not done: the check by new simulations, the test of other frequencies of the harmonic, and its p-value (--quick and "
+    "check_seeds=0 leave these out)"
+)
 TOGETHER = (
-    "in linear response alone: no nonlinear correction, no check on simulated seeds, no profile and p-value of the "
-    "harmonic; a fit of this target by itself has them"
+    "fitted by the formula alone: no correction and no check by simulation, no profile and no p-value of the harmonic. For "
+    "these, fit this target alone with the usual settings"
 )
 
 
 def may_be_elsewhere(share: float) -> str:
     """Why a harmonic that is elsewhere with this probability has no errors; where it seems small, from where on."""
-    percent, limit = f"{100 * share:.{0 if share >= 0.1 else 1}f}", f" (none are stated above {100 * UNSETTLED:g} %)"
+    percent = f"{100 * share:.{0 if share >= 0.1 else 1}f}"
+    limit = f" (a probability above {100 * UNSETTLED:g} % is enough for that)"
     return ("the harmonic may have another frequency, or be too faint to be seen: with a probability of "
-            f"{percent} % it is more than a bin from the frequency shown. So it has no errors"
+            f"{percent} % it is more than a bin from the frequency shown. So no standard errors are stated for the harmonic"
             f"{limit if share < 0.1 else ''}")  # fmt: skip
 
 
@@ -228,8 +232,8 @@ def _parts(
         elif polished and len(residual) and isinstance(model := stages[-1].objective.parts[i].model, Linear):
             check = {"largest_deviation": float(np.max(np.abs(np.asarray(model.correction.power) - 1)))}
         further = ended.further[i]
-        own = [*notices_of(target, statistics, check, unsettled(plan.problem, moments)), *further_notices(further),
-               *negative_coefficients(task)]  # fmt: skip
+        own = [*notices_of(target, statistics, check | polish, unsettled(plan.problem, moments), plan.problem.method),
+               *further_notices(further), *negative_coefficients(task)]  # fmt: skip
         notices += own if len(tasks) == 1 else [f"{part.name}: {notice}" for notice in own]
         parts[part.name or target.name] = FittedPart(
             target=target,
@@ -287,20 +291,22 @@ def unsimulated(plan: Plan, stages: list[Stage]) -> tuple[str, ...]:
     if plan.check_seeds or not any(len(part.target.bins) for part in plan.problem.parts):
         return ()
     if len(plan.problem.parts) == 1:
-        return (UNCHECKED if stages[-1].name == "polishing" else TOGETHER,)
+        return (UNCHECKED if stages[-1].name == "polishing" or not plan.problem.control else TOGETHER,)
     if stages[-1].name == "polishing":
         return ()
-    return ("in linear response, without the nonlinear model's correction (0.2 % of a bin is usual)",)
+    return ("fitted by the formula alone. The correction by simulation was left out; usually it is 0.2 % of a bin",)
 
 
 def _not_finite(problem: FitProblem) -> str:
     if problem.method != "linear":
-        return "no start has a finite spectrum: the model explodes there; lower the noise or damping of the task"
+        return ("none of the starts gives a finite spectrum: probably the simulation grows without limit. Lower the noise, "
+                "or in Python dt")  # fmt: skip
     if len(problem.parts) == 1:
-        return ("no start has a finite spectrum in linear response: there is no stable equilibrium, or no noise that "
-                f"moves {problem.parts[0].task.output_name} (noise on C does nothing at rest)")  # fmt: skip
-    return ("no start has a finite spectrum of every target in linear response: a task has no stable equilibrium there, or "
-            "no noise that moves its output; fit the targets one by one to see which")  # fmt: skip
+        return ("none of the starts gives a spectrum: the muscle has no stable equilibrium, or no noise moves "
+                f"{problem.parts[0].task.output_name} (noise on damping alone does nothing when nothing moves). Check the "
+                "values that you fixed or gave")  # fmt: skip
+    return ("none of the starts gives a spectrum of every target: a task has no stable equilibrium, or no noise moves its "
+            "output. Fit the targets one by one to see which")  # fmt: skip
 
 
 def _failed(problem: FitProblem, common: dict[str, Any], reason: str) -> FitResult:

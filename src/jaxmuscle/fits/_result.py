@@ -28,7 +28,7 @@ from ._adequacy import Adequacy
 from ._fit_file import FORMAT, FORMATS, FitTable, PartTable, disagreement
 from ._ladder import Rung
 from ._part import Estimate, FittedPart, Start, estimates_to_table, met, part_to_table, read_estimates, read_part
-from ._result_text import card_of, in_use, once, per_newton
+from ._result_text import WHAT_TO_DO, card_of, in_use, once, per_newton
 
 if TYPE_CHECKING:
     import pandas
@@ -167,13 +167,10 @@ class FitResult(Result, eqx.Module):
         told = [f"standard errors are widened by a factor of {self.adequacy.widening:.2g}: the model misses the data"]
         measured = {name.replace("_", " ") for part in self.parts.values() for name in met(part.further)}
         if measured:
-            told[0] += f". Measured, and so not widened: {', '.join(sorted(measured))}"
+            told[0] += f". Not widened, since measured directly: {', '.join(sorted(measured))}"
         if "harmonic_frequency" in self.free:
             told.append("no p-value of the harmonic: where the model misses the data, any harmonic improves the fit")
-        return (*told, "what to do: do not interpret the parameters. Report that the model does not describe the data, and "
-                "no number of it. What needs no model (mean, variation, power by band, the peak of a tremor) comes from "
-                "`jaxmuscle steadiness`. To go on, look at the residuals in the figure, and whether the recording drifts. "
-                "`jaxmuscle compare fit.json` tries other noises; it takes as long as all fits so far")  # fmt: skip
+        return (*told, WHAT_TO_DO)
 
     @property
     def per_newton(self) -> dict[str, float]:
@@ -228,9 +225,9 @@ class FitResult(Result, eqx.Module):
         """What was checked, in sentences: linear response against simulation, and whether there is a harmonic."""
         single = len(self.parts) == 1
         said = [s if single else f"{name}: {s}" for name, part in self.parts.items() for s in part.remarks]
-        if self.harmonic_p_value is not None:
-            word = "significant" if self.harmonic_p_value < 0.05 else "not significant"
-            said.append(f"the harmonic is {word}: p = {self.harmonic_p_value:.2g}, from simulated spectra that have none")
+        if (p := self.harmonic_p_value) is not None:
+            said.append(f"the harmonic is {'not ' * (p >= 0.05)}significant: p = {p:.2g}, the share of simulated spectra "
+                        "without a harmonic that show one as strong by chance")  # fmt: skip
         return tuple(said)
 
     def plot(self, ax: "Axes | None" = None) -> "Figure | SubFigure":

@@ -30,6 +30,12 @@ ALIASES = {
 LENGTHS = ("x_ref_w", "x_ref_z")
 OTHER_LENGTHS = (0.75, 1.5)  # times x_ref_w
 COLUMNS = ("name", "value", "95 % interval", "unit", "in the fit", "what it is")
+WHAT_TO_DO = (
+    "what to do: do not interpret the parameters. Report that the model does not describe the data, and report none of its "
+    "numbers. What needs no model (mean, variation, power by band, the peak of a tremor) comes from `jaxmuscle steadiness`. "
+    "To go on, look at the residuals in the figure, and whether the recording drifts. `jaxmuscle compare fit.json` tries "
+    "other noises; it takes as long as all fits so far"
+)
 
 
 def card_of(result: "FitResult") -> Card:
@@ -78,12 +84,14 @@ def text_of(result: "FitResult") -> str:
     rows = {name: p for name, p in shown.items() if name not in bands}
     title = "determined by the data" if result.adequate is not False else "would be determined if the model held"
     lines += _table(title + _per_newton(result, rows), rows, " 95 % interval    " * intervals)
-    lines += [f"  {sentence}" for sentence in _by_band(result, bands)]
+    lines += [f"  {sentence}" for sentence in (*_counted(rows, every), *_by_band(result, bands))]
     fixed = [name for name in result.products if name not in result.parameters]
-    lines += [f"  products and ratios known roughly: {', '.join(map(_as_people_say, fixed))}"] if fixed else []
+    said = "products and ratios that the data determine, though not each factor alone"
+    lines += [f"  {said}: {', '.join(map(_as_people_say, fixed))}"] if fixed else []
     loose = {name: p for name, p in every.items() if name not in shown and p.free}
     title = f"not determined: do not interpret these values{_per_newton(result, loose)}"
     lines += _table(title, loose) if loose else []
+    lines += [f"  {sentence}" for sentence in _counted(loose, every)]
     if factor := result.settings.get("carried"):
         moved = any(part.stiffness is not None for part in result.parts.values())
         what = "P_w, stiffness" if moved else "P_w, masses, stiffness"
@@ -91,10 +99,10 @@ def text_of(result: "FitResult") -> str:
                   "measured mean force" + " (mean_force=False leaves the mean out)" * (not moved)]  # fmt: skip
     lines += [f"  {sentence}" for sentence in _held(result)]
     if result.per_newton:
-        lines += ["  no mean force in newtons was given, so the scale of force is unknown: forces, masses, stiffness and "
-                  "damping are stated per newton of mean force. In newtons, as in result['K_w0'], in to_dataframe() and in "
-                  f"fit.json, they are those of a model muscle that pulls with {result.derived['mean'].value:.3g} N: divide "
-                  "by that"]  # fmt: skip
+        mean = f"{result.derived['mean'].value:.3g} N"
+        lines += ["  no mean force in newtons was given, so the scale of force is unknown. Forces, masses, stiffness and "
+                  "damping are stated here per newton of mean force. In fit.json (Python: result['K_w0'], to_dataframe()) "
+                  f"they are those of a model muscle that pulls with {mean}: divide them by {mean}"]  # fmt: skip
     if result.undetermined:
         whose = "the data leave" if single else "all targets together leave"
         lines += [f"  {whose} open:", *(f"    - {sentence}" for sentence in result.undetermined)]
@@ -123,17 +131,18 @@ def _held(result: "FitResult") -> list[str]:
         return [f"held fixed: {', '.join(told.values())}. {means}"] if {"m_w", *LENGTHS} <= set(held) else []
     said = []
     if "m_w" in held:
-        said += [f"held fixed: {told['m_w']}. The data do not tell it, and the verdict notices no wrong one. Where it is "
-                 "wrong, C_w0 and K_w0 are, too (docs/perturbed.md has by how much). To have that in the errors let it be "
-                 "free, as by default"]  # fmt: skip
+        said += [f"held fixed: {told['m_w']}. The data do not determine it, and the verdict would not notice a wrong "
+                 "value. But a wrong m_w makes C_w0 and K_w0 wrong, too (docs/perturbed.md has by how much). Leave m_w "
+                 "free, as by default: then the errors contain this doubt"]  # fmt: skip
     if "x_ref_w" in held and f"K_w_tangent{at}" in result.derived:
         base = result.derived["K_w0" if "K_w0" in result.derived else f"K_w0{at}"].value
         tangent = result.derived[f"K_w_tangent{at}"].value
         other = [f"{tangent / (1 + (tangent / base - 1) / times**2):.4g}" for times in OTHER_LENGTHS]
         lengths = " or ".join(f"{1e3 * times * float(task['x_ref_w']):.3g}" for times in OTHER_LENGTHS)
-        said += [f"held fixed: {told['x_ref_w']}. No record tells it, and K_w0 depends on it: with {lengths} mm it would be "
-                 f"{' or '.join(other)} N/m, and the fit as good. Report K_w_tangent, the stiffness of the active tissue "
-                 "as stretched in the hold, and tangent_stiffness, that of both tissues: they hardly change"]  # fmt: skip
+        said += [f"held fixed: {told['x_ref_w']}. No record determines it, and K_w0 depends on it: with {lengths} mm K_w0 "
+                 f"would be {' or '.join(other)} N/m, and the fit as good. So report K_w_tangent (stiffness of the active "
+                 "tissue as stretched in the hold) and tangent_stiffness (that of both tissues) instead: these hardly "
+                 "change"]  # fmt: skip
     return said
 
 
@@ -165,21 +174,29 @@ def _table(title: str, table: dict[str, Estimate], column: str = "") -> list[str
                          zip(*((p.in_words(), p.interval_in_words()) for p in table.values()), strict=True))  # fmt: skip
     lines = [f"  {title}:"] if not column else [f"  {title + ': ':<{wide + value + indent}}{column.strip()}"]
     for name, p in table.items():
-        interval, unit = f"{p.interval_in_words():<{beside}}" if column else "", _beside(name, table)
+        interval, unit = f"{p.interval_in_words():<{beside}}" if column else "", _beside(name, p)
         lines.append(f"{'':{indent}}{name:<{wide}}{p.in_words():<{value}}{interval}{unit}".rstrip())
     return lines if table else [*lines, "    nothing"]
 
 
-def _beside(name: str, table: Mapping[str, Estimate]) -> str:
-    """What stands behind a number: its unit; a variation in percent, too; from where on a share of the power counts."""
-    base, at, target = name.partition("@")
+def _beside(name: str, p: Estimate) -> str:
+    """What stands behind a number: its unit; a variation in percent, too."""
+    base, at, _ = name.partition("@")
     if base == "coefficient_of_variation":
-        return f"{'' if at else '= '}{100 * table[name].value:.3g} %"
-    rhythm = table.get(f"tremor_frequency{at}{target}")
-    if base == "tremor_share" and rhythm is not None:
-        return f"> {0.5 * rhythm.value:.2g} Hz"
+        return f"{'' if at else '= '}{100 * p.value:.3g} %"
     # A parameter of an own muscle has a unit that only its author knows: it is never divided by a force.
-    return {"1": "", "": "in its own unit"}.get(table[name].unit, table[name].unit)
+    return {"1": "", "": "in its own unit"}.get(p.unit, p.unit)
+
+
+def _counted(shown: Mapping[str, Estimate], every: Mapping[str, Estimate]) -> list[str]:
+    """From where on each tremor's share in a table counts, in a sentence."""
+    sentences = []
+    for name in shown:
+        base, at, target = name.partition("@")
+        rhythm = every.get(f"tremor_frequency{at}{target}")
+        if base == "tremor_share" and rhythm is not None:
+            sentences.append(f"{name}: counted from {0.5 * rhythm.value:.2g} Hz on, half of the tremor's frequency")
+    return sentences
 
 
 def _by_band(result: "FitResult", table: dict[str, Estimate]) -> list[str]:
@@ -192,7 +209,8 @@ def _by_band(result: "FitResult", table: dict[str, Estimate]) -> list[str]:
         each = [f"{low:g}-{high:g} Hz {own} ({100 * share:.2g} %)"
                 for (low, high), own, share in zip(BANDS.values(), fitted, shares, strict=True)]  # fmt: skip
         known = any(band + at in table for band in BANDS)
-        sentences += [f"power by band{of}, fitted (measured): {', '.join(each)}; shares of the compared bins"] * known
+        sentences += [f"power by band{of}, fitted (measured): {', '.join(each)}; in percent of the power in the fitted "
+                      "bins"] * known  # fmt: skip
     return sentences
 
 

@@ -244,7 +244,7 @@ def run_study(study: "str | os.PathLike[str] | Iterable[Mapping[str, Any]]", *, 
               window: Sequence[float | int] | str | None = None, column: str | int | None = None,
               rate: float | int | None = None, units: str | None = None, axis: str | None = None,
               reference: str | int | None = None, time: str | int | None = None, skip_rows: int | None = None,
-              max_gap: float | int | None = None, spectrum: str | None = None,
+              max_gap: float | int | None = None, lever_arm: float | int | None = None, spectrum: str | None = None,
               mvc: float | int | None = None) -> StudyResult:  # fmt: skip
     """Fit the recordings of a whole study with one model and compare groups and conditions.
 
@@ -271,7 +271,7 @@ def run_study(study: "str | os.PathLike[str] | Iterable[Mapping[str, Any]]", *, 
       interaction) are corrected together.
     - `progress`: True or a function of (text, share).
     - How files are read where a row does not say it: `window` (start, stop) [s] or "all" (by default the steady part);
-      `column`, `rate`, `units`, `axis`, `reference`, `time`, `skip_rows`, `max_gap` as in `load_recording`;
+      `column`, `rate`, `units`, `axis`, `reference`, `time`, `skip_rows`, `max_gap`, `lever_arm` as in `load_recording`;
       `spectrum`, a name of settings, the same for all; `mvc` as in `Trials.target`.
 
     An option that is given here replaces that of the .toml; what a row says about its own file stays.
@@ -282,7 +282,8 @@ def run_study(study: "str | os.PathLike[str] | Iterable[Mapping[str, Any]]", *, 
     """
     check_key(key)
     reading = {"window": window, "column": column, "rate": rate, "units": units, "axis": axis, "reference": reference,
-               "time": time, "skip_rows": skip_rows, "max_gap": max_gap, "spectrum": spectrum, "mvc": mvc}  # fmt: skip
+               "time": time, "skip_rows": skip_rows, "max_gap": max_gap, "lever_arm": lever_arm, "spectrum": spectrum,
+               "mvc": mvc}  # fmt: skip
     table = read_study(study)
     given = {"rung": rung, "noise": noise, "quantities": quantities, "alpha": alpha, "correction": correction} | reading
     options = USUAL | table.options | {name: value for name, value in given.items() if value is not None}

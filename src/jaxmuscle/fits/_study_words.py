@@ -44,14 +44,15 @@ def report_lines(study: "StudyResult") -> list[str]:
     lines += [f"    {_sentence(d, alpha)}" for d in found[:MOST]]
     lines += [f"    and {len(found) - MOST} more"] if len(found) > MOST else []
     if any(d.left_out for d in found):
-        lines.append("  People whose fits do not determine a quantity are left out of its comparisons: a selection")
+        lines.append("  People whose fits do not determine a quantity are left out of its comparisons. This is a selection "
+                     "and can mislead")  # fmt: skip
     return lines
 
 
 def _sentence(d: Difference, alpha: float) -> str:
     unit = "" if d.unit == "1" else f" {d.unit}"
     where = f", {d.where}" if d.where else ""
-    people = "/".join(map(str, d.members if d.kind != "conditions" else d.members[:1]))
+    people = " and ".join(map(str, d.members if d.kind != "conditions" else d.members[:1]))
     left = f", {d.left_out} left out" if d.left_out else ""
     return (f"{'*' if d.p_corrected is not None and d.p_corrected < alpha else ' '} {d.quantity}{where}: {d.b} - {d.a} = "
             f"{d.difference:.3g}{unit} ({d.low:.3g} to {d.high:.3g}), p = {d.p:.2g}, corrected "
@@ -77,7 +78,8 @@ def _aic(study: "StudyResult") -> str:
     if len(study.aic) < 2:
         return ""
     above = {number: aic - study.aic[study.rung] for number, aic in study.aic.items() if number != study.rung}
-    return f" (lowest summed AIC; above it: {', '.join(f'{number} by {aic:.0f}' for number, aic in above.items())})"
+    more = ", ".join(f"model {number} has {aic:.0f} more" for number, aic in above.items())
+    return f" (lowest AIC, summed over all spectra; {more})"
 
 
 def _count(number: int, what: str) -> str:
@@ -105,11 +107,11 @@ def methods_paragraph(study: "StudyResult") -> str:
     said = [
         f"We analysed {_people(study)}: {_trials(study)}.",
         f"Recordings (sampled at {_range(rates)} Hz) were resampled to {s.rate:g} Hz and {low_pass}; {part} was analysed "
-        "where the table of the study states no other window.",
+        "unless another window was specified.",
         f"Power spectra were estimated by Welch's method ({_window(s)}, {s.length} samples, "
         f"{100 * s.overlap:g} % overlap, {DETREND[s.detrend]}) from {s.frequency[0]:.2f} to {s.frequency[-1]:.2f} Hz. "
-        f"Spectra of trials of one {whose} were averaged, weighted with their segments; where trials scattered more than "
-        "their segments explain, all errors were widened by that.",
+        f"Spectra of trials of one {whose} were averaged, weighted by their number of Welch segments. Where trials "
+        "scattered more than expected from these, all errors were widened accordingly.",
         f"A stochastic rheological muscle model{noise} was fitted to every averaged spectrum, its coefficient of variation "
         f"and, where recorded in newtons, its mean force (linear response, Levenberg-Marquardt, {study.options['starts']} "
         "starts, log power weighted by the scatter of Welch's estimate).",
@@ -149,7 +151,7 @@ def _statistics(study: "StudyResult") -> list[str]:
         if left else []
     )  # fmt: skip
     return [
-        f"We compared {tests}, with people as the unit and quantities as they are, not their logarithms. Intervals hold "
-        f"{100 * (1 - study.options['alpha']):g} % for one comparison at a time; {p}.",
+        f"We compared {tests}. In a comparison each person counted once; quantities were not log-transformed. Each "
+        f"{100 * (1 - study.options['alpha']):g} % interval is for a single comparison; {p}.",
         *selected,
     ]

@@ -51,7 +51,7 @@ class Stream(eqx.Module):
 
     `words` [2] are 64 bits of the seed's key. A word of 32 random bits is
 
-        word(k, j) = mix3(mix2(k ^ words[0]) ^ words[1] + j γ),   γ = 2³² / golden ratio
+        word(k, j) = mix3(mix2(k ^ words[0]) ^ words[1] + (j + 1) γ),   γ = 2³² / golden ratio
 
     where mix2 and mix3 are bijections that spread every bit over all (Wellons, *Hash Prospector*, 2018: two and three
     rounds of multiplication and shift). With generator "threefry" it is `jax.random.bits` of the key folded with k.

@@ -92,10 +92,14 @@ def effective_parameters(
 
 SCALES = (
     (
-        "all noise amplitudes and the harmonic's can be multiplied by one number",
+        "all amplitudes of noise and harmonic can be multiplied by one number, and the fit stays as good",
         ("noise_K_w", "noise_K_z", "noise_P_w", "harmonic_amplitude", "resonance_amplitude", "resonance_2_amplitude"),
     ),
-    ("stiffness and damping can all be multiplied by one number", ("k_w", "k_z", "c_w", "c_z")),
+    (
+        "all stiffness and damping can be multiplied by one number, and the fit stays as good: at most their ratios are "
+        "known",
+        ("k_w", "k_z", "c_w", "c_z"),
+    ),
 )
 
 

@@ -6,8 +6,8 @@ from typing import Literal, NamedTuple
 
 from ._numbers import Reproduction
 
-Verdict = Literal["agrees", "agrees within the grid", "does not agree", "cannot be checked"]
-AGREES, GRID, DIFFERS, UNCHECKED = "agrees", "agrees within the grid", "does not agree", "cannot be checked"
+Verdict = Literal["agrees", "agrees within our resolution", "does not agree", "cannot be checked"]
+AGREES, GRID, DIFFERS, UNCHECKED = "agrees", "agrees within our resolution", "does not agree", "cannot be checked"
 Kind = Literal["tests the model", "fitted", "put in", "arithmetic"]
 TESTED, FITTED, GIVEN, ARITHMETIC = "tests the model", "fitted", "put in", "arithmetic"
 KINDS: dict[Kind, str] = {
@@ -74,7 +74,7 @@ def outcome(rows: Iterable[Row]) -> str:
     """How many agree, how many do not, how many cannot be checked."""
     verdicts = [row.verdict for row in rows]
     agree, within, differ = sum(v in (AGREES, GRID) for v in verdicts), verdicts.count(GRID), verdicts.count(DIFFERS)
-    told = f"{agree} {'agrees' if agree == 1 else 'agree'}" + (f" ({within} within the grid)" if within else "")
+    told = f"{agree} {'agrees' if agree == 1 else 'agree'}" + (f" ({within} within our resolution)" if within else "")
     return f"{told}, {differ} {'does' if differ == 1 else 'do'} not, {verdicts.count(UNCHECKED)} cannot be checked"
 
 

@@ -18,7 +18,7 @@ COUNTED = {2: "Both", 3: "All three", 5: "All five"}
 HISTOGRAM, BINS = 15, 24  # refits from which on they are drawn as a histogram; its bins
 HEIGHTS = 1.8, 1.7  # inches: residuals, references
 HEIGHT, ACROSS = 1.85, 2  # inches, panels
-REFERENCE = "replicates, each fitted"
+REFERENCE = "simulated data, fitted again"
 
 
 @styled
@@ -54,12 +54,12 @@ def _goodness(fig: Any, found: Any, heights: tuple[float, ...]) -> int:
             panel = fig.add_subplot(grid[row, column * width : (column + 1) * width])
             _reference(panel, found, name)
             if not column:
-                panel.set_ylabel("Share of replicates")
+                panel.set_ylabel("Share of simulations")
     p = found.p_values["all"]
     assert first is not None  # a target has bins or points
     first.set_title(f"{COUNTED[len(found.observed)]} checks together: p = {p:.2g}",
                     color=VERMILLION if p < SMALL_P else ink())  # fmt: skip
-    return heading(fig, found.target.name + " (foretold)" * found.foretold) + key(fig)
+    return heading(fig, found.target.name + " (predicted)" * found.foretold) + key(fig)
 
 
 def _residuals(ax: Axes, found: Any) -> None:
@@ -67,7 +67,7 @@ def _residuals(ax: Axes, found: Any) -> None:
     width = float(np.min(np.diff(f)))
     low, high = np.quantile(found.residuals, [0.025, 0.975], axis=0)
     edges = np.append(f - width / 2, f[-1] + width / 2)
-    ax.stairs(high, edges, baseline=low, fill=True, color=shade(0.1), zorder=1, label="95 % of the replicates")
+    ax.stairs(high, edges, baseline=low, fill=True, color=shade(0.1), zorder=1, label="95 % of the simulated data")
     out = (r < low) | (r > high)
     ax.bar(f[~out], r[~out], 0.6 * width, color=BLUE, zorder=3, label="target over fit")
     if out.any():
@@ -81,7 +81,7 @@ def _off(ax: Axes, found: Any) -> None:
     """How far every point of the dynamic stiffness lies from the fit, whatever the direction."""
     f, off = np.asarray(found.target.stiffness.known.frequency), np.abs(found.stiffness_residual)
     high = np.quantile(np.abs(found.stiffness_residuals), 0.95, axis=0)
-    ax.fill_between(f, 0, high, color=shade(0.1), lw=0, zorder=1, label="95 % of the replicates")
+    ax.fill_between(f, 0, high, color=shade(0.1), lw=0, zorder=1, label="95 % of the simulated data")
     out = off > high
     ax.plot(f[~out], off[~out], "o", ms=3.5, color=BLUE, zorder=3, label="dynamic stiffness from fit")
     if out.any():
@@ -147,7 +147,7 @@ def _refits(ax: Axes, q: Any, label: str) -> None:
         ax.plot(q.values, np.arange(len(q.values)) + 1, "o", ms=3.5, color=GREY, zorder=2, label=label)
         ax.set(yticks=[], ylim=(0, len(q.values) + 1))
         ax.spines["left"].set_visible(False)
-    ax.axvline(q.true, color=BLUE, lw=1.6, zorder=3, label="made from")
+    ax.axvline(q.true, color=BLUE, lw=1.6, zorder=3, label="true value")
     ax.axvline(float(np.mean(q.values)), color=VERMILLION, lw=1.2, ls="--", zorder=3, label="mean of the refits")
     ax.xaxis.set_major_locator(MaxNLocator(4))
     ax.set_xlabel(textwrap.fill(in_words(q.name, q.unit), 26))

@@ -74,17 +74,17 @@ def _scores(ax: Axes, rows: list[Any], colours: dict[str, str]) -> None:
     _rows(ax, [""] * len(rows))
     if rows[0].scores is None:
         ax.set(xticks=[])
-        ax.text(0.5, 0.5, "nothing held out:\nno segments", transform=ax.transAxes, ha="center", va="center", color=GREY)
+        ax.text(0.5, 0.5, "no bins left out:\nno segments", transform=ax.transAxes, ha="center", va="center", color=GREY)
         return
     ax.axvline(0, color=ink(), lw=0.6, zorder=1)
     for i, row in enumerate(rows):
         if not row.success:
-            ax.text(0.02, i, "not settled", transform=ax.get_yaxis_transform(), va="center", color=GREY)
+            ax.text(0.02, i, "not converged", transform=ax.get_yaxis_transform(), va="center", color=GREY)
             continue
         error = row.score_stderr or None
         ax.errorbar(row.score_difference, i, xerr=error, fmt="o", capsize=2, lw=1, color=colours[row.noise],
                     mfc=_face(row, colours), **MARK)  # fmt: skip
-    ax.set_xlabel("Held-out score minus\nthat of the first (± SE)")
+    ax.set_xlabel("Held-out score minus that\nof the lowest AIC (± SE)")
 
 
 def _rows(ax: Axes, labels: list[str]) -> None:

@@ -59,4 +59,4 @@ def _errors(ax: Axes, found: Any) -> None:
     log_axis(ax)
     ax.grid(axis="both", color=shade(0.15), lw=0.5)
     ax.set(xlabel="Standard error (% of the value)")
-    ax.set_title(f"Expected of one record of {found.lengthening.seconds:g} s")
+    ax.set_title(f"Expected errors, one record of {found.lengthening.seconds:g} s")

@@ -207,7 +207,8 @@ def _stretch(ax: Axes, part: Any, relative: bool) -> None:
 def _profile(ax: Axes, result: Any) -> None:
     """Which other frequencies of the harmonic the spectrum allows."""
     frequency, rise = map(np.asarray, result.profile)
-    ax.axhspan(0, ALLOWED, color=shade(0.1), lw=0, zorder=0, label="95 % interval of the frequency")
+    allowed = f"Δχ² < {ALLOWED:g}: in the 95 % interval"
+    ax.axhspan(0, ALLOWED, color=shade(0.1), lw=0, zorder=0, label=allowed)
     ax.plot(frequency, rise, color=BLUE, marker=".", ms=3)
     ax.axvline(float(result.task["harmonic_frequency"]), color=ORANGE, lw=0.8, ls=(0, (4, 2)), zorder=0)
     ax.set_title("Profile of the harmonic's frequency")

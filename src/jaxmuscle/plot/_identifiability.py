@@ -67,13 +67,13 @@ def _singular_values(ax: Axes, shown: list[Any], labels: list[str], threshold: f
         some = ~known & ~tiny
         ax.scatter(size[some], np.full(some.sum(), at), s=18, label="not determined", **open_)
         if tiny.any():
-            ax.scatter([1.15 * EDGE], [at], s=18, marker="<", label=f"so many below {LEAST:g}", **open_)
+            ax.scatter([1.15 * EDGE], [at], s=18, marker="<", label=f"how many below {LEAST:g}", **open_)
             ax.text(1.35 * EDGE, at, f"{tiny.sum()}", va="center", color=VERMILLION, zorder=3)
         row = at + 0.65 * DOTS
     ax.set(xlim=(EDGE, 1.6 * max(top)), ylim=(row + 0.02, -0.02), yticks=[])
     log_axis(ax)
     ax.set_xlabel("Singular value (per prior standard deviation)")
-    ax.set_title(f"Directions of the parameters: from {threshold:g} on determined")
+    ax.set_title(f"Combinations of parameters: determined from {threshold:g} on")
     ax.spines["left"].set_visible(False)
 
 

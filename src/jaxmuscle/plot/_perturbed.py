@@ -78,7 +78,7 @@ def _response(panels: Sequence[Axes] | np.ndarray, response: Any, line: Curve | 
         ends = [np.minimum(2 * spread, response.coherence), np.minimum(2 * spread, 1 - response.coherence)]
         coherence.errorbar(f, response.coherence, np.nan_to_num(ends), color=ink(), **POINTS)
         chance = 1 - CHANCE ** (1 / (np.maximum(k - 1, 1)))
-        coherence.plot(f, chance, color=GREY, lw=0.8, ls="--", label=f"{100 * CHANCE:g} % level without relation")
+        coherence.plot(f, chance, color=GREY, lw=0.8, ls="--", label=f"by chance {100 * CHANCE:g} % lie above")
         legend(coherence, "above")
     coherence.set_ylim(0, 1.03)
     coherence.set_ylabel("Coherence γ²")

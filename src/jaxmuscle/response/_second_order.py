@@ -44,12 +44,12 @@ class SecondOrder(NamedTuple):
     def notices(self) -> tuple[str, ...]:
         """What has to be said before linear numbers are stated."""
         most = float(np.max(self.power))
-        what = [f"about {100 * most:.2g} % of the power of a bin"] * (most > NOTICED)
-        what += [f"about {100 * abs(self.mean):.2g} % of the mean"] * (abs(self.mean) > NOTICED)
+        what = [f"adds about {100 * most:.2g} % to the power of a bin"] * (most > NOTICED)
+        what += [f"changes the mean by about {100 * abs(self.mean):.2g} %"] * (abs(self.mean) > NOTICED)
         if not what:
             return ()
-        return (f"first order ends here: the second order adds {' and '.join(what)}, which linear numbers leave out; "
-                "simulate (ensemble), or fit with method='montecarlo'",)  # fmt: skip
+        return (f"the formula (linear response) is not exact here: what it leaves out {' and '.join(what)}. Simulate "
+                "(jaxmuscle ensemble), or fit by simulation (--method montecarlo, method='montecarlo')",)  # fmt: skip
 
 
 @kept
@@ -147,8 +147,9 @@ def negative_coefficients(task: AbstractTask) -> tuple[str, ...]:
     turn = np.sin(2 * np.pi * (np.arange(64) + 0.5) / 64)
     level = parts.base[:, None] + parts.swing * parts.harmonic.weight[: len(CHANNELS), None] * turn
     share = np.mean(ndtr(level / -np.maximum(sd, 1e-12 * np.abs(parts.base) + 1e-300)[:, None]), axis=1)
-    return tuple(f"{channel} is negative for {100 * part:.2g} % of the time, which no tissue is: lower its noise or the "
-                 "harmonic" for channel, part, base in zip(CHANNELS, share, parts.base, strict=True)
+    return tuple(f"{channel} is negative for {100 * part:.2g} % of the time, which is impossible: its noise or the harmonic "
+                 f"is too strong. Lower one of them (in a fit, for example, --fix noise_{channel}=VALUE)"
+                 for channel, part, base in zip(CHANNELS, share, parts.base, strict=True)
                  if part > NEGATIVE and base > 0)  # fmt: skip
 
 

@@ -27,8 +27,8 @@ FEWER_LINES = 1.6  # times as long as a part of a longer motion
 SHOWN = 2.0  # times the even density: where a design moves the most
 DOUBTFUL = 0.3  # relative standard error
 LOOSE = 0.165  # a third of the narrower of the usual priors, 0.5 in the logarithm
-OPEN = ("  a fit calls a quantity determined only if its error is a third of its prior's or less: about 33 %, and 17 % in "
-        "models with activation or tremor")  # fmt: skip
+OPEN = ("  a quantity with a larger error than about 33 % (17 % in models with activation or tremor) will stay 'not "
+        "determined' in the fit: its error must be at most a third of its prior's")  # fmt: skip
 ASSUMED = (
     "  assumed: no reflex. A reflex can change K_w0 by 10 to 55 %, and the fit does not notice: call it muscle plus reflex",
     "  assumed: no fatigue. Split a long or strong hold into trials with rests between, and give all trials to one fit",
@@ -176,16 +176,16 @@ class DesignedInput(Printed, Result, eqx.Module):
         rows = [f"    {n:<22}" + "".join(f"{_digits(self.percent(n, e)):>10}" for e in (self.now, self.flat, self.stderr))
                 for n in self.told]  # fmt: skip
         names = " and ".join(filter(None, [", ".join(self.quantity[:-1]), self.quantity[-1]]))
-        variance = (
-            f"relative variance of {names}" if len(self.quantity) == 1 else f"sum of the relative variances of {names}"
-        )
+        single = len(self.quantity) == 1
+        square = f"squared relative error of {names}" if single else f"sum of the squared relative errors of {names}"
         return folded([
-            f"designed input: one more record of {self.lengthening.seconds:g} s would tell {best}",
+            f"designed motion: one more record of {self.lengthening.seconds:g} s would measure {best} (standard "
+            f"error{'s' * (not single)})",
             *self._vague(),
             *self._elsewhere(),
             *(f"  note: {notice}" for notice in self.notices),
-            f"  a flat input of {1e3 * self.even.rms:.3g} mm rms: {flat}; with it the {variance} is {self.gain:.2g} times "
-            "as large" if self.moves else "  this motion is flat itself: no frequency is preferred",
+            f"  a flat motion of {1e3 * self.even.rms:.3g} mm rms: {flat}. The {square} is then {self.gain:.2g} times as "
+            "large" if self.moves else "  this motion is flat itself: no frequency is preferred",
             f"  lengthening of the muscle: {1e3 * self.rms:.3g} mm rms, at most {1e3 * self.peak:.3g} mm to "
             f"either side and {1e3 * self.speed:.3g} mm/s, {low:.2g} to {high:.2g} Hz",
             *[f"  most of the motion: {most}"] * bool(most),
@@ -203,7 +203,7 @@ class DesignedInput(Printed, Result, eqx.Module):
         lines = []
         if self.by_seconds:
             heads = "".join(f"{f'{seconds:g} s':>10}" for seconds in self.by_seconds)
-            lines += ["  the same by the length of the record, the motion being repeated:", f"    {'':<22}{heads}"]
+            lines += ["  the same for records of other lengths, in which the motion repeats:", f"    {'':<22}{heads}"]
             lines += [f"    {n:<22}" + "".join(f"{_digits(self.percent(n, e)):>10}" for e in self.by_seconds.values())
                       for n in self.told]  # fmt: skip
         if self.needed is not None:
@@ -217,8 +217,9 @@ class DesignedInput(Printed, Result, eqx.Module):
             if periods > 1:
                 lines[-1] += f": {periods} periods of this motion. Play {end:.3g} s and analyse the last {end - begin:.3g} s"
             elif (shorter := float(np.ceil(FEWER_LINES * seconds))) < period:
-                lines[-1] += (f", less than the {period:.3g} s of this motion. A shorter motion has fewer frequencies: "
-                              f"design again with more (--seconds {shorter:g}, seconds={shorter:.1f})")  # fmt: skip
+                lines[-1] += (f"; this motion lasts {period:.3g} s. To record less, design again with --seconds {shorter:g} "
+                              f"(seconds={shorter:.1f}). That is longer than {seconds:.3g} s, since a shorter motion has "
+                              "fewer frequencies")  # fmt: skip
             else:
                 lines[-1] += f": one period of this motion. Play {end:.3g} s and analyse the last {period:.3g} s"
         return lines
@@ -228,30 +229,31 @@ class DesignedInput(Printed, Result, eqx.Module):
         mean = [self.values[name] for name in self.values if name.partition("@")[0] == "mean"]
         lines = ["  assumed: the muscle is the one given here" + f", with a mean force of {mean[0]:.3g} N" * bool(mean)]
         if mean:
-            lines[0] += ". If you measured another one, fit with it first (mean and unit of the target)"
+            lines[0] += ". If you measured another mean force, fit with it first (mean and unit of the target)"
         if "K_w0" in {name.partition("@")[0] for name in self.quantity}:
-            lines += ["  assumed: the reference displacement x_ref_w. No record tells it, and the value of K_w0 depends on "
-                      "it. What does not is K_w_tangent, the stiffness as stretched in the hold (docs/perturbed.md, "
-                      "limits)"]  # fmt: skip
+            lines += ["  assumed: the reference displacement x_ref_w. No record determines it, and the value of K_w0 "
+                      "depends on it. K_w_tangent, the stiffness as stretched in the hold, hardly depends on it "
+                      "(docs/perturbed.md, limits)"]  # fmt: skip
         values = " and ".join(f"{name} = {value:.3g} kg" for name, value in self.masses.items())
         if "m_w" in self.held:
-            lines += ["  assumed: the active mass m_w is right, as in the fit. No record tells it. Where it is wrong, C_w0 "
-                      "and K_w0 are, too (docs/perturbed.md has by how much)"]  # fmt: skip
+            lines += ["  assumed: the active mass m_w is right, as in the fit. No record determines it. A wrong m_w makes "
+                      "C_w0 and K_w0 wrong, too (docs/perturbed.md has by how much)"]  # fmt: skip
         elif not self.held and any(value != USUAL for value in self.masses.values()):
-            lines += [f"  assumed: {values}, as here. A held force tells no mass. If you know roughly what moves, fit with "
-                      f"that (--fix m_w={USUAL:g} --fix m_z={USUAL:g}, say) and design again. The fit of a record lets both "
-                      f"free, and begins with {USUAL:g} kg"]  # fmt: skip
+            lines += [f"  assumed: {values}, as in this fit or preset. A held force tells no mass. If you know roughly what "
+                      f"moves, fit with that (--fix m_w={USUAL:g} --fix m_z={USUAL:g}, say) and design again. The fit of "
+                      f"the new record leaves both masses free, and starts them at {USUAL:g} kg"]  # fmt: skip
         return lines
 
     def _vague(self) -> list[str]:
         """A motion designed for what is hardly known is none to begin with."""
         known = {name: self.percent(name, self.now) for name in self.quantity}
-        vague = [f"{name} to {_digits(percent)} %" for name, percent in known.items() if percent > 100 * DOUBTFUL]
-        what = "This motion is flat, so it is one to begin with. Fit its record, and design again from that fit"
+        vague = [(name, f"{_digits(percent)} %") for name, percent in known.items() if percent > 100 * DOUBTFUL]
+        what = "This motion is flat, so it is a good one to begin with. Fit its record, and design again from that fit"
         if self.moves:
-            what = ("So do not begin with this motion: record a first minute with a flat one (--spread 1, spread=1.0), fit "
+            what = ("That is too vague for a design. First record a minute with a flat motion (--spread 1, spread=1.0). Fit "
                     "it, and design again from that fit")  # fmt: skip
-        return [f"  so far only known: {', '.join(vague)}. {what}"] * bool(vague)
+        said = [f"{name} {'to' if i else 'is known only to'} {error}" for i, (name, error) in enumerate(vague)]
+        return [f"  so far {', '.join(said)}. {what}"] * bool(vague)
 
     def _elsewhere(self) -> list[str]:
         """What the record would tell if the muscle is not as fitted, as far as that is likely."""

@@ -26,15 +26,16 @@ COLUMNS = 4
 PAIRS_TOLD = 3
 TOGETHER = " together with "
 SAME = 1e-6
+FAR = 999  # percent
 STRICTER = "The fit is stricter: it also looks for other solutions, and at combinations that are open. Believe the fit"
 TIRING = (
-    "no design knows fatigue: split a long or strong hold into short trials with rests between, and give all trials "
+    "fatigue is not considered: split a long or strong hold into short trials with rests between, and give all trials "
     "to one fit"
 )
-NO_NOISE = ("no further measurement is tried, since the fit has no spectrum: nothing is known of the noise that would limit "
-            "it. Fit the recording of both channels, or a spectrum beside the response (fit_joint)")  # fmt: skip
-FITTED_TOO = "fitted with it"
-OPENED = "; but open where it says so above"
+NO_NOISE = ("no further measurement is tried: the fit has no spectrum, so the noise that limits a measurement is not known. "
+            "Fit the recording of both channels, or a spectrum beside the response (fit_joint)")  # fmt: skip
+FITTED_TOO = "fitted in this measurement"
+OPENED = "; but fitted in the measurements that say so above"
 BASE = {"k_w": "K_w0", "k_z": "K_z0", "c_w": "C_w0", "c_z": "C_z0"}
 
 
@@ -218,12 +219,12 @@ def _present(report: IdentifiabilityReport) -> list[str]:
     lines += _wrapped(f"{now.task}; {now.data}", 2)
     for notice in report.notices:
         lines += _wrapped(notice, 4, "  note: ")
-    lines += _wrapped(f"{now.determined} of {len(report.free)} combinations of the parameters are determined: those with a "
-                      f"singular value of {DETERMINED:g} or more", 4, "  ")  # fmt: skip
+    lines += _wrapped(f"{now.determined} of {len(report.free)} combinations of the parameters are determined: those left "
+                      f"of the bar, with a singular value of {DETERMINED:g} or more", 4, "  ")  # fmt: skip
     values = [f"{v:.3g}" for v in now.singular_values]
     lines += _wrapped("  ".join([*values[: now.determined], "|", *values[now.determined :]]), 4)
     if now.products:
-        lines += _wrapped(f"known to a third of the prior's error or better: {_products(now)}", 4, "  ")
+        lines += _wrapped(f"determined parameters, products and ratios, with standard errors: {_products(now)}", 4, "  ")
     if doubted := [name for name in told(now.quantities) if name in report.open_in_fit]:
         lines += _wrapped(f"known here, but not determined in the fit: {', '.join(doubted)}. {STRICTER}", 4, "  ")
     if now.undetermined:
@@ -244,7 +245,8 @@ def _designs(report: IdentifiabilityReport) -> list[str]:
     for number, design in enumerate(report.designs):
         count = "impossible" if design.failed else f"{design.determined} of {len(report.free)}"
         lines += _wrapped(f"{design.name}: {count}", 8, f"    {letter(number):<2}  ")
-        own = f"; {', '.join(design.separate)} of its own" if design.separate else ""
+        values = "values" if len(design.separate) > 1 else "value"
+        own = f"; with its own {values} of {', '.join(design.separate)}" if design.separate else ""
         lines += _wrapped(f"{design.task}; {design.data}{own}", 8)
     return lines
 
@@ -254,8 +256,9 @@ def _table(report: IdentifiabilityReport) -> list[str]:
     names = told(report.present.quantities)
     possible = [(letter(i), d) for i, d in enumerate(report.designs) if d.failed is None]
     wide = max(24, *(1 + len(name) for name in names))
-    lines = _wrapped("standard error in percent of the value; in brackets: not determined. Columns: prior, before any data; "
-                     "now, with those of the fit; A and on, with that measurement, too", 4, "  ")  # fmt: skip
+    lines = _wrapped(f"standard errors in percent of the value. In brackets: not determined. >>: {FAR} % or more. prior: "
+                     "without data. now: with the data of the fit"
+                     + ". A, B, ...: with that measurement added" * bool(possible), 4, "  ")  # fmt: skip
     if report.mean_force is not None:
         lines += _wrapped("no mean force in newtons was given: forces, stiffness and damping are stated per newton of mean "
                           f"force (that of the fitted muscle is {report.mean_force:.3g} N)", 4, "  ")  # fmt: skip
@@ -291,7 +294,7 @@ def _shown(known: Known) -> str:
 
 def _cell(known: Known, error: float) -> str:
     share = 100 * error / abs(known.value) if known.value else np.inf
-    return f"{share:.2g}" if share < 99.5 else f"{share:.0f}" if share < 999 else ">>"
+    return f"{share:.2g}" if share < 99.5 else f"{share:.0f}" if share < FAR else ">>"
 
 
 def _sentences(report: IdentifiabilityReport) -> list[str]:

@@ -76,7 +76,7 @@ def verdict(found: Chains, diagnostics: dict, determined: tuple[str, ...]) -> tu
     most two divergences in a thousand draws.
     """
     count = len(found.log_density)
-    advice = "draw longer chains (draws, warmup), or fix what the data do not determine (free, priors)"
+    advice = "draw longer chains (--draws, --warmup), or fit again with fewer free parameters (--fix)"
     for names, most in ((determined, MIXED), (tuple(diagnostics), NEARLY)):
         worst = max(names, key=lambda n: diagnostics[n][0], default=None)
         if worst is not None and not diagnostics[worst][0] <= most:
@@ -90,7 +90,8 @@ def verdict(found: Chains, diagnostics: dict, determined: tuple[str, ...]) -> tu
                        f"{EFFECTIVE * count}; {advice}")  # fmt: skip
     if diverges(found):
         return False, (f"{int(found.diverging.sum())} of {found.diverging.size} draws diverged, so parts of the posterior "
-                       "were not reached: give tighter priors or bounds")  # fmt: skip
+                       "were not reached: fit again with fewer free parameters (--fix), or in Python with tighter priors "
+                       "or bounds")  # fmt: skip
     return True, f"the chains mixed: R-hat at most {r_hat:.3f}, effective sample size at least {size:.0f}"
 
 

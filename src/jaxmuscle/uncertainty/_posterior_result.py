@@ -174,7 +174,8 @@ class Posterior(Shown, eqx.Module):
         if self.success:
             for name, part in self.parts.items():
                 whose = f"{name}: " if len(self.parts) > 1 else ""
-                lines.append(f"  {whose}posterior-predictive chi2: p = {part.replicates.p_value:.2g}")
+                lines.append(f"  {whose}posterior-predictive chi2: p = {part.replicates.p_value:.2g} (near 0: the model "
+                             "does not describe the data)")  # fmt: skip
             for name, modes in self.frequency_modes.items():
                 if len(modes) > 1:
                     told = ", ".join(f"{middle:.2f} Hz ({100 * share:.0f} %)" for _, middle, _, share in modes)
@@ -214,7 +215,7 @@ class Summary(Shown, eqx.Module):
             rows.append((name + mark, *cells, unit))
             numbers = "".join(f"{cell:>{wide}}" for cell, wide in zip(cells, (10, 10, 10, 7, 6), strict=True))
             lines.append(f"  {name + mark:<24}{numbers}  {unit}")
-        said = ("* the data do not determine it: the prior keeps it where it is",)
+        said = ("* not determined by the data: it comes from the prior. Do not interpret it",)
         remarks = said * any(name not in self.determined for name in self.rows)
         text = "\n".join([*lines, *(f"  {remark}" for remark in remarks)])
         return Card(text, self.title.partition("\n")[0], columns, tuple(rows), remarks)
