@@ -8,7 +8,9 @@ import scipy.stats
 
 import jaxmuscle as jm
 from jaxmuscle.fits._half_power import half_power_intervals
-from jaxmuscle.fits._intervals import intervals
+from jaxmuscle.fits._intervals import Interval, intervals
+from jaxmuscle.fits._part import Estimate
+from jaxmuscle.fits._tables import with_intervals
 from jaxmuscle.objective._arguments import FitOptions, planned
 from jaxmuscle.objective._consequences import consequences, consequences_of_rows, expand
 from jaxmuscle.objective._covariance import parameter_covariance, residual_covariance
@@ -21,6 +23,14 @@ NAME, FREE = "half_power_frequency", ("c_w", "c_z")
 STILL = jm.Isometric().replace(harmonic_amplitude=0.0, noise_K_z=1e-4)
 STEEP, BENT, SHELF = (STILL.replace(c_z=c) for c in (5.0, 15.0, 20.0))
 LAST = 30.5 * STILL.settings.resolution  # upper edge of the bins
+
+
+def test_an_interval_that_says_next_to_nothing_is_none():
+    ends = {"known": Interval(-2.0, 2.0, True), "half": Interval(-1.0, None, True), "signed": Interval(-1.5, 400.0, False),
+            "vague": Interval(-4.0, 1.0, True), "open": Interval(None, None, True)}  # fmt: skip
+    found = with_intervals({name: Estimate(1.0, "1", 0.1, True, True) for name in ends}, ends)
+    assert [name for name, p in found.items() if p.stderr is not None] == ["known", "half", "signed"]
+    assert all(found[name].identifiable is False and found[name].interval is None for name in ("vague", "open"))
 
 
 def drawn(task, segments, seed):

@@ -13,6 +13,10 @@ from typer.testing import CliRunner
 import jaxmuscle as jm
 from jaxmuscle.commands.console import write_fit
 from jaxmuscle.commands.main import app
+from jaxmuscle.data._perturbed_target import LINEAR
+from jaxmuscle.fits import _perturbed
+from jaxmuscle.fits._perturbed import seen_with
+from jaxmuscle.simulation._driven import driven
 
 TASK = jm.PrescribedLength()
 F = np.geomspace(0.2, 8.0, 17)
@@ -204,6 +208,7 @@ def test_a_file_of_both_channels_is_fitted_from_the_command_line_alone_and_with_
         (["PULL", "--hold", "HOLD", "--window", "1:9,2:9,3:9"], "3 windows for 2 recordings"),
         (["PULL", "--hold", "TORQUE"], "torque: is in N m, and a moved record is fitted in N. Give --lever-arm"),
         (["PULL", "--hold", "HOLD", "--task", "isometric"], "leave out --task and --quantity"),
+        (["PULL", "--hold", "HOLD", "--fix", "m_w@held=0.4"], "a fixed value holds for all records. Give --fix m_w=VALUE"),
         (["PULL", "--hold", "HOLD", "--segments", "5"], "--segments and --dataset belong to spectra"),
         (["PULL", "--hold", "none.csv"], "none.csv"),
     ],
@@ -232,3 +237,29 @@ def test_a_hold_is_not_taken_for_a_moved_record(tmp_path):
     assert said.exit_code == 2 and "hold.csv: no displacement was found beside the force" in said.stderr
     assert "--force-column and --displacement; a hold is fitted with --task isometric" in said.stderr
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.slow
+def test_the_answer_of_a_light_and_damped_muscle_is_taken_off_whole(monkeypatch):
+    """A muscle of 55 N and half a kilogram relaxes at 3100 /s: too fast for whole steps, at which no answer was finite."""
+    stiff = {"k_w": 13.1e6, "k_z": 18.5e6, "c_w": 1470.0, "c_z": 95.0, "m_w": 0.5, "m_z": 0.2, "P_w": 98.6}
+    task = TASK.replace(**stiff, harmonic_amplitude=0.0)
+    rate, rng = 1000.0, np.random.default_rng(8)
+    time, lines = np.arange(64_001) / rate, np.arange(20, 401) / 40.0
+    turns = [np.exp(1j * (2 * np.pi * line * time + phase))
+             for line, phase in zip(lines, rng.uniform(0, 2 * np.pi, lines.size), strict=True)]  # fmt: skip
+    size = 0.8e-3 * np.sqrt(2 / lines.size)
+    motion = np.array([size * sum(np.real((2j * np.pi * f) ** n * turn) for f, turn in zip(lines, turns, strict=True))
+                       for n in (0, 1, 2)])  # fmt: skip
+    with jax.enable_x64(True):
+        answer = driven(task, -motion, 1 / rate)
+    noise = 0.005 * rng.standard_normal(answer.size)
+    recording = jm.PerturbedRecording.from_array(55.0 + answer + noise, motion[0, ::2], rate / 2, positive="lengthening")
+    with jax.enable_x64(True):
+        seen = seen_with(task, [recording.steady((2.0, 62.0))])
+        monkeypatch.setattr(_perturbed, "driven", lambda *_: np.full(1, np.nan))
+        linear = seen_with(task, [recording.steady((2.0, 62.0))])
+    assert LINEAR not in seen.notices and LINEAR in linear.notices
+    power, more = (np.mean(t.proportional_power[12:22] * t.coefficient_of_variation[0] ** 2) for t in (seen, linear))
+    density = 0.005**2 / (rate / 4) * np.diff(seen.frequency)[0] / 55.0**2  # of the noise that was added, in a bin
+    assert power < 2 * density and more > 100 * density

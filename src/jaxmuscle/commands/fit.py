@@ -227,6 +227,10 @@ def fit(
             if method != MethodName.linear:
                 raise ValueError("with --hold all records are fitted by the formula of the spectrum: leave out --method")
             options |= {"rungs": rungs if rungs is not None else 0 if noise is not None or names else RUNGS}
+            for name in fixed:
+                if "@" in name:
+                    raise ValueError(f"--fix {name}: with --hold a fixed value holds for all records. Give --fix "
+                                     f"{name.partition('@')[0]}=VALUE")  # fmt: skip
             if task not in (None, "prescribed-length") or quantity is not None:
                 raise ValueError("with --hold the records are those of a moved insertion, and of the force in a hold: leave "
                                  "out --task and --quantity")  # fmt: skip

@@ -29,6 +29,8 @@ EXCITED = 1e-6  # of the largest density of the displacement: below is the senso
 AROUND, FEWEST = 0.25, 0.1  # over which range the density of the fluctuations is averaged: relative; at least [Hz]
 NODES = 600
 HALF_STEPS = 10  # of the nonlinear muscle in a sampling interval
+LINEAR = ("the response to the movement was taken off as a linear one, since that of the nonlinear muscle could not be "
+          "computed. If the motion was large, a part of it is left in the fluctuations")  # fmt: skip
 
 Stiffness = Callable[[Float[np.ndarray, " frequencies"]], Complex[np.ndarray, " frequencies"]]
 Motion = Float[np.ndarray, "3 times"]
@@ -105,10 +107,11 @@ def _ordinates(recording: Any, stiffness: Stiffness, predicted: Any, settings: S
     force, inside = _even(recording.force, rate)
     moved, _ = _even(recording.displacement, rate)
     length = moved - np.mean(moved[inside])
-    reply = _response(length, stiffness, predicted, rate)
+    reply, exact = _response(length, stiffness, predicted, rate)
     edges = (recording.force.start + inside.start / rate, recording.force.start + inside.stop / rate)
     fluctuation = Recording(force - reply, rate, unit=recording.force.unit, name=recording.name, source=recording.source,
-                            start=recording.force.start, window=edges, notices=recording.notices)  # fmt: skip
+                            start=recording.force.start, window=edges,
+                            notices=recording.notices + (LINEAR,) * (not exact))  # fmt: skip
     rest = fluctuation.whole[inside]
     taper = scipy.signal.windows.tukey(len(rest), TAPER)
     f = np.fft.rfftfreq(len(rest), 1 / rate)
@@ -117,8 +120,8 @@ def _ordinates(recording: Any, stiffness: Stiffness, predicted: Any, settings: S
 
 def _response(
     length: Float[np.ndarray, " all"], stiffness: Stiffness, predicted: Any, rate: float
-) -> Float[np.ndarray, " all"]:
-    """What the force does when it follows the lengthening; right from the margin on."""
+) -> tuple[Float[np.ndarray, " all"], bool]:
+    """What the force does when it follows the lengthening, right from the margin on; and whether it is as `predicted`."""
     edge = round(0.5 * MARGIN * rate)
     ramp = np.sin(0.5 * np.pi * (np.arange(edge) + 0.5) / edge) ** 2
     tapered = length.copy()
@@ -134,11 +137,11 @@ def _response(
         motion = np.append(motion, motion[:, :1], axis=1)  # which is periodic
         reply = predicted(motion, 1 / (HALF_STEPS * rate))[:: HALF_STEPS // 2][: len(length)]
         if np.all(np.isfinite(reply)):
-            return reply
+            return reply, True
     nodes = np.sinh(np.linspace(0.0, 6.0, NODES)) / np.sinh(6.0) * rate / 2
     value = stiffness(nodes)
     smooth = scipy.interpolate.CubicSpline(nodes, np.stack([np.real(value), np.imag(value)]), axis=1)(f)
-    return np.fft.irfft((smooth[0] + 1j * smooth[1]) * moved, len(length))
+    return np.fft.irfft((smooth[0] + 1j * smooth[1]) * moved, len(length)), predicted is None
 
 
 def _groups(lowest: float, highest: float) -> Float[np.ndarray, " edges"]:

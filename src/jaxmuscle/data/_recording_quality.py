@@ -50,7 +50,7 @@ class RecordingSummary(Printed, eqx.Module):
             ("approximate entropy", f"{self.approximate_entropy:.4f}"),
             ("sample entropy", f"{self.sample_entropy:.4f}"),
             ("maximum of the spectrum", f"{top.interpolated:.3f} Hz, {top.power:.3f} of the power"),
-            ("local maxima of the spectrum", f"{local} Hz" if self.peaks.local_maxima else local),
+            ("local maxima (from 1 % of it on)", f"{local} Hz" if self.peaks.local_maxima else local),
         ]
 
     def __str__(self) -> str:

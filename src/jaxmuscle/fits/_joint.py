@@ -169,14 +169,14 @@ def planned_jointly(
     local = _local_free(
         tasks, targets, None if options.free is None else tuple(options.free), options.fix or (), tuple(carried)
     )
-    names = joint_names(local, tasks, separate)
+    names, moved = joint_names(local, tasks, separate), any(target.stiffness is not None for target in targets.values())
     known = list(dict.fromkeys(joint for of in names.values() for joint in of.values()))
     _check_known("bounds", bounds, known)
     _check_known("priors", priors, known)
     plans = {
         name: planned(tasks[name], target, dataclasses.replace(
             options, free=local[name], fix=None, bounds=_own(bounds, names[name]), priors=_own(priors, names[name]),
-            mean_force=means.get(name)))
+            mean_force=means.get(name)), moved=moved)
         for name, target in targets.items()
     }  # fmt: skip
     first = next(iter(plans.values()))

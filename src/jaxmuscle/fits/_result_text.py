@@ -100,9 +100,11 @@ def text_of(result: "FitResult") -> str:
     lines += [f"  {sentence}" for sentence in _held(result)]
     if result.per_newton:
         mean = f"{result.derived['mean'].value:.3g} N"
-        lines += ["  no mean force in newtons was given, so the scale of force is unknown. Forces, masses, stiffness and "
-                  "damping are stated here per newton of mean force. In fit.json (Python: result['K_w0'], to_dataframe()) "
-                  f"they are those of a model muscle that pulls with {mean}: divide them by {mean}"]  # fmt: skip
+        torque = any(part.target.quantity == "torque" for part in result.parts.values())
+        given = " (of a torque it needs the lever arm: --lever-arm)" * torque
+        lines += [f"  no mean force in newtons was given{given}, so the scale of force is unknown. Forces, masses, "
+                  "stiffness and damping are stated here per newton of mean force. In fit.json (Python: result['K_w0'], "
+                  f"to_dataframe()) they are those of a model muscle that pulls with {mean}: divide by {mean}"]  # fmt: skip
     if result.undetermined:
         whose = "the data leave" if single else "all targets together leave"
         lines += [f"  {whose} open:", *(f"    - {sentence}" for sentence in result.undetermined)]

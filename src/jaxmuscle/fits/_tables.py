@@ -18,6 +18,7 @@ from ._part import Estimate
 OUTPUTS = ("coefficient_of_variation", "mean")
 BASE = {"K_w0": "k_w", "K_z0": "k_z", "C_w0": "c_w", "C_z0": "c_z"}
 STRAIGHT = 0.25  # error of a log up to which a quantity is as good as linear
+VAGUE = 100.0
 
 
 def parameter_table(
@@ -131,12 +132,17 @@ def widened(table: dict[str, Estimate], factor: Callable[[str], float]) -> dict[
 
 
 def with_intervals(table: dict[str, Estimate], ends: Mapping[str, Interval]) -> dict[str, Estimate]:
-    """The table with 95 % intervals about its values; a quantity whose interval is open at both ends is not determined."""
+    """The table with 95 % intervals about its values; a quantity whose interval says next to nothing is not determined.
+
+    That is one which is open at both ends, or whose ends are more than a factor of `VAGUE` apart.
+    """
     found = {}
     for name, p in table.items():
         if name in ends:
             about = ends[name].about(p.value)
             p = eqx.tree_at(lambda e: e.interval, p, about, is_leaf=lambda x: x is None)
-            p = p if any(end is not None for end in about) else Estimate(p.value, p.unit, None, p.free, False)
+            low, high = about
+            wide = low is not None and high is not None and 0 < VAGUE * low < high
+            p = Estimate(p.value, p.unit, None, p.free, False) if wide or about == (None, None) else p
         found[name] = p
     return found

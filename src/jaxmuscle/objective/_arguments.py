@@ -213,8 +213,12 @@ class Plan(NamedTuple):
     seed: int | None
 
 
-def planned(task: AbstractTask, target: Target, options: FitOptions) -> Plan:
-    """The fit of one target, its arguments checked (see `fit`). Needs double precision."""
+def planned(task: AbstractTask, target: Target, options: FitOptions, *, moved: bool | None = None) -> Plan:
+    """The fit of one target, its arguments checked (see `fit`). Needs double precision.
+
+    `moved`: whether the insertion was moved in this recording or in another one that is fitted together with it.
+    """
+    moved = target.stiffness is not None if moved is None else moved
     bounds, priors, fix = dict(options.bounds or {}), dict(options.priors or {}), dict(options.fix or {})
     task = as_numbers(task.with_parts(settings=target.settings).replace(**fix))
     if "acceleration" in (task.quantity, target.quantity):
@@ -239,7 +243,7 @@ def planned(task: AbstractTask, target: Target, options: FitOptions) -> Plan:
     if options.method == "montecarlo" and counts["seeds"] < 1:
         raise ValueError("seeds = 0: a Monte Carlo fit needs at least one")
     usual = {n: PARAMETERS[n].prior_sd if n in PARAMETERS else 1.0 for n in names}
-    if task.activation is not None:
+    if task.activation is not None and not moved:  # else a muscle could swing as a tremor does; a response tells that apart
         usual |= {n: NARROW for n in COEFFICIENTS if n in names}
     sds = {n: priors.get(n, usual[n]) for n in names}
     coordinates = Coordinates.of({n: float(task[n]) for n in names}, bounds, {n: sd or 1.0 for n, sd in sds.items()})

@@ -14,6 +14,8 @@ from ._coordinates import Coordinates
 from ._least_squares import Minima
 from ._problem import FitProblem
 
+RANGE = 30.0
+
 
 def starting_points(problem: FitProblem, count: int) -> Float[np.ndarray, "starts free"]:
     """Starts: harmonic frequencies at the targets' local maxima and spread over their band, the rest space-filling.
@@ -29,6 +31,8 @@ def starting_points(problem: FitProblem, count: int) -> Float[np.ndarray, "start
             frequencies = np.random.default_rng(number).permutation(frequencies)
         theta[:, coordinates.names.index(name)] = coordinates.theta_of(name, frequencies)
     _spread_resonances(problem, theta)
+    if any(part.points is not None for part in problem.parts):
+        _spread_coefficients(problem, theta)
     return coordinates.from_theta(theta)
 
 
@@ -50,6 +54,19 @@ def _spread_resonances(problem: FitProblem, theta: Float[np.ndarray, "starts fre
         each = [np.random.default_rng(i).permutation(frequencies_for(problem, n, len(rows))) for i, n in enumerate(pair)]
         for name, frequencies in zip(pair, -np.sort(-np.stack(each), axis=0), strict=True):
             theta[rows, names.index(name)] = problem.coordinates.theta_of(name, frequencies)
+
+
+def _spread_coefficients(problem: FitProblem, theta: Float[np.ndarray, "starts free"]) -> None:
+    """Every other start has stiffness and damping up to `RANGE` times larger or smaller than by default.
+
+    A dynamic stiffness knows both, wherever they are: a person may well be ten times softer than the default muscle of the
+    same force, and from there a search finds its way only if it begins at the right order of magnitude.
+    """
+    names, rows = problem.coordinates.names, np.arange(1, len(theta), 2)
+    factors = math.log(RANGE) * (2 * halton(2, len(rows)) - 1)
+    for pair, factor in zip((("k_w", "k_z"), ("c_w", "c_z")), factors.T, strict=True):
+        for column in (i for i, name in enumerate(names) if name.partition("@")[0] in pair):
+            theta[rows, column] += factor / problem.coordinates.sd[column]
 
 
 def frequencies_for(problem: FitProblem, name: str, count: int) -> Float[np.ndarray, " starts"]:

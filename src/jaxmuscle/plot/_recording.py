@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure, SubFigure
+from matplotlib.ticker import MaxNLocator
 
 from ._style import (
     BLUE,
@@ -45,22 +46,35 @@ def recording(recording: Any, settings: Any = None, ax: Axes | None = None) -> F
 
 @styled
 def trials(trials: Any, settings: Any = None, ax: Axes | None = None) -> Figure | SubFigure:
-    """Draws the windows of several recordings below each other, and their spectra with the mean, linear and logarithmic."""
+    """Draws several recordings below each other, each with its window, and their spectra with the mean.
+
+    On the left each whole recording with the window shaded, on the right the window larger, low-passed. Below these the
+    spectra, linear and logarithmic.
+    """
     if len(trials) == 1:
         return recording(trials[0], settings, ax)
     shown = trials[:MOST]
     heights = [0.55] * len(shown) + [2.1]
     fig = canvas(ax, (COLUMN, sum(heights)))
     grid = fig.add_gridspec(len(heights), 2, height_ratios=heights)
-    panel = None
+    whole = window = None
     for row, one in enumerate(shown):
+        last = row == len(shown) - 1
+        whole = fig.add_subplot(grid[row, 0], sharex=whole, sharey=whole)
+        whole.plot(one.start + np.arange(one.whole.size) / one.rate, one.whole, color=BLUE, lw=0.5)
+        if one.window is not None:
+            whole.axvspan(*one.window, color=ORANGE, alpha=0.25, lw=0, label=None if row else "window: what is analysed")
+        whole.set_title(one.name, pad=2.0, weight="normal", parse_math=False)
+        _label(whole, "Time (s)" if last else "", f"({one.unit})")
         x = one.filtered(settings)
-        panel = fig.add_subplot(grid[row, :], sharex=panel, sharey=panel)
-        panel.plot(np.arange(x.size) * one.duration / x.size, x, color=BLUE, lw=0.6)
-        panel.set_title(one.name, pad=2.0, weight="normal", parse_math=False)
-        panel.margins(x=0)
-        panel.tick_params(labelbottom=row == len(shown) - 1)
-        _label(panel, "Time in the window (s)" if row == len(shown) - 1 else "", f"({trials[0].unit})")
+        window = fig.add_subplot(grid[row, 1], sharex=window, sharey=window)
+        window.plot(np.arange(x.size) * one.duration / x.size, x, color=BLUE, lw=0.5)
+        window.set_title("" if row else "Window", pad=2.0, weight="normal")
+        _label(window, "Time in the window (s)" if last else "", "")
+        for panel in (whole, window):
+            panel.margins(x=0)
+            panel.tick_params(labelbottom=last)
+            panel.yaxis.set_major_locator(MaxNLocator(2, prune="both", min_n_ticks=2))
     mean, each = trials.spectrum(settings), [one.spectrum(settings) for one in trials]
     for column, log in enumerate((False, True)):
         panel = fig.add_subplot(grid[-1, column])

@@ -1,5 +1,6 @@
 """What the force does when the insertion is moved as measured: the nonlinear muscle, without noise."""
 
+import math
 from typing import Any
 
 import jax
@@ -11,24 +12,31 @@ from jaxmuscle._common.arrays import as_arrays
 from jaxmuscle._common.programs import kept
 from jaxmuscle.model._parameters import INPUTS
 from jaxmuscle.model._tasks import PrescribedLength
-from jaxmuscle.response._equilibrium import HOLD, equilibrium
+from jaxmuscle.response._equilibrium import HOLD, equilibrium, fastest_rate
 
 BLOCK = 10_240  # half steps; a program serves all recordings of as many blocks
+LONGEST = 1.4  # of rate times step: half of what keeps the method stable, since damping grows with speed
+MOST = 256
 
 
 def driven(task: PrescribedLength, motion: Float[np.ndarray, "3 times"], interval: float) -> Float[np.ndarray, " steps"]:
     """F_ext less its value at rest [N] at every second of some times, by the Runge-Kutta method of order 4.
 
     **Arguments:** `task`, whose P_w is held; `motion`: x_z, x_z', x_z'' about the task's own x_z at times `interval` [s]
-    apart, an odd number of them; they begin at rest. Not finite where the step, two intervals, is too long.
+    apart, an odd number of them; they begin at rest.
+
+    A step, two intervals, is cut into as many parts (a power of two, at most `MOST`) as the fastest rate of the muscle asks
+    for. Within a step the motion is the parabola through its three values. Not finite where that is not enough.
     """
     times = motion.shape[1]
     filled = np.pad(motion, ((0, 0), (0, -(times - 1) % BLOCK)))
-    return np.asarray(_driven(as_arrays(task), filled, 2 * interval))[: (times + 1) // 2]
+    needed = fastest_rate(task, HOLD) * 2 * interval / LONGEST
+    parts = min(2 ** max(0, math.ceil(math.log2(max(needed, 1.0)))), MOST)
+    return np.asarray(_driven(as_arrays(task), filled, 2 * interval, parts))[: (times + 1) // 2]
 
 
 @kept
-def _driven(task: Any, motion: Any, step: Any) -> Float[Array, " steps"]:
+def _driven(task: Any, motion: Any, step: Any, parts: int) -> Float[Array, " steps"]:
     t, start = jnp.asarray(HOLD, motion.dtype), equilibrium(task)
     still, rest = jnp.zeros(len(INPUTS), motion.dtype), task.insertion(t)[0].astype(motion.dtype)
 
@@ -37,13 +45,21 @@ def _driven(task: Any, motion: Any, step: Any) -> Float[Array, " steps"]:
 
     def advance(y, rows):
         first, middle, last = rows
-        a, force = at(y, first)
-        b = at(y + 0.5 * step * a, middle)[0]
-        c = at(y + 0.5 * step * b, middle)[0]
-        d = at(y + step * c, last)[0]
-        return y + step / 6 * (a + 2 * b + 2 * c + d), force
+        bend = 2 * (first - 2 * middle + last)
 
-    table = motion.T
+        def along(s):
+            return first + s * (last - first + bend * (s - 1))
+
+        def part(y, begin):
+            a = at(y, along(begin))[0]
+            b = at(y + 0.5 * part_of * a, along(begin + 0.5 / parts))[0]
+            c = at(y + 0.5 * part_of * b, along(begin + 0.5 / parts))[0]
+            d = at(y + part_of * c, along(begin + 1 / parts))[0]
+            return y + part_of / 6 * (a + 2 * b + 2 * c + d), None
+
+        return jax.lax.scan(part, y, jnp.arange(parts, dtype=motion.dtype) / parts)[0], at(y, first)[1]
+
+    table, part_of = motion.T, step / parts
     y, found = jax.lax.scan(advance, start, (table[:-1:2], table[1::2], table[2::2]))
     force = jnp.append(found, at(y, table[-1])[1])
     return force - at(start, jnp.zeros(3, motion.dtype))[1]
