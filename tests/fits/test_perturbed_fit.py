@@ -151,7 +151,7 @@ def test_further_questions_take_it(result):
                                                                  "largest_point"}  # fmt: skip
     assert checked.observed["chi2_per_point"] == pytest.approx(result.only.chi2_per_point)
     words = " ".join(str(checked).split())
-    assert "99 spectra and dynamic stiffnesses drawn from the fit" in words and "all five together" in words
+    assert "99 spectra and dynamic stiffnesses that were drawn from the fit" in words and "all five together" in words
     figure = checked.plot()
     assert sum(ax.get_ylabel() == "|Residual| (SE)" for ax in figure.axes) == 1 and len(figure.axes) == 7
     plt.close(figure)

@@ -248,7 +248,7 @@ def test_text_shows_what_is_known_and_what_is_not():
         "not determined: do not interpret these values (per newton of mean force): k_w",
         "the data leave open: - all stiffness and damping can be multiplied by one number",
         "stiffness and damping are stated here per newton of mean force. In fit.json (Python: result['K_w0'], "
-        "to_dataframe()) they are those of a model muscle that pulls with 2.5 N: divide them by 2.5 N",
+        "to_dataframe()) they are those of a model muscle that pulls with 2.5 N: divide by 2.5 N",
         "note: a notice",
     ):
         assert part in words

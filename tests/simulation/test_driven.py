@@ -76,9 +76,10 @@ def test_a_small_motion_is_answered_linearly():
     np.testing.assert_allclose(measured, formula(lines), rtol=1e-4)
 
 
-@pytest.mark.parametrize("m_w", [M_W, 0.01])
-def test_a_large_motion_is_answered_as_scipy_integrates_it(m_w):
-    """A light and damped tissue has a rate of 5100 /s, for which a step of 2 ms is cut into eight."""
+@pytest.mark.parametrize(("m_w", "close"), [(M_W, 1e-6), (0.01, 1e-5)])
+def test_a_large_motion_is_answered_as_scipy_integrates_it(m_w, close):
+    """A light and damped tissue has a rate of 5100 /s: a step of 2 ms is cut into eight, which still see little of how it
+    jumps to its speed at the begin."""
     _, motion = multisine(1e-3)
     t = np.arange(motion.shape[1]) / 1000.0
 
@@ -100,7 +101,7 @@ def test_a_large_motion_is_answered_as_scipy_integrates_it(m_w):
     expected = -(passive(found.y, *motion[:2, :2001:2]) + M_Z * motion[2, :2001:2]) - K_Z * X_REF**2 * rest()
     with jax.enable_x64(True):
         force = driven(task, motion, 1e-3)[: len(at)]
-    np.testing.assert_allclose(force, expected, atol=1e-6 * np.max(np.abs(expected)))
+    np.testing.assert_allclose(force, expected, atol=close * np.max(np.abs(expected)))
 
 
 @pytest.mark.slow

@@ -338,7 +338,7 @@ def test_longer_records_tell_more_and_the_wanted_error_says_how_long():
     assert f"to know K_w0 to 4 % (standard error), {made.needed[1]:.3g} s of record are enough" in " ".join(
         str(made).split()
     )
-    assert "by the length of the record" in str(made) and "by the length" not in str(designed())
+    assert "for records of other lengths" in str(made) and "of other lengths" not in str(designed())
     assert "no length of the record" in str(designed(error=1e-9))
     assert (
         made.to_dict()["needed"]["seconds"] == made.needed[1] and designed(error=1e-9).to_dict()["needed"]["seconds"] is None

@@ -267,7 +267,9 @@ def _with_values(task: Any, values: dict[str, Any]) -> Any:
             raise ValueError(f"{name} has the shape {np.shape(value)}: a parameter is one number. For several tasks use "
                              f"jaxmuscle.Sweep.grid(task, {name}=[...]), or jax.vmap")  # fmt: skip
         if row is not None:
-            message = f"{name} = {value} {row.unit} is outside [{row.lower}, {row.upper}]: {row.meaning}"
+            message = (
+                f"{name} = {value}{f' {row.unit}' * (row.unit != '1')} is outside [{row.lower}, {row.upper}]: {row.meaning}"
+            )
             finite = np.isfinite(value) if is_concrete(value) else jax.numpy.isfinite(value)
             require(finite & (value >= row.lower) & (value <= row.upper), message)
         path = _path(task, name)

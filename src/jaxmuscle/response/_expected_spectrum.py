@@ -36,7 +36,8 @@ def expected_spectrum(
     **Raises:** `OperatingPointError` (a `ValueError`) without a stable, damped equilibrium, and where an input still
     moves in the window; `ValueError` for a harmonic beyond half the sampling rate and for a task without noise and
     harmonic. Warns (`FirstOrderWarning`) where the second order adds more than 10 % to a bin, and of coefficients that
-    turn negative. Under a transformation, where values cannot be looked at, the result is not finite instead.
+    turn negative. Under a transformation, where values cannot be looked at, nothing is raised: without a stable equilibrium
+    the result is not finite, and all else that would be refused gives numbers without meaning.
     """
     moments, settings = _moments(task, "expected_spectrum(task)", settings, window)
     frequency = jnp.asarray(settings.frequency, moments.power.dtype)
