@@ -197,7 +197,7 @@ def test_goodness_of_two_targets():
     found = jm.goodness(jm.fit_joint(pair, tasks=TASKS, free=FREE, **QUICK), replicates=99)
     assert found.parts["high"].p_values["largest"] <= 0.02 < found.parts["low"].p_values["largest"]
     assert found.p_value <= 0.05
-    assert "high: against 99 spectra" in str(found) and "all targets together: p = " in str(found)
+    assert "high: compared with 99 spectra" in str(found) and "all targets together: p = " in str(found)
     assert len(found.plot().axes) == 8
     plt.close("all")
 

@@ -70,7 +70,7 @@ def trials(trials: Any, settings: Any = None, ax: Axes | None = None) -> Figure 
         window = fig.add_subplot(grid[row, 1], sharex=window, sharey=window)
         window.plot(np.arange(x.size) * one.duration / x.size, x, color=BLUE, lw=0.5)
         window.set_title("" if row else "Window", pad=2.0, weight="normal")
-        _label(window, "Time in the window (s)" if last else "", "")
+        _label(window, "Time in the window (s)" if last else "", f"({one.unit})")
         for panel in (whole, window):
             panel.margins(x=0)
             panel.tick_params(labelbottom=last)
