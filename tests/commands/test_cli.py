@@ -223,7 +223,8 @@ def test_a_preset_with_a_mean_force_is_simulated_at_it(tmp_path):
 def test_what_is_observed_of_a_motion(tmp_path):
     arguments = ["simulate", "zagrodny-slifkin", "--observe", "acceleration", "--seeds", 4, "--out", tmp_path]
     refused = run(*arguments)
-    assert refused.exit_code == 2 and "the output of PrescribedMotion is no motion; add --task prescribed-force" in refused.stderr
+    assert refused.exit_code == 2
+    assert "the output of PrescribedMotion is no motion; add --task prescribed-force" in refused.stderr
     outcome = run(*arguments, "--task", "prescribed-force")
     assert outcome.exit_code == 0 and "a_z: mean" in outcome.stdout and "m/s^2, standard deviation" in outcome.stdout
 
