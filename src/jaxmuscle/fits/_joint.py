@@ -169,7 +169,7 @@ def planned_jointly(
     local = _local_free(
         tasks, targets, None if options.free is None else tuple(options.free), options.fix or (), tuple(carried)
     )
-    names, moved = joint_names(local, tasks, separate), any(target.stiffness is not None for target in targets.values())
+    names, moved = joint_names(local, tasks, separate), _any_moved(targets)
     known = list(dict.fromkeys(joint for of in names.values() for joint in of.values()))
     _check_known("bounds", bounds, known)
     _check_known("priors", priors, known)
@@ -201,6 +201,11 @@ def _loaded(targets: Mapping[str, Any], tasks: Mapping[str, AbstractTask]) -> di
     return {name: aimed(t, tasks.get(name)) for name, t in targets.items()}
 
 
+def _any_moved(targets: Mapping[str, Target]) -> bool:
+    """Whether the insertion was moved for one of the targets."""
+    return any(target.stiffness is not None for target in targets.values())
+
+
 def _models(targets: dict[str, Target], tasks: Mapping[str, AbstractTask], noise: Any, fix: dict[str, float]) -> Tasks:
     """Every target's task with its noise, its fixed values and the target's settings."""
     found, fixed = {}, {t: {base_of(n): v for n, v in fix.items() if target_of(n) in ("", t)} for t in targets}
@@ -228,7 +233,7 @@ def _local_free(
     tasks: Tasks, targets: dict[str, Target], free: Iterable[str] | None, fix: Iterable[str], carried: Iterable[str]
 ) -> dict[str, tuple[str, ...]]:
     """The free parameters of every target's task."""
-    found, moved = {}, any(target.stiffness is not None for target in targets.values())
+    found, moved = {}, _any_moved(targets)
     fixed, wanted = ({n: _holders(argument, n, tasks) for n in names or ()} for argument, names in
                      (("fix", fix), ("free", free)))  # fmt: skip
     for t, task in tasks.items():
@@ -251,7 +256,7 @@ def _at_means(tasks: Tasks, targets: dict[str, Target]) -> tuple[Tasks, dict[str
     first, (mean, _) = next(iter(stated.items()))
     factor = float(at_force(tasks[first], mean)["P_w"]) / float(tasks[first]["P_w"])
     scaled = {name: times_force(task, factor) for name, task in tasks.items()}
-    if any(target.stiffness is not None for target in targets.values()):  # displacements are known: masses are no scale
+    if _any_moved(targets):  # displacements are known: masses are no scale
         scaled = {name: task.replace(**{m: tasks[name][m] for m in MASSES}) for name, task in scaled.items()}
     own = {name: scaled[name].replace(P_w=float(scaled[name]["P_w"]) * value / mean) for name, (value, _) in stated.items()}
     return scaled | own, stated, factor

@@ -18,7 +18,7 @@ from ._part import Estimate
 OUTPUTS = ("coefficient_of_variation", "mean")
 BASE = {"K_w0": "k_w", "K_z0": "k_z", "C_w0": "c_w", "C_z0": "c_z"}
 STRAIGHT = 0.25  # error of a log up to which a quantity is as good as linear
-VAGUE = 100.0
+VAGUE = 100.0  # from the lower to the upper end of an interval
 
 
 def parameter_table(

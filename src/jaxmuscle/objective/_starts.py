@@ -14,7 +14,7 @@ from ._coordinates import Coordinates
 from ._least_squares import Minima
 from ._problem import FitProblem
 
-RANGE = 30.0
+RANGE = 30.0  # of stiffness and damping, about the default
 
 
 def starting_points(problem: FitProblem, count: int) -> Float[np.ndarray, "starts free"]:

@@ -1,6 +1,5 @@
 """What the force does when the insertion is moved as measured: the nonlinear muscle, without noise."""
 
-import math
 from typing import Any
 
 import jax
@@ -13,6 +12,8 @@ from jaxmuscle._common.programs import kept
 from jaxmuscle.model._parameters import INPUTS
 from jaxmuscle.model._tasks import PrescribedLength
 from jaxmuscle.response._equilibrium import HOLD, equilibrium, fastest_rate
+
+from ._grid import parts_for
 
 BLOCK = 10_240  # half steps; a program serves all recordings of as many blocks
 LONGEST = 1.4  # of rate times step: half of what keeps the method stable, since damping grows with speed
@@ -30,8 +31,7 @@ def driven(task: PrescribedLength, motion: Float[np.ndarray, "3 times"], interva
     """
     times = motion.shape[1]
     filled = np.pad(motion, ((0, 0), (0, -(times - 1) % BLOCK)))
-    needed = fastest_rate(task, HOLD) * 2 * interval / LONGEST
-    parts = min(2 ** max(0, math.ceil(math.log2(max(needed, 1.0)))), MOST)
+    parts = min(parts_for(fastest_rate(task, HOLD), 2 * interval, LONGEST), MOST)
     return np.asarray(_driven(as_arrays(task), filled, 2 * interval, parts))[: (times + 1) // 2]
 
 
@@ -52,14 +52,14 @@ def _driven(task: Any, motion: Any, step: Any, parts: int) -> Float[Array, " ste
 
         def part(y, begin):
             a = at(y, along(begin))[0]
-            b = at(y + 0.5 * part_of * a, along(begin + 0.5 / parts))[0]
-            c = at(y + 0.5 * part_of * b, along(begin + 0.5 / parts))[0]
-            d = at(y + part_of * c, along(begin + 1 / parts))[0]
-            return y + part_of / 6 * (a + 2 * b + 2 * c + d), None
+            b = at(y + 0.5 * short * a, along(begin + 0.5 / parts))[0]
+            c = at(y + 0.5 * short * b, along(begin + 0.5 / parts))[0]
+            d = at(y + short * c, along(begin + 1 / parts))[0]
+            return y + short / 6 * (a + 2 * b + 2 * c + d), None
 
         return jax.lax.scan(part, y, jnp.arange(parts, dtype=motion.dtype) / parts)[0], at(y, first)[1]
 
-    table, part_of = motion.T, step / parts
+    table, short = motion.T, step / parts
     y, found = jax.lax.scan(advance, start, (table[:-1:2], table[1::2], table[2::2]))
     force = jnp.append(found, at(y, table[-1])[1])
     return force - at(start, jnp.zeros(3, motion.dtype))[1]

@@ -1,5 +1,7 @@
 """The time grid of a simulation; apart from the integrator, so that who only loads a program does without diffrax."""
 
+import math
+
 import equinox as eqx
 
 
@@ -15,3 +17,8 @@ class Grid(eqx.Module):
     every: int = eqx.field(static=True)
     substeps: int = eqx.field(static=True, default=1)
     reverse: bool = eqx.field(static=True, default=True)
+
+
+def parts_for(rate: float, step: float, longest: float) -> int:
+    """Into how many parts, a power of two, a step [s] is cut so that rate [1/s] times part is at most `longest`."""
+    return 2 ** max(0, math.ceil(math.log2(max(rate * step / longest, 1.0))))

@@ -22,7 +22,7 @@ from jaxmuscle.response._linearised import LinearTask, check_equilibrium, check_
 from jaxmuscle.spectra._settings import WINDOW, Sampling
 
 from ._batch import Recipe, run_seeds
-from ._grid import Grid
+from ._grid import Grid, parts_for
 from ._trajectory import Trajectory, one
 
 MAX_RATE_STEP = 0.5
@@ -178,8 +178,7 @@ def whole(value: float, message: str) -> int:
 def stable_substeps(task: AbstractTask, dt: float, duration: float = DURATION) -> int:
     """The power of two of sub-steps that brings max |eigenvalue| dt to at most 0.5; Heun diverges above 2."""
     fastest = fastest_rate(task, duration)
-    needed = fastest * dt / MAX_RATE_STEP
-    substeps = 2 ** max(0, math.ceil(math.log2(max(needed, 1.0))))
+    substeps = parts_for(fastest, dt, MAX_RATE_STEP)
     if substeps > MAX_SUBSTEPS:
         raise ValueError(
             f"this task has an eigenvalue of {fastest:.3g}/s, which asks for {substeps} sub-steps of dt = {dt} s "
