@@ -2,7 +2,7 @@
 
     python benchmarks/perturbed.py PART [--count N]
 
-PART: classical, amplitude, reflex, inertia, active, reference, rhythm, richer, seconds, coverage or time.
+PART: classical, amplitude, reflex, inertia, active, reference, people, rhythm, richer, seconds, coverage or time.
 
 Takes a minute to a quarter of an hour each.
 """
@@ -207,6 +207,44 @@ def reference(count: int) -> None:
               + " ".join(f"{fit.adequacy_p:.2g}" for fit in fits), flush=True)  # fmt: skip
 
 
+def people(count: int) -> None:
+    """Muscles softer and stiffer than the default one of the same force, with and without a tremor."""
+    tremor = {"activation_time": 0.05, "resonance_amplitude": 0.14, "resonance_frequency": 9.6, "resonance_width": 1.6}
+    for factor in (0.1, 0.3, 3.0):  # more is too fast for the steps of `recorded`
+        muscle = TASK.replace(**{name: factor * float(TASK[name]) for name in ("k_w", "k_z", "c_w", "c_z")})
+        shaking = jm.on_rung(muscle, 2).replace(**tremor)
+        runs = {"noise alone": recorded(muscle, np.random.default_rng(14), count), "tremor": _simulated(shaking, count)}
+        for words, moved in runs.items():
+            print(f"stiffness and damping times {factor:g}, {words}")
+            fits = [jm.fit(TASK, run, seeds=0, check_seeds=0) for run in moved]
+            told(fits, muscle)
+            print("  richest model tried: " + ", ".join(str(len(fit.ladder) - 1) for fit in fits), flush=True)
+            _held(fits, truth(muscle))
+
+
+def _held(fits: list[jm.fits.FitResult], true: dict[str, float]) -> None:
+    """How many of the 95 % intervals hold the truth."""
+    print("  95 % intervals that hold the truth:", end="")
+    for name, value in true.items():
+        known = [fit[name].interval for fit in fits if fit[name].interval is not None]
+        print(f" {name} {sum(low < value < high for low, high in known)} of {len(known)} known;", end="")
+    print(flush=True)
+
+
+def _simulated(muscle: jm.PrescribedLength, count: int, lines: np.ndarray = np.r_[30:300]) -> list[jm.PerturbedRecording]:
+    """A minute of the muscle moved at these lines [1/60 Hz], 1 mm rms, by the package's own simulation."""
+    rng, rate, runs = np.random.default_rng(13), 100, []
+    time = np.arange(90 * rate + 1) / rate
+    for seed in range(count):
+        phase = rng.uniform(0, 2 * np.pi, lines.size)
+        length = np.cos(2 * np.pi * np.outer(time, lines / 60) + phase).sum(axis=1)
+        length *= 1e-3 / np.std(length)
+        moved = jm.settled(muscle).with_parts(x_z=jm.model.Sampled.through(time, -length))
+        force = np.asarray(jm.simulate(moved, seed, duration=90.0, rate=float(rate)).output)
+        runs.append(jm.PerturbedRecording.from_array(force, length, rate).steady((30.0, 90.0)))
+    return runs
+
+
 def rhythm(count: int) -> None:
     """A sine of 4.25 Hz in both stiffnesses, and none: fitted as by default, and by noise alone."""
     for line in (0.003, 0.0):
@@ -229,29 +267,17 @@ def richer(count: int) -> None:
     the one that is found."""
     true = {"k_w": 1.61e7, "k_z": 1.61e7, "c_w": 1360.0, "c_z": 168.0, "P_w": 141.0, "noise_K_w": 0.27, "noise_K_z": 0.0013}
     tremor = {"activation_time": 0.05, "resonance_amplitude": 0.14, "resonance_frequency": 9.6, "resonance_width": 1.6}
-    muscle, rate = jm.on_rung(TASK, 2).replace(**true, **tremor), 100
-    time, rng = np.arange(90 * rate + 1) / rate, np.random.default_rng(13)
+    muscle = jm.on_rung(TASK, 2).replace(**true, **tremor)
     bands = {"two bands": np.r_[28:36, 170:200], "even": np.r_[30:300]}
     for words, lines in bands.items():
-        runs = []
-        for seed in range(count):
-            phase = rng.uniform(0, 2 * np.pi, lines.size)
-            length = np.cos(2 * np.pi * np.outer(time, lines / 60) + phase).sum(axis=1)
-            length *= 1e-3 / np.std(length)
-            moved = jm.settled(muscle).with_parts(x_z=jm.model.Sampled.through(time, -length))
-            force = np.asarray(jm.simulate(moved, seed, duration=90.0, rate=float(rate)).output)
-            runs.append(jm.PerturbedRecording.from_array(force, length, rate).steady((30.0, 90.0)))
+        runs = _simulated(muscle, count, lines)
         for how, times in (("by the base model", 0), ("by the model found", _search.RENEWALS)):
             kept, _search.RENEWALS = _search.RENEWALS, times
             fits = [jm.fit(TASK, run, **(QUICK | {"rungs": 2})) for run in runs]
             _search.RENEWALS = kept
             print(f"{words}, subtracted {how}")
             told(fits, TASK.replace(**{name: true[name] for name in ("k_w", "k_z", "c_w", "c_z")}))
-            print("  95 % intervals that hold the truth:", end="")
-            for name, value in truth(muscle).items():
-                known = [fit[name].interval for fit in fits if fit[name].interval is not None]
-                print(f" {name} {sum(low < value < high for low, high in known)} of {len(known)} known;", end="")
-            print(flush=True)
+            _held(fits, truth(muscle))
 
 
 def seconds(count: int) -> None:
@@ -298,7 +324,7 @@ def time(count: int) -> None:
 
 PARTS: dict[str, Callable[[int], None]] = {
     part.__name__: part
-    for part in (classical, amplitude, reflex, inertia, active, reference, rhythm, richer, seconds, coverage, time)
+    for part in (classical, amplitude, reflex, inertia, active, reference, people, rhythm, richer, seconds, coverage, time)
 }
 
 

@@ -967,3 +967,9 @@ def test_a_start_that_is_left_behind_ends_sooner():
     assert active(2.0, 1) == [True] * 4  # it takes two small gains in a row
     assert active(2.0, 2) == [True, True, False, True]
     assert active(np.inf, 2) == [True] * 4
+
+
+def test_a_task_that_is_traced_is_refused_with_a_way_out():
+    target = jm.load_target("vastus-lateralis-26mvc")
+    with pytest.raises(ValueError, match=r"JAX is tracing it.*Call fit outside; jaxmuscle.problem"):
+        jax.jit(lambda k_w: jm.fit(jm.Isometric().replace(k_w=k_w), target).chi2_per_bin)(4e5)

@@ -360,3 +360,17 @@ def test_signals_that_are_too_short(user_view):
             lowpass(signal, SpectrumSettings())
     with pytest.raises(ValueError, match="segments=0"):
         SpectrumSettings().degrees_of_freedom(0)
+
+
+def test_spectra_that_vmap_made_are_averaged_drawn_and_printed_as_any():
+    """`jax.vmap` gives their frequencies a leading axis, too."""
+    frequency, power = np.array([1.0, 2.0, 3.0], np.float32), np.array([[1.0, 2.0, 3.0], [3.0, 4.0, 5.0]], np.float32)
+    mapped = jax.vmap(lambda power: Spectrum(frequency, power, SpectrumSettings()))(power)
+    assert mapped.frequency.shape == (2, 3)
+    usual = Spectrum(frequency, power, SpectrumSettings())
+    assert str(mapped) == str(usual) and "spectra   2" in str(mapped)
+    for found in (mapped.mean(), usual.mean()):
+        np.testing.assert_array_equal(found.frequency, frequency)
+        np.testing.assert_allclose(found.power, [2.0, 3.0, 4.0])
+    lines = [ax.lines[0].get_xydata() for ax in (mapped.plot(), usual.plot())]
+    np.testing.assert_array_equal(*lines)

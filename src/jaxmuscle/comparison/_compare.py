@@ -16,7 +16,7 @@ from jaxmuscle.data._target import Target
 from jaxmuscle.fits._adequacy import Endpoint
 from jaxmuscle.model._noises import NOISES, with_noise
 from jaxmuscle.model._parameters import HARMONIC, PARAMETERS, proper_names, proper_values, unknown_parameter
-from jaxmuscle.model._rungs import on_rung
+from jaxmuscle.model._rungs import RICHER, on_rung
 from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.objective._arguments import FitOptions, planned
 from jaxmuscle.objective._consequences import expand
@@ -28,7 +28,6 @@ from ._comparison import NEEDED, ComparedModel, Comparison, score_difference
 from ._evidence import Candidate, Folds, held_out, masked_bins, maxima, without_harmonic
 
 Value = TypeVar("Value")
-RICHER = {"activation": 1, "tremor": 2, "two resonances": 3}  # rungs of the task with its own noise
 
 
 def compare_noise(

@@ -18,6 +18,7 @@ from jaxmuscle._common.tables import frame
 from jaxmuscle._common.text import folded, probability
 from jaxmuscle.data._target import Target
 from jaxmuscle.fits._adequacy import ADEQUATE
+from jaxmuscle.model._rungs import RICHER, RUNGS
 from jaxmuscle.model._task_tables import task_to_table
 from jaxmuscle.model._tasks import AbstractTask
 
@@ -326,6 +327,8 @@ class Comparison(Printed, Result, eqx.Module):
             line += f"{'' if p is None else probability(p).removeprefix('p ').removeprefix('= '):>9}"
             lines.append(f"{line}  {held if row.success else 'failed'}")
         lines.append(LEGEND)
+        called = [f"{name} ({RUNGS[rung]})" for name, rung in RICHER.items() if any(row.noise == name for row in self.rows)]
+        lines += [f"  the richer models that `fit` tries: {'; '.join(called)}"] * bool(called)
         said = [f"left out: {noise}: {why}" for noise, why in self.left_out.items()]
         for sentence in (self.adequate, *self.verdict, *said):
             lines.append(f"- {sentence}")

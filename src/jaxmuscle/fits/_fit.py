@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any, Literal
 
+from jaxmuscle._common.arrays import all_concrete, require
 from jaxmuscle._common.environment import fitting
 from jaxmuscle._common.progress import told
 from jaxmuscle._common.types import Key
@@ -101,6 +102,11 @@ def fit(
     bounds); `FitInterrupted` on Ctrl-C, with what was reached.
     """
     require_task(task, "fit(task, target)")
+    require(
+        all_concrete(task),
+        "task: JAX is tracing it (inside jit, grad or vmap), but a fit needs numbers. Call fit outside; "
+        "jaxmuscle.problem(task, target) has functions that JAX can transform (log_density, residuals)",
+    )
     recordings = recordings_of(target, task)
     aim = recordings[0].name if recordings else (target := as_target(target)).name
     with told(progress, f"fitting {aim}") as tell, fitting():

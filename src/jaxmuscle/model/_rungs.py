@@ -11,6 +11,7 @@ RUNGS = (
     "with tremor instead of the harmonic",
     "with a second resonance",
 )
+RICHER = {"activation": 1, "tremor": 2, "two resonances": 3}  # what a comparison calls them, with the task's own noise
 QUIET, NOISE_ALONE = -1, "noise alone"  # below the base model
 
 

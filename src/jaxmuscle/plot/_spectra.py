@@ -62,7 +62,7 @@ def spectrum(
     **Returns:** the axes.
     """
     ax = axes_or_new(ax)
-    frequency = np.asarray(spectrum.frequency)
+    frequency = np.asarray(spectrum.bins)
     rows, kind = _finite(np.asarray(spectrum.power).reshape(-1, frequency.size))
     mean, each = rows.mean(0), rows
     if proportional:

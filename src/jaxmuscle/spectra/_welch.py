@@ -21,7 +21,8 @@ class Spectrum(Shown, eqx.Module):
     """A one-sided power spectral density on bins.
 
     `frequency` [Hz] has one value per bin; `power` [`unit`²/Hz] may have leading axes (seeds, trials). The
-    functions here take those themselves; `jax.vmap` would give `frequency` one as well.
+    functions here take those themselves. `jax.vmap` gives `frequency` leading axes as well, with the same values in every
+    row: `mean`, `plot` and print take it as one.
     """
 
     frequency: Float[Array | np.ndarray, " bins"]
@@ -31,9 +32,9 @@ class Spectrum(Shown, eqx.Module):
 
     def _card(self) -> Card:
         known = (isinstance(x, jax.Array | np.ndarray) and is_concrete(x) for x in (self.frequency, self.power))
-        if not all(known) or self.frequency.ndim != 1:
+        if not all(known) or self.frequency.shape[-1:] != self.power.shape[-1:]:
             return Card(eqx.tree_pformat(self))  # a tree that JAX or Equinox took apart
-        frequency, power, apart = np.asarray(self.frequency), np.asarray(self.power, float), self.settings.resolution
+        frequency, power, apart = np.asarray(self.bins), np.asarray(self.power, float), self.settings.resolution
         rows = [("bins", f"{frequency.size}, {frequency[0]:.3g} to {frequency[-1]:.3g} Hz, {apart:.3g} Hz apart")]
         if power.ndim > 1:
             rows.append(("spectra", f"{' x '.join(map(str, power.shape[:-1]))}; below, their mean"))
@@ -46,6 +47,11 @@ class Spectrum(Shown, eqx.Module):
         return facts(f"power spectral density [{square}/Hz]", rows)
 
     @property
+    def bins(self) -> Float[Array | np.ndarray, " bins"]:
+        """Their frequencies [Hz], without the leading axes that `jax.vmap` gives to `frequency`."""
+        return self.frequency.reshape(-1, self.frequency.shape[-1])[0]
+
+    @property
     def proportional(self) -> Float[Array, "*batch bins"]:
         """Power of each bin over the sum of all bins: p_k = P_k / Σ_j P_j, without unit."""
         power = jnp.asarray(self.power)
@@ -55,7 +61,7 @@ class Spectrum(Shown, eqx.Module):
         """The average over all leading axes: of absolute power, to be normalised afterwards."""
         power = jnp.asarray(self.power)
         power = jnp.mean(power, axis=tuple(range(power.ndim - 1)))
-        return Spectrum(self.frequency, power, self.settings, self.unit)
+        return Spectrum(self.bins, power, self.settings, self.unit)
 
     def plot(self, ax: Any = None, *, log: bool = False, proportional: bool = True, label: str | None = None) -> Any:
         """Draws power over frequency and returns the axes, see `jaxmuscle.plot.spectrum`."""

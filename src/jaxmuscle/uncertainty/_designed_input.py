@@ -189,7 +189,8 @@ class DesignedInput(Printed, Result, eqx.Module):
             f"  lengthening of the muscle: {1e3 * self.rms:.3g} mm rms, at most {1e3 * self.peak:.3g} mm to "
             f"either side and {1e3 * self.speed:.3g} mm/s, {low:.2g} to {high:.2g} Hz",
             *[f"  most of the motion: {most}"] * bool(most),
-            "  expected standard errors, in percent of the value:",
+            "  expected standard errors, in percent of the value (now: before this record, by the data of the fit and by "
+            "its priors; where the data tell little, that is the prior's):",
             f"    {'':<22}{'now':>10}{'flat':>10}{'designed':>10}",
             *rows,
             *([OPEN] if any(self.percent(n, self.stderr) > 100 * LOOSE for n in self.told) else []),
@@ -240,9 +241,11 @@ class DesignedInput(Printed, Result, eqx.Module):
             lines += ["  assumed: the active mass m_w is right, as in the fit. No record determines it. A wrong m_w makes "
                       "C_w0 and K_w0 wrong, too (docs/perturbed.md has by how much)"]  # fmt: skip
         elif not self.held and any(value != USUAL for value in self.masses.values()):
-            lines += [f"  assumed: {values}, as in this fit or preset. A held force tells no mass. If you know roughly what "
-                      f"moves, fit with that (--fix m_w={USUAL:g} --fix m_z={USUAL:g}, say) and design again. The fit of "
-                      f"the new record leaves both masses free, and starts them at {USUAL:g} kg"]  # fmt: skip
+            lines += [
+                f"  assumed: {values}, as in this fit or preset. A held force tells no mass. If you did not choose these "
+                f"values and know roughly what moves, fit with that (--fix m_w={USUAL:g} --fix m_z={USUAL:g}, say) and "
+                f"design again. The fit of the new record leaves both masses free, and starts them at {USUAL:g} kg"
+            ]
         return lines
 
     def _vague(self) -> list[str]:

@@ -189,7 +189,7 @@ class IdentifiabilityReport(Printed, Result, eqx.Module):
         return plot.identifiability(self, ax)
 
     def __str__(self) -> str:
-        return "\n".join([*_present(self), *_designs(self), *_table(self), *_sentences(self)])
+        return "\n".join([*_present(self), *_next(self), *_table(self), *_details(self)])
 
 
 def told(quantities: dict[str, Known]) -> list[str]:
@@ -238,16 +238,32 @@ def _products(outlook: Outlook) -> str:
     return ", ".join(f"{spelt(name)} (± {100 * error:.2g} %)" for name, error in outlook.products.items())
 
 
-def _designs(report: IdentifiabilityReport) -> list[str]:
+def _next(report: IdentifiabilityReport) -> list[str]:
+    """The answer before its details: what each measurement would tell, and which one tells most."""
     if not report.designs:
         return []
-    lines = ["  further measurements, and how many combinations would then be determined:"]
+    free = len(report.free)
+    lines = ["  what to measure next:"]
+    if (best := _most(report)) is not None:
+        count = free - best.determined
+        rest = f"{count} of {free} combinations would stay open" if count else "nothing would stay open"
+        label = f"{letter(report.designs.index(best))}, " if best in report.designs else ""
+        lines += _wrapped(f"most would be learnt from {label}{best.name}: {rest}", 4)
     for number, design in enumerate(report.designs):
-        count = "impossible" if design.failed else f"{design.determined} of {len(report.free)}"
-        lines += _wrapped(f"{design.name}: {count}", 8, f"    {letter(number):<2}  ")
+        count = "" if design.failed else f" ({design.determined} of {free} combinations determined)"
+        lines += _wrapped(f"{design}{count}", 8, f"    {letter(number):<2}  ")
+    for pair in report.telling_pairs[:PAIRS_TOLD]:
+        lines += _wrapped(str(pair), 8, "    two ")
+    return lines + _wrapped(TIRING, 4)
+
+
+def _details(report: IdentifiabilityReport) -> list[str]:
+    """Task and data of each measurement."""
+    lines = ["  the measurements in detail:"] if report.designs else []
+    for number, design in enumerate(report.designs):
         values = "values" if len(design.separate) > 1 else "value"
         own = f"; with its own {values} of {', '.join(design.separate)}" if design.separate else ""
-        lines += _wrapped(f"{design.task}; {design.data}{own}", 8)
+        lines += _wrapped(f"{design.task}; {design.data}{own}", 8, f"    {letter(number):<2}  ")
     return lines
 
 
@@ -295,19 +311,6 @@ def _shown(known: Known) -> str:
 def _cell(known: Known, error: float) -> str:
     share = 100 * error / abs(known.value) if known.value else np.inf
     return f"{share:.2g}" if share < 99.5 else f"{share:.0f}" if share < FAR else ">>"
-
-
-def _sentences(report: IdentifiabilityReport) -> list[str]:
-    lines = []
-    for outlook in (*report.designs, *report.telling_pairs[:PAIRS_TOLD]):
-        lines += _wrapped(str(outlook), 4, "  - ")
-    best = _most(report)
-    if best is not None:
-        count = len(report.free) - best.determined
-        rest = f"{count} of {len(report.free)} combinations stay{'s' * (count == 1)} open" if count else "nothing stays open"
-        lines += _wrapped(f"most would be learnt from {best.name}: {rest}", 4, "  - ")
-        lines += _wrapped(TIRING, 4, "  - ")
-    return lines
 
 
 def _most(report: IdentifiabilityReport) -> Outlook | None:
