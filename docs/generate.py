@@ -57,7 +57,8 @@ FIT = """
 A fit has a [prior](../glossary.md#the-fit) for every free parameter. The prior is centred on the value that the parameter
 has in the task which you pass in. *Prior sd* is the standard deviation of the prior. A positive parameter is fitted in *log
 space*: its *prior sd* is that of the logarithm. For the other parameters it is in their own unit. *Reached by a fit* are the
-bounds of the search. *The paper* is the one from which [the model](../model.md) comes.
+bounds of the search. In models with activation or tremor the *prior sd* of k_w, k_z, c_w and c_z is 0.5, unless a motor
+moved the insertion ([why](../force.md)). *The paper* is the one from which [the model](../model.md) comes.
 
 | name | log space | prior sd | reached by a fit | source of the default |
 |---|---|---|---|---|

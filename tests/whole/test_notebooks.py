@@ -2,11 +2,12 @@
 
 import re
 import sys
+import time
 import types
 
 import nbformat
+import numpy as np
 import pytest
-from nbclient import NotebookClient
 from pages import IN_A_KERNEL, NOTEBOOKS, ROOT, module
 
 
@@ -68,11 +69,25 @@ def test_the_site_offers_every_notebook_for_download(monkeypatch):
 
 
 @pytest.mark.slow
+def test_no_reply_of_a_cell_with_an_output_widget_is_missed(tmp_path):
+    """With nbclient alone every second such cell waits for its whole timeout, which is an error here."""
+    cells = ["import ipywidgets\nshown = ipywidgets.Output()"] + ["with shown:\n    print(1)\n    display(2)"] * 20
+    notebook = nbformat.v4.new_notebook(cells=[nbformat.v4.new_code_cell(cell) for cell in cells])
+    client = module(ROOT / "notebooks" / "run.py").Client
+    taken = []
+    begun = time.monotonic()
+    client(notebook, timeout=60, startup_timeout=300, resources={"metadata": {"path": str(tmp_path)}},
+           on_cell_executed=lambda **_: taken.append(time.monotonic() - begun)).execute()  # fmt: skip
+    assert np.max(np.diff(taken)) < 50
+
+
+@pytest.mark.slow
 def test_a_notebook_runs_in_a_kernel(tmp_path, monkeypatch):
     """The one with sliders; test_pages.py runs the cells of the others."""
     monkeypatch.delenv("MPLBACKEND", raising=False)  # the kernel's own, as a reader has it
     notebook, _ = stored(NOTEBOOKS[0].with_name(f"{IN_A_KERNEL}.ipynb"))
-    NotebookClient(
+    client = module(ROOT / "notebooks" / "run.py").Client
+    client(
         notebook, timeout=900, startup_timeout=300, iopub_timeout=60, resources={"metadata": {"path": str(tmp_path)}}
     ).execute()
     outputs = [output for cell in notebook.cells for output in cell.get("outputs", [])]

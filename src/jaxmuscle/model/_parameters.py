@@ -20,6 +20,7 @@ _DAMP = (
     "(1.5 Hz), is near the corner of force spectra (fits of the measured ones: 0.4 and 0.9 Hz)"
 )
 _REF = "sets the range over which the muscle is linear: displacements here are about 0.01 m"
+_REF_V = "sets the range over which the muscle is linear: velocities in a hold are far below 1 m/s"
 _HUMAN = "coefficient of variation of isometric force near 1 %, as people show"
 _PAPER_K = f"{_HUMAN}; the paper has 0.16 % of the initial stiffness coefficient"
 _PAPER_C = "the paper: 0.01 % of the initial damping coefficient"
@@ -84,8 +85,8 @@ PARAMETERS: dict[str, Parameter] = {
         _row("c_z", "c_z", "N s^3/m^3", 5.0, "passive damping factor", _DAMP),
         _row("x_ref_w", "x_ref,w", "m", 0.02, "active reference displacement", _REF),
         _row("x_ref_z", "x_ref,z", "m", 0.02, "passive reference displacement", _REF),
-        _row("v_ref_w", "v_ref,w", "m/s", 1.0, "active reference velocity", _REF),
-        _row("v_ref_z", "v_ref,z", "m/s", 1.0, "passive reference velocity", _REF),
+        _row("v_ref_w", "v_ref,w", "m/s", 1.0, "active reference velocity", _REF_V),
+        _row("v_ref_z", "v_ref,z", "m/s", 1.0, "passive reference velocity", _REF_V),
         _row("noise_K_w", "σ_Kw/K_w0", "1", 0.15, "noise on active stiffness", _PAPER_K),
         _row("noise_K_z", "σ_Kz/K_z0", "1", 0.005, "noise on passive stiffness", _PAPER_K),
         _row("noise_C_w", "σ_Cw/C_w0", "1", 1e-4, "noise on active damping", _PAPER_C),
@@ -93,7 +94,7 @@ PARAMETERS: dict[str, Parameter] = {
         _row("noise_cutoff", "f_c", "Hz", 50.0, "corner of band-limited noise",
              "half of 100 Hz, to which recordings are resampled"),
         _row("noise_correlation_time", "τ", "s", 0.1, "correlation time of Ornstein-Uhlenbeck noise",
-             "fits of measured force: 0.07 to 0.3 s", fit_lower=0.005, fit_upper=5.0),
+             "most fits of measured force: 0.07 to 0.3 s", fit_lower=0.005, fit_upper=5.0),
         _row("harmonic_amplitude", "A/K_0", "1", 0.003, "harmonic amplitude", _HUMAN),
         _row("harmonic_frequency", "f_S", "Hz", 4.25, "harmonic frequency", "the paper: local maximum at 4.251 Hz",
              fit_lower=0.2, fit_upper=30.0),

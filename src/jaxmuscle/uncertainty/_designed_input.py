@@ -26,9 +26,11 @@ USUAL = PARAMETERS["m_w"].default  # kg
 FEWER_LINES = 1.6  # times as long as a part of a longer motion
 SHOWN = 2.0  # times the even density: where a design moves the most
 DOUBTFUL = 0.3  # relative standard error
-LOOSE = 0.165  # a third of the narrower of the usual priors, 0.5 in the logarithm
-OPEN = ("  a quantity with a larger error than about 33 % (17 % in models with activation or tremor) will stay 'not "
-        "determined' in the fit: its error must be at most a third of its prior's")  # fmt: skip
+LOOSE = 0.33  # a third of the usual prior, 1 in the logarithm
+OPEN = (
+    "  a quantity with a larger error than about 33 % will stay 'not determined' in the fit: its error must be at most "
+    "a third of its prior's"
+)
 ASSUMED = (
     "  assumed: no reflex. A reflex can change K_w0 by 10 to 55 %, and the fit does not notice: call it muscle plus reflex",
     "  assumed: no fatigue. Split a long or strong hold into trials with rests between, and give all trials to one fit",

@@ -22,7 +22,7 @@ from jaxmuscle.objective._derived import TANGENTS, derived_names, has_tangents
 from jaxmuscle.objective._problem import FitProblem, Part
 from jaxmuscle.response._expected_spectrum import expected_spectrum
 
-from ._design_information import coordinates_of, design_information, opened, seen_here
+from ._design_information import coordinates_of, design_information, opened, prior_beside_a_motion, seen_here
 from ._designed_input import DOUBTFUL, DesignedInput
 from ._designs import moved_insertion, without_noise
 from ._identifiability import Here, fitted_problem, missed
@@ -193,7 +193,7 @@ class Experiment(NamedTuple):
         design = moved_insertion(record, problem.parts[0].target.settings, coefficient_of_variation=True, target=target)
         like = design.like(problem)
         task: Any = _moved(like.task).with_parts(settings=like.target.settings)
-        start = np.diag(problem.prior) + (here.information if isinstance(given, FitResult) else 0.0)
+        start = np.diag(prior_beside_a_motion(problem)) + (here.information if isinstance(given, FitResult) else 0.0)
         apart = start + design_information(problem, theta, dataclasses.replace(design, task=task, lengthening=None))
         own, coordinates = coordinates_of(like, theta, task)
         lines = np.zeros((len(record.frequency), *start.shape))
