@@ -134,6 +134,9 @@ OPTIONS = {
     "fix out of range": (["{csv}", "--fix", "m_w=-1"], "m_w = -1.0 kg is outside"),
     "fix twice, differently": (["{csv}", "--fix", "k_w=1e5", "--fix", "k_w=2e5"], "--fix 'k_w=2e5': k_w is fixed twice"),
     "unknown noise": (["{csv}", "--noise", "purple"], "'--noise'"),
+    "one model and a richest one": (["{csv}", "--rung", "2", "--rungs", "1"], "--rung fits one model to one spectrum"),
+    "one model for several spectra": (["{csv}", "{csv}", "--rung", "2"], "--rung fits one model to one spectrum"),
+    "noise of a model that has its own": (["{csv}", "--rung", "2", "--noise", "pink"], "--rung: the models with activation"),
     "unknown task": (["{csv}", "--task", "isotonic"], "'--task'"),
     "unknown residual": (["{csv}", "--residual", "square"], "'--residual'"),
     "unknown method": (["{csv}", "--method", "linaer"], "'--method'"),
@@ -518,6 +521,18 @@ def test_options_reach_the_fit(tmp_path, monkeypatch):
                 "method": "linear", "residual": "linear", "seeds": 9, "key": 4}  # fmt: skip
     assert {name: seen[name] for name in expected} == expected
     assert seen["target"].segments == (7,) and isinstance(seen["task"], jm.Isometric)
+
+
+def test_one_model_of_the_ladder_is_fitted(tmp_path, monkeypatch):
+    seen = {}
+
+    def fake(task, target, **options):
+        seen.update(options, task=task)
+        return made_result()
+
+    monkeypatch.setattr(jm, "fit", fake)
+    assert run("fit", csv_file(tmp_path), "--rung", "2", "--quick", "--out", tmp_path / "out").exit_code == 0
+    assert seen["task"] == jm.on_rung(jm.Isometric(), 2) and seen["rungs"] == 0
 
 
 def test_a_failing_simulation_is_not_a_users_mistake(tmp_path, monkeypatch):
@@ -909,10 +924,10 @@ def test_a_designed_motion(tmp_path):
     said = run("design", preset, *asked, "--out", tmp_path / "out", "--force").stdout
     assert "    jaxmuscle fit RECORD.csv --task prescribed-length --window 10:30 --out out/moved\n" in said
     assert "    jaxmuscle fit RECORD.csv --hold HOLD.csv --window 10:30,auto --out out/both\n" in said
-    assert "Play the motion for 30 s: motor.csv holds one period of 20 s" in " ".join(said.split())
+    assert "Play the motion for 32 s: motor.csv holds one period of 20 s" in " ".join(said.split())
     said = run("design", preset, *asked, "--error", "10", "--out", tmp_path / "out", "--force").stdout
     end = 10 + 20 * np.ceil(table["needed"]["seconds"] / 20)
-    assert end > 30 and f"Play {end:.3g} s and analyse the last {end - 10:.3g} s" in " ".join(said.split())
+    assert end > 30 and f"Play {end + 2:.3g} s and analyse 10 to {end:.3g} s" in " ".join(said.split())
     assert f"--window 10:{end:g} --out out/moved\n" in said  # as long as is said above
     for arguments, message in (
         (("--out", tmp_path / "out"), "motor.csv: is there already; overwrite it with --force"),

@@ -221,6 +221,19 @@ def test_a_window_needs_what_lies_before_it(minute):
         short.target()
 
 
+def test_a_window_that_is_cut_says_so(minute):
+    whole = minute.force.whole.size / RATE
+    cut = jm.PerturbedRecording.from_array(
+        minute.force.whole, minute.displacement.whole, RATE, positive="lengthening", window=(20.0, whole)
+    ).target()
+    asked = f"of the window from 20 to {whole:.4g} s the fit uses 20 to {whole - 2:.4g} s: it needs 2 s"
+    assert any(notice.startswith(asked) for notice in cut.notices)
+    inside = jm.PerturbedRecording.from_array(
+        minute.force.whole, minute.displacement.whole, RATE, positive="lengthening", window=(20.0, whole - 2.5)
+    ).target()
+    assert not any("the fit uses" in notice for notice in inside.notices)
+
+
 def test_a_task_that_cannot_be_moved(minute):
     target = minute.target()
     with pytest.raises(ValueError, match=r"dynamic stiffness, which PrescribedForce cannot give.*PrescribedLength"):

@@ -12,12 +12,13 @@ from scipy.optimize import brentq
 import jaxmuscle as jm
 from jaxmuscle.comparison._comparison import NEEDED
 from jaxmuscle.fits._adequacy import Endpoint
-from jaxmuscle.fits._checks import twitch_notices
+from jaxmuscle.fits._checks import mass_notices, twitch_notices
 from jaxmuscle.fits._ladder import Rung, _fewer, criterion, gains, passed_over, told_apart
 from jaxmuscle.fits._part import Estimate
 from jaxmuscle.model._rungs import RUNGS
 from jaxmuscle.objective._arguments import COEFFICIENTS, FitOptions, planned
 from jaxmuscle.objective._consequences import expand
+from jaxmuscle.objective._coordinates import Coordinates
 from jaxmuscle.objective._derived import derived_names
 from jaxmuscle.response._expected import expected_moments
 from jaxmuscle.spectra._bin_law import bin_statistics
@@ -190,8 +191,27 @@ def test_every_part_of_the_chosen_model_says_what_it_gains_over_the_poorer_one()
         "with activation the AIC falls by 50.0 (chi2 per bin 4.00 instead of 9.00)",
         "with tremor instead of the harmonic the AIC rises by 0.5 (chi2 per bin 4.05 instead of 4.00)",
     )
+    assert "A richer model can fit worse here" in said[-1]
     assert f"2 or less says nothing. jaxmuscle compare is stricter: it needs at least {NEEDED:g}, and" in said[-1]
     assert "no p-value" in said[-1] and "No model" not in said[-1]
+
+
+def test_what_a_part_gains_is_counted_from_the_best_model_without_it():
+    worse = gains(tried((0, -60.0), (1, -50.0), (2, -90.0), chosen=2), describes=True)
+    assert worse[:-1] == (
+        "with activation the AIC rises by 10.0 (chi2 per bin 5.00 instead of 4.00)",
+        "with tremor instead of the harmonic the AIC falls by 30.0 against the best model before (0) (chi2 per bin 1.00 "
+        "instead of 4.00)",
+    )
+
+
+def test_an_active_mass_far_from_its_prior_is_told():
+    names, one = ("k_w", "m_w"), np.ones(2)
+    coordinates = Coordinates.of({"k_w": 5e5, "m_w": 0.5}, {}, {"k_w": 1.0, "m_w": 0.5})
+    assert coordinates.names == names
+    (said,) = mass_notices(coordinates, np.array([9.0, 5.0]))
+    assert said.startswith("m_w went to 6.1 kg, 5 standard deviations of its prior from the 0.5 kg")  # 0.5 exp(5/2)
+    assert mass_notices(coordinates, 2.9 * one) == ()
 
 
 def test_a_model_that_is_missing_in_the_table_is_explained():

@@ -343,6 +343,7 @@ def test_longer_records_tell_more_and_the_wanted_error_says_how_long():
     assert (
         made.to_dict()["needed"]["seconds"] == made.needed[1] and designed(error=1e-9).to_dict()["needed"]["seconds"] is None
     )
+    assert "what is known without this record is enough" in " ".join(str(designed(error=0.999)).split())
     with pytest.raises(ValueError, match="durations"):
         designed(durations=(0.0,))
     with pytest.raises(ValueError, match="error"):

@@ -82,19 +82,18 @@ def design(
         begin, end = found.window
         period = found.lengthening.seconds
         out.print(folded([
-            f"- Play the motion for {end:g} s: motor.csv holds one period of {period:g} s, to be repeated without a gap. It "
-            "begins in the middle of the motion, so let the motor move to its first value slowly. Its largest acceleration "
-            f"is {found.acceleration:.2g} m/s². If the person tires, record several shorter trials instead.",
-            f"- Record force and displacement, and fit both channels without the first {begin:g} s:",
-        ]), highlight=False)  # fmt: skip
-        fit = f"jaxmuscle fit RECORD.csv --task prescribed-length --window {begin:g}:{end:g}"
-        out.print(f"    {fit} --out out/moved", highlight=False, soft_wrap=True)
-        out.print(folded([
-            "- The errors above include what earlier recordings tell, if you design from their fit. To reach them, fit "
-            "these together with the new record: give an earlier moved record as a second file, and a hold with --hold. In "
-            "--window, give the window of the new record first, then one auto for each other file:",
+            f"- Play the motion for {found.played:g} s: motor.csv holds one period of {period:g} s, to be repeated without "
+            "a gap. Its first lines, which begin with #, say what it is. Let the motor move to its first value slowly. Its "
+            f"largest acceleration is {found.acceleration:.2g} m/s². If the person tires, record several shorter trials "
+            "instead.",
+            f"- Record force and displacement. Fit both channels from {begin:g} to {end:g} s, together with what you have "
+            "already: the errors above include that. Give each held trial with --hold, and an earlier moved record as a "
+            "second file. In --window, give the window of the new record first, then one auto for each other file:",
         ]), highlight=False)  # fmt: skip
         out.print(f"    jaxmuscle fit RECORD.csv --hold HOLD.csv --window {begin:g}:{end:g},auto --out out/both",
+                  highlight=False, soft_wrap=True)  # fmt: skip
+        out.print(folded(["- Without other recordings:"]), highlight=False)
+        out.print(f"    jaxmuscle fit RECORD.csv --task prescribed-length --window {begin:g}:{end:g} --out out/moved",
                   highlight=False, soft_wrap=True)  # fmt: skip
 
 

@@ -81,6 +81,12 @@ def fit(
             "If you give several spectra, all get exactly this model.",
         ),
     ] = None,
+    rung: Annotated[
+        int | None,
+        typer.Option(
+            min=0, max=3, help="Fit just this model: 0 base, 1 with activation, 2 with tremor, 3 with a second resonance."
+        ),
+    ] = None,
     residual: Annotated[
         ResidualName,
         typer.Option(
@@ -198,6 +204,11 @@ def fit(
                              "with `jaxmuscle analyse ... --save-target FILE.toml`")  # fmt: skip
         if hold and not all(recorded):
             raise ValueError(NO_MOTION)
+        if rung is not None and (rungs is not None or hold or (len(target) > 1 and not any(recorded))):
+            raise ValueError("--rung fits one model to one spectrum or to recordings of one condition: leave out --rungs "
+                             "and --hold (with these, and with several spectra, --rungs says which model)")  # fmt: skip
+        if rung and noise is not None:
+            raise ValueError("--rung: the models with activation and tremor have noise of their own; leave out --noise")
         options = {
             "free": names,
             "fix": fixed,
@@ -239,7 +250,7 @@ def fit(
             writable(output, "fit.json", force=force)
             converged = _fit_with_holds(*given, output, options, [] if quick else formats_of(formats))
             raise typer.Exit(CONVERGED if converged else NOT_CONVERGED)
-        options |= {"method": str(method), "seeds": seeds, "rungs": rungs}
+        options |= {"method": str(method), "seeds": seeds, "rungs": rungs if rung is None else 0}
         options |= {"check_seeds": 0} if quick else {}
         options |= {} if increments is None else {"increments": str(increments)}
         if any(recorded):
@@ -255,6 +266,8 @@ def fit(
             unused(reading, "axis", window=window, what="recordings; this is a spectrum")
             aim = aim_of(target[0], task, read)
         writable(output, "fit.json", force=force)
+        if rung is not None:
+            aim = aim[0], jm.on_rung(aim[1], rung)
         converged = _fit_alone(*aim, output, options, [] if quick else formats_of(formats))
     raise typer.Exit(CONVERGED if converged else NOT_CONVERGED)
 

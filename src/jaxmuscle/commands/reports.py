@@ -226,7 +226,9 @@ def _after_a_fit(result: "FitResult", path: Path) -> list[str]:
         f"How sure is each number? `jaxmuscle posterior {place}` draws from the posterior.",
         *([f"Move the parameters yourself: `jaxmuscle explore {place}`."] if single else []),
         f"What should you measure to know the rest? `jaxmuscle identifiability {place}`.",
-        'In a paper, give the numbers under "What the data determine" with their intervals, unless a note says not to.',
+        'In a paper, give the parameters under "What the data determine" with their intervals, unless a note says not to. '
+        "Take mean, variation and bands from `jaxmuscle steadiness`, which needs no model. If the model has a tremor, leave "
+        "out high_frequency_floor: there it holds the tremor, too.",
         "Name those that the data do not determine.",
     ]
 

@@ -31,7 +31,7 @@ def second_order_fit(response: Response, delayed: bool) -> SecondOrder:
     The errors take the correlation of neighbouring bins into account. Where chi² is more than it should be, since the muscle
     has another shape, they are multiplied by √(chi² / its expectation).
     """
-    f, weight = response.frequency, 1 / np.concatenate([response.stderr] * 2)
+    f, weight = response.centre, 1 / np.concatenate([response.stderr] * 2)
     count = 3 + delayed
     require(2 * f.size > count, "bins", f.size, "too few for a fit; excite a wider band, or take longer segments")
     scale, shapes = _terms(response)
@@ -64,7 +64,7 @@ def lengthens(response: Response) -> float:
 
 def _terms(response: Response) -> tuple[Float[np.ndarray, " 3"], Float[np.ndarray, "twice 3"]]:
     """Scales of K, B and I, and the response to one of each, in standard errors."""
-    f = response.frequency
+    f = response.centre
     scale = np.abs(response.value).max() / (2 * np.pi * f.max()) ** np.arange(3)
     shapes = np.stack([parts(second_order_shape(f, unit * scale)) for unit in np.eye(3)], axis=1)
     return scale, shapes / np.concatenate([response.stderr] * 2)[:, None]

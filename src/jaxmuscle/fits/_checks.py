@@ -5,10 +5,12 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
+from jaxtyping import Float
 
 from jaxmuscle.data._target import Target
 from jaxmuscle.objective._arguments import base_of
 from jaxmuscle.objective._consequences import BATCH, Expansion, consequences, expand, quantities
+from jaxmuscle.objective._coordinates import Coordinates
 from jaxmuscle.objective._covariance import Identifiability
 from jaxmuscle.objective._least_squares import SMALL, Minima
 from jaxmuscle.objective._problem import FitProblem
@@ -22,6 +24,7 @@ from jaxmuscle.spectra._settings import WINDOW
 from ._part import Estimate, Start, met
 
 AMBIGUOUS, OTHER = 2.0, 3.0
+PULLED = 3.0  # prior standard deviations
 NONLINEAR = 0.1
 LEFT = 1e-3
 RISEN = 1.5
@@ -209,6 +212,19 @@ def twitch_notices(found: Mapping[str, Estimate]) -> tuple[str, ...]:
             said.append(f"{name} ({p.interval_in_words()} s) is {'longer' if slow else 'shorter'} than in human muscle, "
                         f"{TWITCH[0]:g} to {TWITCH[1]:g} s. {SLOW if slow else FAST}. Do not report it as the muscle's "
                         f"contraction time. What to do: {instead}hold activation_time at a value that you know")  # fmt: skip
+    return tuple(said)
+
+
+def mass_notices(coordinates: Coordinates, theta: Float[np.ndarray, " free"]) -> tuple[str, ...]:
+    """The notice of an active mass that was pulled far from where its prior has it."""
+    said = []
+    for name, at, centre, sd in zip(coordinates.names, theta, coordinates.centre, coordinates.sd, strict=True):
+        if base_of(name) == "m_w" and abs(at) > PULLED:
+            said.append(f"{name} went to {centre * np.exp(at * sd):.2g} kg, {abs(at):.2g} standard deviations of its prior "
+                        f"from the {centre:.2g} kg with which the fit began. No record determines it, so something else "
+                        "pulls it: the force may fluctuate in a way that this muscle cannot, or another mass moves. "
+                        "Then stiffness and damping may be wrong by more than their errors. Compare them with K and B of "
+                        "jaxmuscle analyse, which look at the response alone")  # fmt: skip
     return tuple(said)
 
 

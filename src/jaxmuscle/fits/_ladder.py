@@ -73,18 +73,21 @@ def heading(datum: str) -> str:
 
 
 def gains(ladder: tuple[Rung, ...], *, describes: bool | None, datum: str = "bin") -> tuple[str, ...]:
-    """What every part of the chosen model gains over the model before it, in sentences; and what such a number says.
+    """What every part of the chosen model gains over the best model without it, in sentences; and what such a number says.
 
     `describes`: whether the chosen model describes the data; `datum`, what chi² is counted for.
     """
     number = next((rung.number for rung in ladder if rung.chosen), QUIET)
-    climbed = [rung for rung in ladder if rung.number <= number]
-    said = tuple(_gain(before, after, datum) for before, after in itertools.pairwise(climbed))
+    climbed = tuple(rung for rung in ladder if rung.number <= number)
+    said = tuple(_gain(climbed[:i], after, datum) for i, after in enumerate(climbed) if i)
     if not said:
         return ()
     meaning = ("the AIC weighs how well a model fits against its number of parameters: lower is better. A difference of "
                f"{ALIKE:g} or less says nothing. jaxmuscle compare is stricter: it needs at least 6, and the richer model "
                "must also predict bins better that were left out of its fit. The AIC is no p-value")  # fmt: skip
+    if any(after.aic > before.aic for before, after in itertools.pairwise(climbed)) and number > 0:
+        meaning += (". A richer model can fit worse here, since models with activation or tremor keep stiffness and damping "
+                    "nearer to their usual values")  # fmt: skip
     if describes is False:
         meaning += (". No model that was tried describes the data: then a lower AIC says that a model misses less, not that "
                     "the muscle has this part")  # fmt: skip
@@ -99,12 +102,14 @@ def passed_over(ladder: tuple[Rung, ...]) -> tuple[str, ...]:
                  for number in range(before.number + 1, after.number))  # fmt: skip
 
 
-def _gain(before: Rung, after: Rung, datum: str) -> str:
-    """AIC and chi² of a model against those of a poorer one."""
-    added = " and ".join("with a harmonic" if n == 0 else rung_name(n) for n in range(before.number + 1, after.number + 1))
-    change = after.aic - before.aic
-    return (f"{added} the AIC {'falls' if change < 0 else 'rises'} by {abs(change):.1f} (chi2 per {datum} "
-            f"{after.chi2_per_bin:.2f} instead of {before.chi2_per_bin:.2f})")  # fmt: skip
+def _gain(poorer: tuple[Rung, ...], after: Rung, datum: str) -> str:
+    """AIC and chi² of a model against those of the best of the poorer ones."""
+    last, best = poorer[-1], min(poorer, key=lambda rung: rung.aic)
+    added = " and ".join("with a harmonic" if n == 0 else rung_name(n) for n in range(last.number + 1, after.number + 1))
+    change = after.aic - best.aic
+    against = "" if best is last else f" against the best model before ({best.model})"
+    return (f"{added} the AIC {'falls' if change < 0 else 'rises'} by {abs(change):.1f}{against} (chi2 per {datum} "
+            f"{after.chi2_per_bin:.2f} instead of {best.chi2_per_bin:.2f})")  # fmt: skip
 
 
 def options_for(task: AbstractTask, options: FitOptions) -> FitOptions:

@@ -16,7 +16,9 @@ class Response(NamedTuple):
     """The response H of an output to an input in the bins that the input excites.
 
     `input_power` is the input's density, `stderr` the standard error of the real and of the imaginary part of `value`,
-    `correlation` that of the errors of bins, `E e_k e_l* / √(E|e_k|² E|e_l|²)`.
+    `correlation` that of the errors of bins, `E e_k e_l* / √(E|e_k|² E|e_l|²)`. `centre` is where the input that a bin sees
+    lies on the average [Hz]: at an edge of the input's band not in the middle of the bin, and to first order `value` is H
+    at the centre.
     """
 
     frequency: Float[np.ndarray, " bins"]
@@ -25,6 +27,7 @@ class Response(NamedTuple):
     coherence: Float[np.ndarray, " bins"]
     correlation: Complex[np.ndarray, "bins bins"]
     input_power: Float[np.ndarray, " bins"]
+    centre: Float[np.ndarray, " bins"]
 
 
 def ordinates(
@@ -75,5 +78,14 @@ def response_of(
     sd = np.sqrt(np.real(np.diag(v)))
     return Response(
         settings.frequency[kept], cross / power, sd * np.sqrt(noise / 2), np.abs(cross) ** 2 / (power * total),
-        v / np.outer(sd, sd), power / count,
+        v / np.outer(sd, sd), power / count, _centres(given, rows.reshape((*shape, n)), settings.rate),
     )  # fmt: skip
+
+
+def _centres(
+    given: Float[np.ndarray, " times"], rows: Complex[np.ndarray, "bins tapers n"], rate: float
+) -> Float[np.ndarray, " bins"]:
+    """`Σ f |W_k(f)|² S(f) / Σ |W_k(f)|² S(f)`, S the input's periodogram, W_k the transform of a bin's rows."""
+    density, f = np.abs(np.fft.rfft(given - given.mean())) ** 2, np.fft.rfftfreq(given.size, 1 / rate)
+    seen = [np.sum(np.abs(np.fft.fft(row.conj(), given.size)[:, : f.size]) ** 2, axis=0) * density for row in rows]
+    return np.array([share @ f / share.sum() for share in seen])

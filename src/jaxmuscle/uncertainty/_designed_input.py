@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
 USUAL = PARAMETERS["m_w"].default  # kg
 FEWER_LINES = 1.6  # times as long as a part of a longer motion
+SHORTEST, AFTER = 1.0, 2.0  # s of a record that are worth to be told of; that a fit needs after its window
 SHOWN = 2.0  # times the even density: where a design moves the most
 DOUBTFUL = 0.3  # relative standard error
 LOOSE = 0.33  # a third of the usual prior, 1 in the logarithm
@@ -44,8 +45,9 @@ class DesignedInput(Printed, Result, eqx.Module):
     `quantity`, the names of what it was made for; `lengthening`, its lines; `even`, those of a flat motion: of even density
     in the band and as large as the same limits allow; `displacement` [m] at `time` [s], one period at
     `rate` [Hz], positive where the muscle gets longer (the motor pulls away from it: x_z = -displacement); `values` and
-    `units` of every free parameter and derived quantity, and their standard errors in these units: `now`, without the
-    record; `flat`, with the flat motion; `stderr`, with this one; `by_seconds`, with records of it that have other lengths
+    `units` of every free parameter and derived quantity, and their standard errors in these units: `prior`, without any
+    data; `now`, without the record; `flat`, with the flat motion; `stderr`, with this one; `by_seconds`, with records of
+    it that have other lengths
     [s]; `needed`, the relative error that was asked for and the length [s] of the record that reaches it, or None;
     `notices`, what to know before; `elsewhere`, of each quantity that is hardly known so far: its value one standard error
     below and above, and the error that this motion gives there, both in its unit; `masses` [kg] that the fit
@@ -68,6 +70,7 @@ class DesignedInput(Printed, Result, eqx.Module):
     elsewhere: dict[str, tuple[tuple[float, float], ...]] = eqx.field(default_factory=dict)
     masses: dict[str, float] = eqx.field(default_factory=dict)
     held: tuple[str, ...] = eqx.field(static=True, default=())
+    prior: dict[str, float] = eqx.field(default_factory=dict)
 
     @property
     def time(self) -> Float[np.ndarray, " samples"]:
@@ -137,9 +140,14 @@ class DesignedInput(Printed, Result, eqx.Module):
         periods = max(1, int(np.ceil(seconds / period - 1e-9))) if np.isfinite(seconds) else 1
         return period / 2, period / 2 + periods * period
 
+    @property
+    def played(self) -> float:
+        """How long the motion is to be played [s]: to the end of the window, and a little longer, which a fit needs."""
+        return self.window[1] + AFTER
+
     def to_dict(self) -> dict[str, Any]:
         """As nested tables of numbers and strings, without the signal."""
-        errors = {"now": self.now, "flat": self.flat, "stderr": self.stderr}
+        errors = {"prior": self.prior, "now": self.now, "flat": self.flat, "stderr": self.stderr}
         known = {n: {"value": v, "unit": self.units[n]} | {which: e[n] for which, e in errors.items()}
                  for n, v in self.values.items()}  # fmt: skip
         return {
@@ -175,14 +183,14 @@ class DesignedInput(Printed, Result, eqx.Module):
         best = ", ".join(f"{n} to {_digits(self.percent(n, self.stderr))} %" for n in self.quantity)
         flat = ", ".join(f"{_digits(self.percent(n, self.flat))} %" for n in self.quantity)
         most = " and ".join(f"{100 * share:.0f} % at {a:.2g} to {b:.2g} Hz" for a, b, share in self.moves)
-        rows = [f"    {n:<22}" + "".join(f"{_digits(self.percent(n, e)):>10}" for e in (self.now, self.flat, self.stderr))
+        rows = [f"    {n:<22}" + "".join(f"{_digits(self.percent(n, e)):>10}" for e in self._columns)
                 for n in self.told]  # fmt: skip
         names = " and ".join(filter(None, [", ".join(self.quantity[:-1]), self.quantity[-1]]))
         single = len(self.quantity) == 1
         square = f"squared relative error of {names}" if single else f"sum of the squared relative errors of {names}"
         return folded([
-            f"designed motion: one more record of {self.lengthening.seconds:g} s would measure {best} (standard "
-            f"error{'s' * (not single)})",
+            f"{'designed' if self.moves else 'flat'} motion: one more record of {self.lengthening.seconds:g} s would "
+            f"measure {best} (standard error{'s' * (not single)})",
             *self._vague(),
             *self._elsewhere(),
             *(f"  note: {notice}" for notice in self.notices),
@@ -191,15 +199,19 @@ class DesignedInput(Printed, Result, eqx.Module):
             f"  lengthening of the muscle: {1e3 * self.rms:.3g} mm rms, at most {1e3 * self.peak:.3g} mm to "
             f"either side and {1e3 * self.speed:.3g} mm/s, {low:.2g} to {high:.2g} Hz",
             *[f"  most of the motion: {most}"] * bool(most),
-            "  expected standard errors, in percent of the value (now: before this record, by the data of the fit and by "
-            "its priors; where the data tell little, that is the prior's):",
-            f"    {'':<22}{'now':>10}{'flat':>10}{'designed':>10}",
+            "  expected standard errors, in percent of the value (prior: without any data; now: before this record):",
+            f"    {'':<22}{'prior':>10}{'now':>10}{'flat':>10}" + f"{'designed':>10}" * bool(self.moves),
             *rows,
             *([OPEN] if any(self.percent(n, self.stderr) > 100 * LOOSE for n in self.told) else []),
             *self._by_duration(),
             *self._as_fitted(),
             *ASSUMED,
         ])  # fmt: skip
+
+    @property
+    def _columns(self) -> tuple[dict[str, float], ...]:
+        """The errors that are printed; a motion that is flat itself is no other one."""
+        return (self.prior, self.now, self.flat, self.stderr) if self.moves else (self.prior, self.now, self.stderr)
 
     def _by_duration(self) -> list[str]:
         """The errors by the length of the record, and how long it takes to reach the one that was asked for."""
@@ -214,17 +226,21 @@ class DesignedInput(Printed, Result, eqx.Module):
             goal = f"{' and '.join(self.quantity)} to {100 * error:.3g} % (standard error)"
             if not np.isfinite(seconds):
                 return [*lines, f"  no length of the record tells {goal}: raise rms, or choose another band"]
+            if seconds < SHORTEST:
+                return [*lines, f"  {goal}: what is known without this record is enough for that"]
             begin, end = self.window
             period, periods = self.lengthening.seconds, round((end - begin) / self.lengthening.seconds)
             lines += [f"  to know {goal}, {seconds:.3g} s of record are enough"]
             if periods > 1:
-                lines[-1] += f": {periods} periods of this motion. Play {end:.3g} s and analyse the last {end - begin:.3g} s"
+                lines[-1] += (
+                    f": {periods} periods of this motion. Play {self.played:.3g} s and analyse {begin:.3g} to {end:.3g} s"
+                )
             elif (shorter := float(np.ceil(FEWER_LINES * seconds))) < period:
                 lines[-1] += (f"; this motion lasts {period:.3g} s. To record less, design again with --seconds {shorter:g} "
                               f"(seconds={shorter:.1f}). That is longer than {seconds:.3g} s, since a shorter motion has "
                               "fewer frequencies")  # fmt: skip
             else:
-                lines[-1] += f": one period of this motion. Play {end:.3g} s and analyse the last {period:.3g} s"
+                lines[-1] += f": one period of this motion. Play {self.played:.3g} s and analyse {begin:.3g} to {end:.3g} s"
         return lines
 
     def _as_fitted(self) -> list[str]:

@@ -25,7 +25,7 @@ from jaxmuscle.response._expected_spectrum import expected_spectrum
 from ._design_information import coordinates_of, design_information, opened, prior_beside_a_motion, seen_here
 from ._designed_input import DOUBTFUL, DesignedInput
 from ._designs import moved_insertion, without_noise
-from ._identifiability import Here, fitted_problem, missed
+from ._identifiability import LEAST_PRIOR, Here, fitted_problem, missed
 from ._identifiability_report import BASE, NO_NOISE
 from ._lengthening import Lengthening, information_of_lines, lines_in, require_positive
 from ._multisine import multisine, speed_of
@@ -133,7 +133,7 @@ def design_input(
                   for n in vague}  # fmt: skip
     notices = missed(result) if isinstance(result, FitResult) else ()
     return DesignedInput(quantities, own, even, motion, float(rate), values, units, now, flat, best, longer, needed, notices,
-                         others, experiment.masses, experiment.held)  # fmt: skip
+                         others, experiment.masses, experiment.held, experiment.by_prior())  # fmt: skip
 
 
 def _elsewhere(
@@ -148,12 +148,14 @@ def _elsewhere(
 
 
 class Experiment(NamedTuple):
-    """What is known without the motion: `start` of all data, information `apart` from the response; that of its lines."""
+    """What is known without the motion: by the `prior`, `start` of it and all data, information `apart` from the response;
+    that of its lines."""
 
     here: Here
     quantity: tuple[str, ...]
     masses: dict[str, float]
     held: tuple[str, ...]
+    prior: Float[np.ndarray, " free"]
     start: Float[np.ndarray, "free free"]
     apart: Float[np.ndarray, "free free"]
     frequency: Float[np.ndarray, " lines"]
@@ -193,7 +195,8 @@ class Experiment(NamedTuple):
         design = moved_insertion(record, problem.parts[0].target.settings, coefficient_of_variation=True, target=target)
         like = design.like(problem)
         task: Any = _moved(like.task).with_parts(settings=like.target.settings)
-        start = np.diag(prior_beside_a_motion(problem)) + (here.information if isinstance(given, FitResult) else 0.0)
+        prior = prior_beside_a_motion(problem)
+        start = np.diag(prior) + (here.information if isinstance(given, FitResult) else 0.0)
         apart = start + design_information(problem, theta, dataclasses.replace(design, task=task, lengthening=None))
         own, coordinates = coordinates_of(like, theta, task)
         lines = np.zeros((len(record.frequency), *start.shape))
@@ -201,7 +204,7 @@ class Experiment(NamedTuple):
         unfitted = [name for name in MASSES if name not in design.like(fitted).coordinates.names]
         masses = {name: float(task[name]) for name in unfitted if name in task.parameter_names}
         held = tuple(name for name in masses if name not in coordinates.names)
-        return cls(here, tuple(quantity), masses, held, start, apart, record.frequency, lines)
+        return cls(here, tuple(quantity), masses, held, prior, start, apart, record.frequency, lines)
 
     @property
     def rows(self) -> Float[np.ndarray, "quantities free"]:
@@ -239,6 +242,11 @@ class Experiment(NamedTuple):
         known = self.start + times * record
         after = np.linalg.pinv(known, hermitian=True)
         return {name: float(np.sqrt(g @ after @ g)) for name, g in self.here.gradients.items()}
+
+    def by_prior(self) -> dict[str, float]:
+        """Standard errors of all quantities without any data."""
+        before = 1 / np.maximum(self.prior, LEAST_PRIOR)
+        return {name: float(np.sqrt(np.sum(before * g**2))) for name, g in self.here.gradients.items()}
 
     def towards(self, name: str) -> Float[np.ndarray, " free"]:
         """The step `Σ g / √(gᵀ Σ g)` of the fit's θ to the likeliest muscle in which a quantity is a standard error larger.
