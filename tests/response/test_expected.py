@@ -796,3 +796,16 @@ def test_the_expected_spectrum_has_a_second_derivative(x64):
     slope = once(jax.grad(power))
     second = float(once(jax.grad(jax.grad(power)))(k))
     assert second == pytest.approx(float(slope(k + step) - slope(k - step)) / (2 * step), rel=1e-4)
+
+
+def test_who_forbids_jax_to_add_axes_can_use_it():
+    """`jax_numpy_rank_promotion = "raise"` finds slips in one's own code; ours must not stand against it."""
+    task = jm.Isometric()
+    with jax.numpy_rank_promotion("raise"):
+        with pytest.raises(ValueError, match="rank_promotion"):
+            jnp.ones((2, 3)) * jnp.ones(3)
+        assert jm.expected_spectrum(task).power.shape == (30,)
+        assert np.isfinite(jax.grad(lambda k_w: jm.expected_spectrum(task.replace(k_w=k_w)).power.sum())(5e5))
+        signal = np.random.default_rng(0).standard_normal((2, 3, 1000))
+        settings = jm.SpectrumSettings(detrend="linear")
+        assert jm.spectra.welch(jm.spectra.lowpass(signal, settings), settings).shape == (2, 3, 30)

@@ -83,6 +83,10 @@ class Kept:
         _ALL.add(self)
 
     def __call__(self, *args: Any, **kwargs: Any) -> Any:
+        with jax.numpy_rank_promotion("allow"):  # of our own arrays, whatever the caller has set
+            return self._called(*args, **kwargs)
+
+    def _called(self, *args: Any, **kwargs: Any) -> Any:
         leaves, structure = jax.tree.flatten((args, kwargs))
         which = tuple(_is_array(leaf) for leaf in leaves)
         arrays = [leaf for leaf, own in zip(leaves, which, strict=True) if own]

@@ -80,12 +80,17 @@ def _impulse_response(sections: Float[np.ndarray, "sections 6"], samples: int) -
     return np.asarray(scipy.signal.sosfilt(sections, np.eye(1, samples)[0]))
 
 
+def _along(values: np.ndarray, of: Array) -> Array:
+    """Values for the last axes of an array, with as many axes: who forbids JAX to add any can call this, too."""
+    return jnp.asarray(values, of.dtype).reshape((1,) * (of.ndim - values.ndim) + values.shape)
+
+
 def _convolve(signal: Float[Array, "*batch times"], response: Float[np.ndarray, " times"]) -> Float[Array, "*batch times"]:
     """y_n = Σ_m h_m x_{n - m}, for as many samples as both have."""
     samples = signal.shape[-1]
     size = scipy.fft.next_fast_len(2 * samples - 1, real=True)
     transform = jnp.fft.rfft(signal, size)
-    transfer = jnp.asarray(np.fft.rfft(response, size), transform.dtype)
+    transfer = _along(np.fft.rfft(response, size), transform)
     return jnp.fft.irfft(transform * transfer, size)[..., :samples]
 
 
@@ -142,18 +147,19 @@ def _forward_and_backward(
 
 def _density(segments: Float[Array, "*batch length"], settings: SpectrumSettings) -> Float[Array, "*batch frequencies"]:
     """One-sided density of every segment: Σ_t |Σ_m w_tm x_m e^{-2πikm/n}|² / (rate Σ w²), doubled inside."""
-    samples, dtype = segments.shape[-1], segments.dtype
+    samples = segments.shape[-1]
     if settings.detrend != "none":
         segments = segments - jnp.mean(segments, axis=-1, keepdims=True)
     if settings.detrend == "linear":
         line = np.arange(samples) - (samples - 1) / 2
-        line = jnp.asarray(line / np.linalg.norm(line), dtype)
+        line = _along(line / np.linalg.norm(line), segments)
         segments = segments - jnp.sum(segments * line, axis=-1, keepdims=True) * line
-    tapers = jnp.asarray(tapers_of(settings, samples) / np.sqrt(settings.rate), dtype)
-    transform = jnp.fft.rfft(segments[..., None, :] * tapers)
+    each = segments[..., None, :]
+    transform = jnp.fft.rfft(each * _along(tapers_of(settings, samples) / np.sqrt(settings.rate), each))
     sides = np.full(transform.shape[-1], 2.0)
     sides[[0, -1] if samples % 2 == 0 else [0]] = 1.0
-    return jnp.sum(transform.real**2 + transform.imag**2, axis=-2) * jnp.asarray(sides, dtype)
+    density = jnp.sum(transform.real**2 + transform.imag**2, axis=-2)
+    return density * _along(sides, density)
 
 
 def welch(signal: Real[Array | np.ndarray, "*batch times"], settings: SpectrumSettings) -> Float[Array, "*batch bins"]:
