@@ -125,6 +125,9 @@ def _write(
     for row in zip(*(summary.rows() for summary in summaries), strict=True):
         table.add_row(row[0][0], *(plain(value) for _, value in row))
     out.print(table)
+    if any(summary.peaks.local_maxima for summary in summaries):
+        out.print("A maximum stands between two bins: it is interpolated. Local maxima may be chance. Whether a peak is "
+                  "real says jaxmuscle steadiness.", highlight=False)  # fmt: skip
     if target is not None and (several or target.mvc_fraction is not None):
         out.print(plain(target), highlight=False)
     written = [f"{folder}/analysis.json, spectrum.csv", *figures]

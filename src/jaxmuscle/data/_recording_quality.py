@@ -42,15 +42,17 @@ class RecordingSummary(Printed, eqx.Module):
         variation, top = self.coefficient_of_variation, self.peaks.maximum
         local = ", ".join(f"{peak.interpolated:.3f}" for peak in self.peaks.local_maxima) or "none"
         return [
-            ("window", f"{self.duration:.2f} s, {self.segments} Welch segments"),
-            ("mean", f"{self.mean:.4g} {self.unit}"),
-            ("standard deviation", f"{self.standard_deviation:.4g} {self.unit}"),
-            ("coefficient of variation", f"{100 * variation:.3g} %" if variation < 10 else "none, the mean is near zero"),
+            ("window (s)", f"{self.duration:.2f}"),
+            ("Welch segments", f"{self.segments}"),
+            (f"mean ({self.unit})", f"{self.mean:.4g}"),
+            (f"standard deviation ({self.unit})", f"{self.standard_deviation:.4g}"),
+            ("coefficient of variation (%)", f"{100 * variation:.3g}" if variation < 10 else "none, the mean is near zero"),
             ("mean over SD (signal-to-noise)", f"{self.signal_to_noise:.4g}"),
             ("approximate entropy", f"{self.approximate_entropy:.4f}"),
             ("sample entropy", f"{self.sample_entropy:.4f}"),
-            ("maximum of the spectrum", f"{top.interpolated:.3f} Hz, {top.power:.3f} of the power"),
-            ("local maxima (from 1 % of it on)", f"{local} Hz" if self.peaks.local_maxima else local),
+            ("maximum of the spectrum (Hz)", f"{top.interpolated:.3f}"),
+            ("power in its bin (%)", f"{100 * top.power:.3g}"),
+            ("local maxima (Hz)", local),
         ]
 
     def __str__(self) -> str:
