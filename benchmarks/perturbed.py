@@ -25,6 +25,7 @@ from jaxmuscle.fits import _search
 TASK = jm.PrescribedLength()
 # The bundled knee extension as fitted, with masses of 0.5 kg
 KNEE = TASK.replace(k_w=4.6e5, k_z=7.8e5, c_w=114.0, c_z=1.8, P_w=5.0, noise_K_w=0.27, noise_K_z=0.002)
+TREMOR = {"activation_time": 0.05, "resonance_amplitude": 0.14, "resonance_frequency": 9.6, "resonance_width": 1.6}
 QUICK = {"rungs": 0, "seeds": 0, "check_seeds": 0, "starts": 16}
 
 
@@ -209,10 +210,9 @@ def reference(count: int) -> None:
 
 def people(count: int) -> None:
     """Muscles softer and stiffer than the default one of the same force, with and without a tremor."""
-    tremor = {"activation_time": 0.05, "resonance_amplitude": 0.14, "resonance_frequency": 9.6, "resonance_width": 1.6}
     for factor in (0.1, 0.3, 3.0):  # more is too fast for the steps of `recorded`
         muscle = TASK.replace(**{name: factor * float(TASK[name]) for name in ("k_w", "k_z", "c_w", "c_z")})
-        shaking = jm.on_rung(muscle, 2).replace(**tremor)
+        shaking = jm.on_rung(muscle, 2).replace(**TREMOR)
         runs = {"noise alone": recorded(muscle, np.random.default_rng(14), count), "tremor": _simulated(shaking, count)}
         for words, moved in runs.items():
             print(f"stiffness and damping times {factor:g}, {words}")
@@ -266,8 +266,7 @@ def richer(count: int) -> None:
     """A strong muscle with a tremor, moved in two bands or evenly: its response taken off by the base model's muscle, or by
     the one that is found."""
     true = {"k_w": 1.61e7, "k_z": 1.61e7, "c_w": 1360.0, "c_z": 168.0, "P_w": 141.0, "noise_K_w": 0.27, "noise_K_z": 0.0013}
-    tremor = {"activation_time": 0.05, "resonance_amplitude": 0.14, "resonance_frequency": 9.6, "resonance_width": 1.6}
-    muscle = jm.on_rung(TASK, 2).replace(**true, **tremor)
+    muscle = jm.on_rung(TASK, 2).replace(**true, **TREMOR)
     bands = {"two bands": np.r_[28:36, 170:200], "even": np.r_[30:300]}
     for words, lines in bands.items():
         runs = _simulated(muscle, count, lines)

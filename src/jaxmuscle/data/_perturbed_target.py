@@ -22,8 +22,8 @@ if TYPE_CHECKING:
     from ._perturbed import PerturbedRecording
 
 CUT = 0.1  # s
-SHORTER = ("of the window from {:.4g} to {:.4g} s the fit uses {:.4g} to {:.4g} s: it needs 2 s of the recording before and "
-           "after what it uses. If you can, record that much longer")  # fmt: skip
+SHORTER = ("of the window from {:.4g} to {:.4g} s the fit uses {:.4g} to {:.4g} s: it needs {:g} s of the recording before "
+           "and after what it uses. If you can, record that much longer")  # fmt: skip
 MARGIN = 2.0  # s before and after the window, where the muscle forgets what is not known
 TAPER = 0.1  # share of the window that is tapered
 LOWEST, LEAST_PERIODS = 0.05, 2.5  # Hz; periods of the lowest frequency in the window
@@ -113,7 +113,9 @@ def _ordinates(recording: Any, stiffness: Stiffness, predicted: Any, settings: S
     reply, exact = _response(length, stiffness, predicted, rate)
     edges = (recording.force.start + inside.start / rate, recording.force.start + inside.stop / rate)
     asked = tuple(recording.force.start + edge / rate for edge in recording.force.span(rate))
-    cut = () if max(abs(a - b) for a, b in zip(asked, edges, strict=True)) < CUT else (SHORTER.format(*asked, *edges),)
+    cut = (
+        () if max(abs(a - b) for a, b in zip(asked, edges, strict=True)) < CUT else (SHORTER.format(*asked, *edges, MARGIN),)
+    )
     fluctuation = Recording(force - reply, rate, unit=recording.force.unit, name=recording.name, source=recording.source,
                             start=recording.force.start, window=edges,
                             notices=recording.notices + cut + (LINEAR,) * (not exact))  # fmt: skip

@@ -12,6 +12,7 @@ from jaxmuscle._common.arrays import with_nulls
 from jaxmuscle._common.cards import Printed, Result
 from jaxmuscle._common.files import replacing, write_json
 from jaxmuscle._common.text import folded
+from jaxmuscle.data._perturbed_target import MARGIN
 from jaxmuscle.model._parameters import PARAMETERS
 from jaxmuscle.objective._derived import TANGENTS
 
@@ -24,7 +25,7 @@ if TYPE_CHECKING:
 
 USUAL = PARAMETERS["m_w"].default  # kg
 FEWER_LINES = 1.6  # times as long as a part of a longer motion
-SHORTEST, AFTER = 1.0, 2.0  # s of a record that are worth to be told of; that a fit needs after its window
+SHORTEST = 1.0  # s of a record that are worth telling of
 SHOWN = 2.0  # times the even density: where a design moves the most
 DOUBTFUL = 0.3  # relative standard error
 LOOSE = 0.33  # a third of the usual prior, 1 in the logarithm
@@ -47,11 +48,11 @@ class DesignedInput(Printed, Result, eqx.Module):
     `rate` [Hz], positive where the muscle gets longer (the motor pulls away from it: x_z = -displacement); `values` and
     `units` of every free parameter and derived quantity, and their standard errors in these units: `prior`, without any
     data; `now`, without the record; `flat`, with the flat motion; `stderr`, with this one; `by_seconds`, with records of
-    it that have other lengths
-    [s]; `needed`, the relative error that was asked for and the length [s] of the record that reaches it, or None;
-    `notices`, what to know before; `elsewhere`, of each quantity that is hardly known so far: its value one standard error
-    below and above, and the error that this motion gives there, both in its unit; `masses` [kg] that the fit
-    does not have free, and which of them are `held`: the others are fitted with the record, their errors are in the rest.
+    it that have other lengths [s]; `needed`, the relative error that was asked for and the length [s] of the record that
+    reaches it, or None; `notices`, what to know before; `elsewhere`, of each quantity that is hardly known so far: its value
+    one standard error below and above, and the error that this motion gives there, both in its unit; `masses` [kg] that the
+    fit does not have free, and which of them are `held`: the others are fitted with the record,
+    their errors are in the rest.
     """
 
     quantity: tuple[str, ...] = eqx.field(static=True)
@@ -143,7 +144,7 @@ class DesignedInput(Printed, Result, eqx.Module):
     @property
     def played(self) -> float:
         """How long the motion is to be played [s]: to the end of the window, and a little longer, which a fit needs."""
-        return self.window[1] + AFTER
+        return self.window[1] + MARGIN
 
     def to_dict(self) -> dict[str, Any]:
         """As nested tables of numbers and strings, without the signal."""
