@@ -63,7 +63,7 @@ def test_an_option_that_xla_does_not_know_is_done_without(x64, folder, monkeypat
 
 
 def test_a_fault_in_compiling_is_not_hidden(x64, folder, monkeypatch):
-    monkeypatch.setattr(programs, "OPTIONS", {"xla_cpu_use_fusion_emitters": "perhaps"})
+    monkeypatch.setattr(programs, "OPTIONS", {"xla_backend_optimization_level": "perhaps"})
     with pytest.raises(jax.errors.JaxRuntimeError, match="perhaps"):
         Kept(solved)(TASK, MATRIX)
 

@@ -31,6 +31,7 @@ from jaxmuscle.ensembles import _settings
 from jaxmuscle.ensembles._processes import join
 from jaxmuscle.ensembles._running_moments import CELLS, add, count_cells, empty, merged, moments, quantiles, set_cells
 from jaxmuscle.ensembles._store import differences
+from jaxmuscle.simulation import _batch
 
 KEY = jax.random.key(5)
 TASK = jm.Isometric()
@@ -507,6 +508,16 @@ def test_what_a_thread_raises_ends_the_ensemble(monkeypatch):
     monkeypatch.setattr(layouts, "_finish", broken)
     with pytest.raises(MemoryError, match="no room"):
         jm.ensemble(TASK, KEY, seeds=45, threads=3, **SHORT)
+
+
+@pytest.mark.parametrize(("version", "cores", "wanted", "threads"), [
+    ("0.12.0", 4, None, 4), ("0.12.0", 4, 6, 6), ("0.11.2", 4, None, 3), ("0.11.2", 4, 6, 3), ("0.11.2", 4, 2, 2),
+    ("0.11.1", 1, None, 1)])  # fmt: skip
+def test_one_core_stays_free_where_ffts_on_all_of_them_never_end(monkeypatch, version, cores, wanted, threads):
+    """Two threads that did nothing but FFTs stood still with jax 0.11.1 and 0.11.2, and did not with 0.11.0 and 0.12.0."""
+    monkeypatch.setattr(jax, "__version__", version)
+    monkeypatch.setattr(_batch, "usable_cores", lambda: cores)
+    assert _batch.threads_of(wanted) == threads
 
 
 def test_threads_must_be_a_number():

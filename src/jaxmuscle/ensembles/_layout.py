@@ -30,7 +30,8 @@ from ._sweep import Sweep
 
 BLOCKS = 4
 STEPS_AT_ONCE = 4_000_000
-# Of a GPU, which hides its latency by many lanes and has memory for them; chosen by reasoning, not measured.
+# Of a GPU, which hides its latency by many lanes and has memory for them. With 16 384 and 65 536 an H100 was as fast, with
+# 4096 nearly three times slower.
 WIDE_LANES, WIDE_STEPS_AT_ONCE = 65_536, 250_000_000
 EIGHT = 8
 

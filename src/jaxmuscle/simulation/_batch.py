@@ -24,6 +24,8 @@ from ._grid import Grid
 
 LANES = 1024
 THREADED = ("cpu",)  # backends whose devices are cores
+# In these versions of JAX an FFT waits for other threads of XLA's pool. If all of them wait, none goes on.
+WAITING = ("0.11.1", "0.11.2")
 
 
 class Recipe(eqx.Module):
@@ -54,7 +56,8 @@ def threads_of(wanted: int | None) -> int:
     """How many chunks run at the same time: one on each core of a CPU, or as many as wanted; two on other devices."""
     if jax.default_backend() not in THREADED:
         return 2
-    return usable_cores() if wanted is None else wanted
+    threads = usable_cores() if wanted is None else wanted
+    return min(threads, max(1, usable_cores() - 1)) if jax.__version__ in WAITING else threads
 
 
 def respond(task: AbstractTask, source: Stream | Realisation, grid: Grid, sampling: str) -> tuple[Array, Array]:
