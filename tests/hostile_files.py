@@ -88,12 +88,10 @@ def write_c3d(path: Path) -> None:
 
 
 def write_edf(path: Path) -> None:
-    import pyedflib
+    import edfio
 
-    with pyedflib.EdfWriter(str(path), 1) as writer:
-        writer.setSignalHeader(0, pyedflib.highlevel.make_signal_header(
-            "Force", dimension="N", sample_frequency=60, physical_min=-20, physical_max=20))  # fmt: skip
-        writer.writeSamples([signals()["force"]])
+    force = edfio.EdfSignal(signals()["force"], 60, label="Force", physical_dimension="N", physical_range=(-20, 20))
+    edfio.Edf([force]).write(path)
 
 
 def write_tdms(path: Path) -> None:

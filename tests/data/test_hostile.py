@@ -22,7 +22,7 @@ from jaxmuscle.data._recording_channels import Channel, distinct
 from jaxmuscle.data._recording_files import load_recording, read_table
 from jaxmuscle.data._study_table import read_study
 
-LIBRARIES = {"c3d": "ezc3d", "edf": "pyedflib", "tdms": "nptdms", "xlsx": "openpyxl"}
+LIBRARIES = {"c3d": "ezc3d", "edf": "edfio", "tdms": "nptdms", "xlsx": "openpyxl"}
 MUTANTS = 50  # of every format; benchmarks/hostile.py reads 5000
 POSIX = pytest.mark.skipif(os.name != "posix", reason="named pipes, devices and limits of memory are those of POSIX")
 

@@ -313,17 +313,22 @@ def test_xlsx(tmp_path):
         load_recording(tmp_path / "trial.xlsx")
 
 
-def test_edf(tmp_path):
-    pyedflib, path = pytest.importorskip("pyedflib"), tmp_path / "trial.edf"
+@pytest.mark.parametrize(("kind", "bits"), [("edf", 16), ("bdf", 24)])
+def test_edf(tmp_path, kind, bits):
+    pyedflib, path = pytest.importorskip("pyedflib"), tmp_path / f"trial.{kind}"
     force, emg = np.tile(X, 50), np.tile(EMG, 10)
-    with pyedflib.EdfWriter(str(path), 2) as writer:
+    with pyedflib.EdfWriter(
+        str(path), 2, {"edf": pyedflib.FILETYPE_EDFPLUS, "bdf": pyedflib.FILETYPE_BDFPLUS}[kind]
+    ) as writer:
         for i, (label, unit, rate, signal) in enumerate((("Force", "N", 500, force), ("EMG", "mV", 100, emg))):
             writer.setSignalHeader(i, pyedflib.highlevel.make_signal_header(
-                label, dimension=unit, sample_frequency=rate, physical_min=-20, physical_max=20))  # fmt: skip
+                label, dimension=unit, sample_frequency=rate, physical_min=-20, physical_max=20,
+                digital_min=-(2 ** (bits - 1)), digital_max=2 ** (bits - 1) - 1))  # fmt: skip
             assert signal.size % rate == 0
         writer.writeSamples([force, emg])
+        writer.writeAnnotation(0.5, -1, "go")  # a signal of its own in the file, which is none
     recording = load_recording(path, column="Force")
-    np.testing.assert_allclose(recording.whole, force, atol=40 / 2**16)  # stored in 16 bits
+    np.testing.assert_allclose(recording.whole, force, atol=40 / 2**bits)
     assert (recording.rate, recording.unit) == (500, "N")
     assert load_recording(path, column="EMG").rate == 100
 
@@ -370,7 +375,7 @@ def test_smr(monkeypatch):
         read_smr("trial.smr", 0)
 
 
-LIBRARIES = {"xlsx": "openpyxl", "edf": "pyedflib", "tdms": "nptdms", "acq": "bioread", "smr": "neo.io"}
+LIBRARIES = {"xlsx": "openpyxl", "edf": "edfio", "tdms": "nptdms", "acq": "bioread", "smr": "neo.io"}
 
 
 @pytest.mark.parametrize("kind", LIBRARIES)

@@ -30,11 +30,11 @@ def read_xlsx(path: str, most: int) -> bytes:
 
 def read_edf(path: str, most: int) -> list[Channel]:
     """EDF and BDF: signals by their labels, with rates and units."""
-    with _library("pyedflib").EdfReader(path) as file:
-        return [
-            Channel(file.getLabel(i), file.readSignal(i), file.getSampleFrequency(i), file.getPhysicalDimension(i))
-            for i in range(file.signals_in_file)
-        ]
+    library = _library("edfio")
+    with open(path, "rb") as file:
+        read = library.read_bdf if file.read(1) == b"\xff" else library.read_edf
+    signals = read(path, header_encoding="latin-1").signals  # though the format allows ASCII alone
+    return [Channel(each.label, each.data, each.sampling_frequency, each.physical_dimension) for each in signals]
 
 
 def read_tdms(path: str, most: int) -> list[Channel]:
