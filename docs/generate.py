@@ -39,7 +39,8 @@ A parameter has the name of this table wherever you write it:
 - `K_w0`, `K_z0`, `C_w0` and `C_z0` are stiffness and damping at rest. They follow from the parameters. You can read them
   (`task["K_w0"]`, `result["K_w0"]`), but not set or fit them.
 - `P_w`, `F_ext` and `x_z` are inputs over time. `task["P_w"]` is the level that is held, and
-  `task.P_w` is the whole signal.
+  `task.P_w` is the whole signal. `P_w` is larger than the force that one measures: the spring of the active tissue (K_w)
+  takes its share. At the defaults P_w = 5 N gives F_ext = 2.2 N.
 - In a [joint fit](../identifiability.md#a-joint-fit) `c_w@high` is the `c_w` of the target "high" alone.
 - A wrong name is an error that says which one you may have meant.
 

@@ -9,12 +9,14 @@ from typing import Any
 import jax
 import numpy as np
 import pytest
+import typer.testing
 from typer.testing import CliRunner
 
 from jaxmuscle._common import programs
 from jaxmuscle.commands.main import app
 
 COMMANDS: dict[str, Any] = {each.callback.__name__: each.callback for each in app.registered_commands if each.callback}
+MADE = typer.main.get_command(app)
 VALID = {
     "fit": ["t.csv", "--segments", "12"], "simulate": ["zagrodny-slifkin"], "merge": ["none.zarr"], "analyse": ["r.csv"],
     "ensemble": ["zagrodny-slifkin", "--seeds", "4", "--out", "e.zarr"], "steadiness": ["r.csv"], "compare": ["t.csv"],
@@ -50,6 +52,8 @@ def here(tmp_path, monkeypatch):
         raise Compiled(self.function.__name__)
 
     monkeypatch.setattr(programs.Kept, "__call__", call)
+    # Made anew for every call, all commands with their options take more time than a call.
+    monkeypatch.setattr(typer.testing, "_get_command", lambda app: MADE, raising=False)
     monkeypatch.setenv("COLUMNS", "1000")
     monkeypatch.chdir(tmp_path)
     frequency = 0.390625 * np.arange(1, 31)

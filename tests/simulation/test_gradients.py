@@ -69,3 +69,22 @@ def test_a_parameter_by_its_natural_name(x64):
     slope = jax.grad(last_force)(task["k_w"])
     h = 1e-4 * task["k_w"]
     np.testing.assert_allclose(slope, (last_force(task["k_w"] + h) - last_force(task["k_w"] - h)) / (2 * h), rtol=1e-6)
+
+
+@pytest.mark.slow
+def test_a_mean_spectrum_and_the_filtered_output_by_differences(x64):
+    """Also with the control variate, and the numbers are those without derivatives."""
+
+    def of(k_w):
+        task = jm.Isometric(k_w=k_w, settings=SETTINGS)
+        runs = jm.ensemble(task, KEY, seeds=2, dt=2e-3, control=True)
+        estimate = runs.mean_spectrum()
+        assert estimate.expected is not None
+        scatter = jnp.asarray(runs.filtered()).std(axis=1)
+        return jnp.concatenate([jnp.log(estimate.power), jnp.log(estimate.stderr), jnp.log(scatter)])
+
+    h = 5.0
+    ahead, value, behind = (np.asarray(of(k_w)) for k_w in (5e5 + h, 5e5, 5e5 - h))
+    again, slope = jax.jit(lambda k_w: jax.jvp(of, (k_w,), (jnp.ones_like(k_w),)))(jnp.asarray(5e5))
+    np.testing.assert_allclose(again, value, rtol=1e-9)
+    np.testing.assert_allclose(slope, (ahead - behind) / (2 * h), rtol=1e-5, atol=1e-5 * np.abs(slope).max())

@@ -19,6 +19,11 @@ def is_concrete(value: Any) -> bool:
     return not isinstance(value, Tracer)
 
 
+def as_seen(value: Any) -> Any:
+    """A NumPy array, or the value as it is while JAX traces it."""
+    return np.asarray(value) if is_concrete(value) else value
+
+
 def require(condition: Any, message: str) -> None:
     """Raise a `ValueError` unless the condition holds; a traced condition is let through."""
     if is_concrete(condition) and not np.all(np.asarray(condition)):

@@ -84,11 +84,12 @@ def design(
         out.print(folded([
             f"- Play the motion for {found.played:g} s: motor.csv holds one period of {period:g} s, to be repeated without "
             "a gap. Its first lines, which begin with #, say what it is. Let the motor move to its first value slowly. Its "
-            f"largest acceleration is {found.acceleration:.2g} m/s². If the person tires, record several shorter trials "
-            "instead.",
+            f"largest acceleration is {found.acceleration:.2g} m/s². If that is too much for your motor, design again "
+            "with a smaller --rms. If the person tires, record several shorter trials instead.",
             f"- Record force and displacement. Fit both channels from {begin:g} to {end:g} s, together with what you have "
             "already: the errors above include that. Give each held trial with --hold, and an earlier moved record as a "
-            "second file. In --window, give the window of the new record first, then one auto for each other file:",
+            "second file. In --window, give the window of the new record first, then one auto for each other "
+            f"file. For three held trials that is --window {begin:g}:{end:g},auto,auto,auto:",
         ]), highlight=False)  # fmt: skip
         out.print(f"    jaxmuscle fit RECORD.csv --hold HOLD.csv --window {begin:g}:{end:g},auto --out out/both",
                   highlight=False, soft_wrap=True)  # fmt: skip

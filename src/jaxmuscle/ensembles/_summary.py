@@ -117,7 +117,7 @@ class EnsembleSummary(Printed, Result, eqx.Module):
             "quantiles": ((*lead, "quantile", "time"), self.quantile, unit),
         }
         if self.spectra:
-            found["frequency"] = ("frequency",), self.spectra[0].frequency, "Hz"
+            found["frequency"] = ("frequency",), np.asarray(self.spectra[0].frequency), "Hz"
             found["coefficient_of_variation"] = lead, self.coefficient_of_variation[..., 0], "1"
             found["coefficient_of_variation_stderr"] = lead, self.coefficient_of_variation[..., 1], "1"
             for name, label in SPECTRUM.items():

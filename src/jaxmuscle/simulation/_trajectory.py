@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Integer
 
 from jaxmuscle import plot
-from jaxmuscle._common.arrays import _is_scalar, as_numbers, is_concrete
+from jaxmuscle._common.arrays import _is_scalar, as_numbers, as_seen, is_concrete
 from jaxmuscle._common.cards import Card, Shown, facts
 from jaxmuscle._common.environment import versions
 from jaxmuscle.model._parameters import PARAMETERS
@@ -91,7 +91,7 @@ class Trajectory(Shown, eqx.Module):
 
     def filtered(
         self, settings: SpectrumSettings | None = None, window: tuple[float, float] = WINDOW
-    ) -> Float[np.ndarray, "*seeds times"]:
+    ) -> Float[Array | np.ndarray, "*seeds times"]:
         """What the spectra are made of: the output at the rate of the settings, low-passed from t = 0, cut to the window.
 
         Its coefficient of variation is what a `Target` states and what a fit compares (see `Recording.filtered`).
@@ -102,7 +102,7 @@ class Trajectory(Shown, eqx.Module):
         settings = self.task.settings if settings is None else settings
         passed = lowpass(self._at_rate_of(settings, self.output), settings)
         start, stop = self._edges(window, settings.rate)
-        return np.asarray(passed)[..., start:stop]
+        return as_seen(passed)[..., start:stop]
 
     def spectrum(self, settings: SpectrumSettings | None = None, window: tuple[float, float] = WINDOW) -> Spectrum:
         """Welch spectrum of the output per seed (see `Spectrum.mean`), low-pass filtered from t = 0, then windowed.
@@ -126,15 +126,16 @@ class Trajectory(Shown, eqx.Module):
         **Raises:** `ValueError` for `control=True` without `linear`, or with another `sampling` than was simulated.
         """
         settings = self.task.settings if settings is None else settings
-        plain = np.atleast_2d(np.asarray(self.spectrum(settings, window).power))
+        plain = as_seen(self.spectrum(settings, window).power)
+        plain = plain.reshape(-1, plain.shape[-1])
         same = self.sampling == settings.sampling and self.rate == settings.rate
         if control and (self.linear is None or not same):
             raise ValueError("control = True needs a trajectory simulated with control, and with the rate and sampling of "
                              "the spectrum's settings")  # fmt: skip
         if control is False or self.linear is None or not same:
             return estimated(plain, None, None, settings, self.task.output_unit)
-        beside = np.atleast_2d(np.asarray(self.beside().spectrum(settings, window).power))
-        exact = np.asarray(linear_spectrum(self.task, settings, window).power)
+        beside = as_seen(self.beside().spectrum(settings, window).power).reshape(plain.shape)
+        exact = as_seen(linear_spectrum(self.task, settings, window).power)
         return estimated(plain, beside, exact, settings, self.task.output_unit)
 
     def beside(self) -> "Trajectory":

@@ -4,14 +4,14 @@ from typing import Any
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
 from jaxmuscle import plot
 
 from ._settings import SpectrumSettings
 from ._welch import Spectrum
 
-Bins = Float[np.ndarray, " bins"]
+Bins = Float[Array | np.ndarray, " bins"]
 
 
 class SpectrumEstimate(eqx.Module):
@@ -60,8 +60,8 @@ class SpectrumEstimate(eqx.Module):
 
 
 def estimated(
-    plain: Float[np.ndarray, "seeds bins"],
-    beside: Float[np.ndarray, "seeds bins"] | None,
+    plain: Float[Array | np.ndarray, "seeds bins"],
+    beside: Float[Array | np.ndarray, "seeds bins"] | None,
     expected: Bins | None,
     settings: SpectrumSettings,
     unit: str,
@@ -70,7 +70,7 @@ def estimated(
     count = len(plain)
 
     def summary(rows):
-        error = rows.std(axis=0, ddof=1) / np.sqrt(count) if count > 1 else np.full(rows.shape[1], np.nan)
+        error = rows.std(axis=0, ddof=1) / count**0.5 if count > 1 else np.full(rows.shape[1], np.nan)
         return rows.mean(axis=0), error
 
     control = None if beside is None or expected is None else (*summary(plain - beside), expected)
