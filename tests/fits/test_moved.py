@@ -214,19 +214,43 @@ def test_a_file_of_both_channels_is_fitted_from_the_command_line_alone_and_with_
     ],
 )
 def test_a_hold_that_cannot_be_fitted_with_a_moved_record(tmp_path, given, message):
-    force = np.random.default_rng(0).normal(5.0, 0.1, (3000, 1))
-    moving = np.concatenate([force, 1e-3 * np.random.default_rng(1).normal(size=(3000, 1))], axis=1)
-    time = np.arange(3000)[:, None] / 100
-    for name, columns, head in (("HOLD", force, "force_N"), ("TORQUE", force, "torque_Nm"), ("PULL", moving, "force_N,x_m")):
-        table = np.concatenate([time, columns], axis=1)
-        np.savetxt(tmp_path / f"{name.lower()}.csv", table, delimiter=",", header=f"time_s,{head}", comments="")
-    files = {name: str(tmp_path / f"{name.lower()}.csv") for name in ("HOLD", "TORQUE", "PULL")}
+    files = written_records(tmp_path)
     named = ["--force-column", "force_N", "--displacement", "x_m"] if given[0] == "PULL" else []
     out = tmp_path / "out"
     said = CliRunner().invoke(app, ["fit", *(files.get(x, x) for x in given), *named, "--out", str(out)],
                               env={"COLUMNS": "1000"})  # fmt: skip
     assert said.exit_code == 2 and message in said.stderr, said.output
     assert not (out / "fit.json").exists()
+
+
+def written_records(tmp_path):
+    """Files of noise: a force, a torque, and a force with a displacement."""
+    force = np.random.default_rng(0).normal(5.0, 0.1, (3000, 1))
+    moving = np.concatenate([force, 1e-3 * np.random.default_rng(1).normal(size=(3000, 1))], axis=1)
+    time = np.arange(3000)[:, None] / 100
+    for name, columns, head in (("HOLD", force, "force_N"), ("TORQUE", force, "torque_Nm"), ("PULL", moving, "force_N,x_m")):
+        table = np.concatenate([time, columns], axis=1)
+        np.savetxt(tmp_path / f"{name.lower()}.csv", table, delimiter=",", header=f"time_s,{head}", comments="")
+    return {name: str(tmp_path / f"{name.lower()}.csv") for name in ("HOLD", "TORQUE", "PULL")}
+
+
+def test_one_model_of_the_ladder_is_fitted_with_a_hold(tmp_path, monkeypatch):
+    files, seen = written_records(tmp_path), {}
+
+    def fake(targets, **options):
+        seen.update(options)
+        raise ValueError("enough")
+
+    monkeypatch.setattr(jm, "fit_joint", fake)
+    named = ["--force-column", "force_N", "--displacement", "x_m", "--out", str(tmp_path / "out")]
+    given = ["fit", files["PULL"], "--hold", files["HOLD"], *named]
+    for rung, rungs in (([], 3), (["--rung", "2"], 0), (["--rungs", "1"], 1)):
+        seen.clear()
+        assert "enough" in CliRunner().invoke(app, [*given, *rung]).stderr
+        assert seen["rungs"] == rungs
+        assert seen.get("tasks") == (
+            {"moved": jm.on_rung(jm.PrescribedLength(), 2), "held": jm.on_rung(jm.Isometric(), 2)} if rungs == 0 else None
+        )
 
 
 def test_a_hold_is_not_taken_for_a_moved_record(tmp_path):

@@ -322,6 +322,18 @@ def test_an_even_design_is_the_flat_one():
 
 
 @pytest.mark.slow
+def test_a_flat_motion_is_drawn_and_called_once(tmp_path):
+    for spread, names in ((1.0, {"flat motion"}), (0.0, {"flat motion", "designed motion"})):
+        made = designed(spread=spread, error=0.05)
+        density, _, errors = made.plot().axes
+        assert set(density.get_legend_handles_labels()[1]) == names
+        assert set(errors.get_legend_handles_labels()[1]) == names | {"now, without this record", "error asked for"}
+        made.save(tmp_path / "motor.csv")
+        head = (tmp_path / "motor.csv").read_text(encoding="utf-8").partition("time_s")[0]
+        assert ("designed by jaxmuscle for K_w0" in head) == ("designed motion" in names) != ("flat, made by" in head)
+
+
+@pytest.mark.slow
 def test_longer_records_tell_more_and_the_wanted_error_says_how_long():
     """A record of twice the length, designed as such, has the errors told for it; at the length needed they are as wanted.
 

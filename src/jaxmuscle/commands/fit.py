@@ -204,9 +204,9 @@ def fit(
                              "with `jaxmuscle analyse ... --save-target FILE.toml`")  # fmt: skip
         if hold and not all(recorded):
             raise ValueError(NO_MOTION)
-        if rung is not None and (rungs is not None or hold or (len(target) > 1 and not any(recorded))):
+        if rung is not None and (rungs is not None or (len(target) > 1 and not any(recorded))):
             raise ValueError("--rung fits one model to one spectrum or to recordings of one condition: leave out --rungs "
-                             "and --hold (with these, and with several spectra, --rungs says which model)")  # fmt: skip
+                             "(with several spectra --rungs says which model)")  # fmt: skip
         if rung and noise is not None:
             raise ValueError("--rung: the models with activation and tremor have noise of their own; leave out --noise")
         options = {
@@ -237,7 +237,8 @@ def fit(
             simulated = {} if increments is None else {"increments": str(increments)}
             if method != MethodName.linear:
                 raise ValueError("with --hold all records are fitted by the formula of the spectrum: leave out --method")
-            options |= {"rungs": rungs if rungs is not None else 0 if noise is not None or names else RUNGS}
+            most = 0 if rung is not None or noise is not None or names else RUNGS
+            options |= {"rungs": most if rungs is None else rungs}
             for name in fixed:
                 if "@" in name:
                     raise ValueError(f"--fix {name}: with --hold a fixed value holds for all records. Give --fix "
@@ -248,6 +249,9 @@ def fit(
             options |= simulated | {"starts": starts or 32, "seeds": 0 if quick else seeds or 32}
             given = read_with_holds(target, hold, reading, window)
             writable(output, "fit.json", force=force)
+            if rung is not None:
+                bases = {"moved": jm.PrescribedLength(), "held": jm.Isometric()}
+                options["tasks"] = {name: jm.on_rung(base, rung) for name, base in bases.items()}
             converged = _fit_with_holds(*given, output, options, [] if quick else formats_of(formats))
             raise typer.Exit(CONVERGED if converged else NOT_CONVERGED)
         options |= {"method": str(method), "seeds": seeds, "rungs": rungs if rung is None else 0}

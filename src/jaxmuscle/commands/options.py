@@ -78,7 +78,9 @@ TargetTask = Annotated[
 ]
 Noise = Annotated[
     NoiseName | None,
-    typer.Option(help="Colour of the noise, band-limited by default; if you give it, no richer model is tried."),
+    typer.Option(
+        help="Colour of the noise, band-limited by default. If you give it, richer models are tried only with --rungs."
+    ),
 ]
 Free = Annotated[
     str | None,

@@ -167,9 +167,10 @@ class DesignedInput(Printed, Result, eqx.Module):
         """Write the signal for the motor as CSV (`time_s`, `displacement_mm`); `to_dict` where the name ends in .json."""
         if Path(path).suffix == ".json":
             return write_json(path, self.to_dict())
+        made = f"designed by jaxmuscle for {', '.join(self.quantity)}" if self.moves else "flat, made by jaxmuscle"
         head = (f"one period of a lengthening of {self.lengthening.seconds:g} s, to be repeated; positive: the muscle gets "
                 f"longer\nrms {1e3 * self.rms:.4g} mm, peak {1e3 * self.peak:.4g} mm, {1e3 * self.speed:.4g} mm/s, "
-                f"{self.acceleration:.3g} m/s^2; designed by jaxmuscle for {', '.join(self.quantity)}")  # fmt: skip
+                f"{self.acceleration:.3g} m/s^2; {made}")  # fmt: skip
         with replacing(path) as temporary, temporary.open("w", encoding="utf-8") as file:
             file.write("".join(f"# {line}\n" for line in head.splitlines()) + "time_s,displacement_mm\n")
             np.savetxt(file, np.stack([self.time, 1e3 * self.displacement], axis=1), "%.7g", ",")
@@ -231,7 +232,8 @@ class DesignedInput(Printed, Result, eqx.Module):
                 return [*lines, f"  {goal}: what is known without this record is enough for that"]
             begin, end = self.window
             period, periods = self.lengthening.seconds, round((end - begin) / self.lengthening.seconds)
-            lines += [f"  to know {goal}, {seconds:.3g} s of record are enough"]
+            if_so = ", if the muscle is like the one given here" if self._vague() else ""
+            lines += [f"  to know {goal}, {seconds:.3g} s of record are enough{if_so}"]
             if periods > 1:
                 lines[-1] += (
                     f": {periods} periods of this motion. Play {self.played:.3g} s and analyse {begin:.3g} to {end:.3g} s"
