@@ -709,6 +709,7 @@ def designed():
     return types.SimpleNamespace(
         told=told, frequency=f, time=time, displacement=1e-3 * np.sin(time), even=lines, lengthening=lines, now=errors[0],
         flat=errors[1], stderr=errors[2], percent=lambda name, known: known[name],
+        moves=((0.1, 1.0, 0.9),), needed=(0.05, 40.0),
     )  # fmt: skip
 
 
