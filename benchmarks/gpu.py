@@ -21,30 +21,14 @@ SECONDS, SEEDS = 15.0, 262_144
 SHORT = 1_048_576
 
 
-def timed(work: Callable[[], Any], repetitions: int = 1) -> tuple[float, float]:
-    """Seconds of the first call and the median of the following."""
+def timed(work: Callable[[], Any], repetitions: int = 1) -> dict[str, float]:
+    """Seconds of the `first` call, which compiles, and the median of the `later` ones."""
     taken = []
     for _ in range(1 + repetitions):
         begun = time.perf_counter()
         work()
         taken.append(time.perf_counter() - begun)
-    return taken[0], float(np.median(taken[1:]))
-
-
-def _with_lanes(lanes: int, duration: float, chunk: int) -> Callable[..., Any]:
-    """`ensemble` with so many seeds side by side on a GPU, whatever the length of a run."""
-    import jaxmuscle as jm
-    from jaxmuscle.ensembles import _layout
-
-    def run(*given: Any, **options: Any) -> Any:
-        usual = _layout.WIDE_LANES, _layout.WIDE_STEPS_AT_ONCE
-        _layout.WIDE_LANES, _layout.WIDE_STEPS_AT_ONCE = lanes, round(lanes * duration * 1000)
-        try:
-            return jm.ensemble(*given, duration=duration, chunk=chunk, **options)
-        finally:
-            _layout.WIDE_LANES, _layout.WIDE_STEPS_AT_ONCE = usual
-
-    return run
+    return {"first": taken[0], "later": float(np.median(taken[1:]))}
 
 
 def worker(small: bool) -> None:
@@ -52,6 +36,7 @@ def worker(small: bool) -> None:
     import jax
 
     import jaxmuscle as jm
+    from jaxmuscle.ensembles import _layout
 
     scale, wide, kind = 64 if small else 1, jax.default_backend() == "gpu", jax.devices()[0].device_kind
     found: dict[str, Any] = {"device": kind, "jax": jax.__version__}
@@ -61,35 +46,24 @@ def worker(small: bool) -> None:
         found[name] = value
         print(name, value, file=sys.stderr, flush=True)
 
-    seeds = (SEEDS if wide else SEEDS // 4) // scale
-    run = lambda: jm.ensemble(task, key, seeds=seeds, duration=SECONDS, reduce=True)  # noqa: E731
-    first, later = timed(run)
-    say("reduced", {"first": first, "seeds per second": seeds / later})
+    def pace(name: str, seeds: int, *given: Any, **options: Any) -> None:
+        taken = timed(lambda: jm.ensemble(*given, key, seeds=seeds, reduce=True, **options))
+        say(name, taken | {"seeds per second": seeds / taken["later"]})
+
+    pace("reduced", (SEEDS if wide else SEEDS // 4) // scale, task, duration=SECONDS)
     say("power", np.asarray(jm.ensemble(task, key, seeds=1024 // scale, reduce=True).spectrum.power, float).tolist())
-    seeds = (SHORT if wide else SHORT // 4) // scale
-    run = lambda: jm.ensemble(white, key, seeds=seeds, duration=1.0, control=False, reduce=True)  # noqa: E731
-    first, later = timed(run)
-    say("short", {"first": first, "seeds per second": seeds / later})
-    if wide:
-        for lanes in WIDTHS:
-            lanes, total = lanes // scale, max(SEEDS, lanes) // scale
-            side = _with_lanes(lanes, SECONDS, lanes)
-            first, later = timed(lambda side=side, total=total: side(task, key, seeds=total, reduce=True))
-            say(f"width {lanes}", {"first": first, "seeds per second": total / later})
-        say("memory", jax.devices()[0].memory_stats()["peak_bytes_in_use"])  # pyright: ignore[reportOptionalSubscript]
-    target = jm.load_target("vastus-lateralis-26mvc")
-    begun = time.perf_counter()
-    result = jm.fit(jm.Isometric(), target)
-    first, begun = time.perf_counter() - begun, time.perf_counter()
-    jm.fit(jm.Isometric(), target)
-    cost = min(start.cost for start in result.starts if start.cost is not None)
-    say("fit", {"first": first, "later": time.perf_counter() - begun, "cost": cost})
+    pace("short", (SHORT if wide else SHORT // 4) // scale, white, duration=1.0, control=False)
+    for lanes in WIDTHS if wide else ():
+        _layout.WIDE_LANES, _layout.WIDE_STEPS_AT_ONCE = lanes // scale, round(lanes // scale * SECONDS * 1000)
+        pace(f"width {lanes // scale}", SEEDS // scale, task, duration=SECONDS, chunk=lanes // scale)
+    target, results = jm.load_target("vastus-lateralis-26mvc"), []
+    taken = timed(lambda: results.append(jm.fit(jm.Isometric(), target)))
+    say("fit", taken | {"cost": min(start.cost for start in results[0].starts if start.cost is not None)})
     with jax.enable_x64(True):
         power = jax.jit(lambda k: jm.expected_spectrum(jm.Isometric(k_w=k)).power)
         slopes = jax.jit(jax.jacrev(lambda k: jm.expected_spectrum(jm.Isometric(k_w=k)).power))
         for name, function in (("expected", power), ("slopes", slopes)):
-            first, later = timed(lambda f=function: jax.block_until_ready(f(4e5)), 20)
-            say(name, {"first": first, "later": later})
+            say(name, timed(lambda f=function: jax.block_until_ready(f(4e5)), 20))
     print(json.dumps(found))
 
 

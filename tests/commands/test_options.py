@@ -52,7 +52,7 @@ def here(tmp_path, monkeypatch):
         raise Compiled(self.function.__name__)
 
     monkeypatch.setattr(programs.Kept, "__call__", call)
-    # Made anew for every call, all commands with their options take more time than a call.
+    # Typer would build all commands with their options for every call, which takes longer than the call.
     monkeypatch.setattr(typer.testing, "_get_command", lambda app: MADE, raising=False)
     monkeypatch.setenv("COLUMNS", "1000")
     monkeypatch.chdir(tmp_path)

@@ -19,7 +19,7 @@ def is_concrete(value: Any) -> bool:
     return not isinstance(value, Tracer)
 
 
-def as_seen(value: Any) -> Any:
+def numpy_unless_traced(value: Any) -> Any:
     """A NumPy array, or the value as it is while JAX traces it."""
     return np.asarray(value) if is_concrete(value) else value
 

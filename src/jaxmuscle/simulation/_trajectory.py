@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Integer
 
 from jaxmuscle import plot
-from jaxmuscle._common.arrays import _is_scalar, as_numbers, as_seen, is_concrete
+from jaxmuscle._common.arrays import _is_scalar, as_numbers, is_concrete, numpy_unless_traced
 from jaxmuscle._common.cards import Card, Shown, facts
 from jaxmuscle._common.environment import versions
 from jaxmuscle.model._parameters import PARAMETERS
@@ -102,7 +102,7 @@ class Trajectory(Shown, eqx.Module):
         settings = self.task.settings if settings is None else settings
         passed = lowpass(self._at_rate_of(settings, self.output), settings)
         start, stop = self._edges(window, settings.rate)
-        return as_seen(passed)[..., start:stop]
+        return numpy_unless_traced(passed)[..., start:stop]
 
     def spectrum(self, settings: SpectrumSettings | None = None, window: tuple[float, float] = WINDOW) -> Spectrum:
         """Welch spectrum of the output per seed (see `Spectrum.mean`), low-pass filtered from t = 0, then windowed.
@@ -126,7 +126,7 @@ class Trajectory(Shown, eqx.Module):
         **Raises:** `ValueError` for `control=True` without `linear`, or with another `sampling` than was simulated.
         """
         settings = self.task.settings if settings is None else settings
-        plain = as_seen(self.spectrum(settings, window).power)
+        plain = numpy_unless_traced(self.spectrum(settings, window).power)
         plain = plain.reshape(-1, plain.shape[-1])
         same = self.sampling == settings.sampling and self.rate == settings.rate
         if control and (self.linear is None or not same):
@@ -134,8 +134,8 @@ class Trajectory(Shown, eqx.Module):
                              "the spectrum's settings")  # fmt: skip
         if control is False or self.linear is None or not same:
             return estimated(plain, None, None, settings, self.task.output_unit)
-        beside = as_seen(self.beside().spectrum(settings, window).power).reshape(plain.shape)
-        exact = as_seen(linear_spectrum(self.task, settings, window).power)
+        beside = numpy_unless_traced(self.beside().spectrum(settings, window).power).reshape(plain.shape)
+        exact = numpy_unless_traced(linear_spectrum(self.task, settings, window).power)
         return estimated(plain, beside, exact, settings, self.task.output_unit)
 
     def beside(self) -> "Trajectory":
