@@ -394,6 +394,8 @@ def test_fit_draws_residuals_in_standard_deviations_and_marks_the_large_ones():
     np.testing.assert_allclose([bar.get_x() + bar.get_width() / 2 for bar in bars], found.frequency_hz)
     outside = [bar.get_facecolor() == to_rgba(plot.VERMILLION) for bar in bars]
     assert outside == list(np.abs(found.residual) > 2)
+    explained = [i for i, bar in enumerate(bars) if bar.get_label() == "residual beyond 2 SD"]
+    assert explained == [outside.index(True)]  # stands in the key, once
     spans = {(p.get_y(), p.get_y() + p.get_height()) for p in ax.patches if p not in bars}
     assert spans == {(-1.0, 1.0), (-2.0, 2.0)}
     assert ax.get_ylabel() == "Residual (SD)"

@@ -314,6 +314,20 @@ def test_limits_are_kept():
     assert made.gain > 1.0 and made.even.rms < made.rms
 
 
+@pytest.mark.slow
+def test_the_acceleration_of_a_motor_is_kept():
+    free = designed(quantity="K_z0", rate=1000.0)
+    most = 0.3 * free.acceleration
+    made = designed(quantity="K_z0", acceleration=most, rate=1000.0)
+    three = np.concatenate([made.displacement[-1:], made.displacement, made.displacement[:1]])
+    acceleration = np.max(np.abs(np.diff(three, 2))) / 1e-6
+    assert made.acceleration == pytest.approx(acceleration, rel=1e-2)
+    assert 0.9 * most < made.acceleration <= most * (1 + 1e-9)  # kept, and used
+    # Slower instead of only smaller: better than the free motion, made smaller until it keeps the limit.
+    smaller = experiment(("K_z0",)).errors(free.lengthening.power * (most / free.acceleration) ** 2)
+    assert free.stderr["K_z0"] < made.stderr["K_z0"] < smaller["K_z0"]
+
+
 def test_an_even_design_is_the_flat_one():
     made = designed(spread=1.0)
     assert made.gain == pytest.approx(1.0)
@@ -484,6 +498,7 @@ def test_the_figure():
         ({"rms": 0.0}, r"rms = 0.0 m must be a positive number"),
         ({"peak": -1e-3}, r"peak = -0.001 m must be a positive number"),
         ({"speed": 0.0}, "speed = 0.0 m/s must be a positive number"),
+        ({"acceleration": -1.0}, "acceleration = -1.0 m/s² must be a positive number"),
         ({"band": (0.0, 5.0)}, r"band = \(0, 5\) Hz must lie above 0 Hz"),
         ({"band": (5.0, 1.0)}, r"band = \(5, 1\) Hz must lie above 0 Hz"),
         ({"band": (0.1, 26.0)}, r"band = \(0.1, 26.0\) Hz reaches beyond half of rate = 50.0 Hz"),

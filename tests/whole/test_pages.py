@@ -211,7 +211,9 @@ def test_coming_from_elsewhere():
         names = pages.run("docs/coming-from-diffrax.md")
         first = float(names["loss"]((names["logs"], names["Sensor"](jax.numpy.asarray(-5.0)))))
     assert float(names["value"]) < 0.9 * first  # the loop of optax went downhill
-    assert names["many"].shape == (8, 1501) and np.all(np.isfinite(names["solution"].ys))
+    assert names["many"].shape == (8,) and np.all(np.isfinite(names["solution"].ys))
+    # Welch power of one recording scatters by half, so the mean of eight by less than a fifth.
+    assert 0.2 < names["many"].mean() / float(jm.expected_spectrum(jm.Isometric()).power[10]) < 1.8
     assert set(names["slopes"]) == {"c_w", "noise_K_z"}
     assert names["better"]["c_w"] == pytest.approx(191.9, rel=0.01)  # Levenberg-Marquardt stops within 1e-2 of a coordinate
 

@@ -32,6 +32,9 @@ def design(
         typer.Option(metavar="MM", help="Largest displacement to either side in mm: half of the motor's travel."),
     ] = None,
     speed: Annotated[float | None, typer.Option(metavar="MM/S", help="Largest speed of the motor in mm/s.")] = None,
+    acceleration: Annotated[
+        float | None, typer.Option(metavar="M/S2", help="Largest acceleration of the motor in m/s².")
+    ] = None,
     spread: Annotated[
         float, typer.Option(metavar="SHARE", help="Share of the motion, 0 to 1, that is spread evenly over the band.")
     ] = 0.1,
@@ -70,7 +73,8 @@ def design(
         found = jm.design_input(
             _source(source), names_in(quantity, "--quantity") or (), rms=rms / 1e3, band=_band(band), seconds=seconds,
             rate=rate,
-            peak=None if peak is None else peak / 1e3, speed=None if speed is None else speed / 1e3, spread=spread, key=seed,
+            peak=None if peak is None else peak / 1e3, speed=None if speed is None else speed / 1e3,
+            acceleration=acceleration, spread=spread, key=seed,
             durations=_lengths(durations), error=None if error is None else error / 100,
         )  # fmt: skip
         found.save(output / "motor.csv")
@@ -85,7 +89,7 @@ def design(
             f"- Play the motion for {found.played:g} s: motor.csv holds one period of {period:g} s, to be repeated without "
             "a gap. Its first lines, which begin with #, say what it is. Let the motor move to its first value slowly. Its "
             f"largest acceleration is {found.acceleration:.2g} m/s². If that is too much for your motor, design again "
-            "with a smaller --rms. If the person tires, record several shorter trials instead.",
+            "and say how much it can do (--acceleration). If the person tires, record several shorter trials instead.",
             f"- Record force and displacement. Fit both channels from {begin:g} to {end:g} s, together with what you have "
             "already: the errors above include that. Give each held trial with --hold, and an earlier moved record as a "
             "second file. In --window, give the window of the new record first, then one auto for each other "

@@ -164,7 +164,10 @@ def _residuals(ax: Axes, part: Any, verdict: tuple[str, float | None] = ("", Non
     outside = np.abs(residual) > 2 if known else np.zeros(residual.shape, bool)
     width = 0.7 * np.min(np.diff(frequency), initial=math.inf)
     bars = {"width": width if math.isfinite(width) else 0.1, "zorder": 3}
-    ax.bar(frequency, np.where(np.isfinite(residual), residual, 0.0), color=np.where(outside, VERMILLION, BLUE), **bars)
+    heights = np.where(np.isfinite(residual), residual, 0.0)
+    drawn = ax.bar(frequency, heights, color=np.where(outside, VERMILLION, BLUE), **bars)
+    for first in np.flatnonzero(outside)[:1]:
+        drawn[first].set_label("residual beyond 2 SD")
     _closeness(ax, part, *verdict)
     ax.set(xlabel="Frequency (Hz)", xlim=(0, frequency[-1] + frequency[0]))
     reach = float(np.max(np.abs(residual), where=np.isfinite(residual), initial=3.0 if known else 0.1)) * 1.1

@@ -199,7 +199,7 @@ class DesignedInput(Printed, Result, eqx.Module):
             f"  a flat motion of {1e3 * self.even.rms:.3g} mm rms: {flat}. The {square} is then {self.gain:.2g} times as "
             "large" if self.moves else "  this motion is flat itself: no frequency is preferred",
             f"  lengthening of the muscle: {1e3 * self.rms:.3g} mm rms, at most {1e3 * self.peak:.3g} mm to "
-            f"either side and {1e3 * self.speed:.3g} mm/s, {low:.2g} to {high:.2g} Hz",
+            f"either side, {1e3 * self.speed:.3g} mm/s and {self.acceleration:.2g} m/s², {low:.2g} to {high:.2g} Hz",
             *[f"  most of the motion: {most}"] * bool(most),
             "  expected standard errors, in percent of the value (prior: without any data; now: before this record):",
             f"    {'':<22}{'prior':>10}{'now':>10}{'flat':>10}" + f"{'designed':>10}" * bool(self.moves),

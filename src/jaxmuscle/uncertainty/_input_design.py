@@ -32,7 +32,7 @@ from ._multisine import multisine, speed_of
 
 WIDTH, FEWEST = 0.15, 5  # of a step of the density: relative to its frequency; lines in it at least
 TRIES = 4  # how often the density follows the crest factors of its motion
-CREST = (1.6, 2.0)  # of position and velocity, to begin with
+CREST = (1.6, 2.0, 2.5)  # of position, velocity and acceleration, to begin with
 ENOUGH = 1e-6
 MOST = 10**8  # samples of a motion
 LONGEST = 1e4  # times the record
@@ -49,6 +49,7 @@ def design_input(
     rate: float = 1000.0,
     peak: float | None = None,
     speed: float | None = None,
+    acceleration: float | None = None,
     spread: float = 0.1,
     target: str | None = None,
     key: Key = 0,
@@ -73,8 +74,8 @@ def design_input(
 
     - `result` of a fit, or a task, whose usual free parameters are then free with their prior
     - `quantity`: a free parameter or a derived quantity such as K_w0, K_z0, C_w0, C_z0, K_w_tangent, or several
-    - `rms` [m], `peak` [m], `speed` [m/s]: at most; where the motion would pass `peak` or `speed` it gets smaller or
-      slower
+    - `rms` [m], `peak` [m], `speed` [m/s], `acceleration` [m/s²]: at most; where the motion would pass `peak`, `speed` or
+      `acceleration` it gets smaller or slower
     - `band` [Hz]: from 0.5 Hz on, as drift and slow movements of the person are not in the model
     - `seconds`: length of the record and period
     - `rate` [Hz] of the motion
@@ -89,7 +90,8 @@ def design_input(
     not positive, a band that holds no line or reaches beyond half the rate, seconds that are no whole number of samples;
     `OperatingPointError` for a task without linear response.
     """
-    for name, value, unit in (("rms", rms, "m"), ("peak", peak, "m"), ("speed", speed, "m/s"), ("rate", rate, "Hz")):
+    for name, value, unit in (("rms", rms, "m"), ("peak", peak, "m"), ("speed", speed, "m/s"),
+                              ("acceleration", acceleration, "m/s²"), ("rate", rate, "Hz")):  # fmt: skip
         require_positive(name, np.float64(1.0) if value is None else value, unit)
     require(0 <= spread <= 1, f"spread = {spread} must be a share, from 0 to 1")
     durations = [float(one) for one in durations]
@@ -103,13 +105,15 @@ def design_input(
             f"seconds = {seconds}: rate = {rate} Hz makes no whole number of samples of it")  # fmt: skip
     require(2 * frequency[-1] < rate, f"band = {band} Hz reaches beyond half of rate = {rate} Hz: raise the rate")
     quantities = (quantity,) if isinstance(quantity, str) else tuple(quantity)
-    limits, crest = np.array([np.inf if limit is None else limit for limit in (peak, speed)]), np.array(CREST)
+    limits = np.array([np.inf if limit is None else limit for limit in (peak, speed, acceleration)])
+    crest = np.array(CREST)
     rng = np.random.default_rng(np.asarray(jax.random.key_data(key_of(key))).tolist())
 
     def realised(power: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """A motion of these lines, made smaller where it must be, and the crest factors of position and velocity."""
+        """A motion of these lines, made smaller where it must be, and the crest factors of it and its derivatives."""
         motion = multisine(frequency * seconds, power, seconds, samples, limits, rng)
-        moved = np.stack([motion, speed_of(motion, seconds)])
+        velocity = speed_of(motion, seconds)
+        moved = np.stack([motion, velocity, speed_of(velocity, seconds)])
         tops = np.max(np.abs(moved), axis=1)
         return motion * min(1.0, *(limits / tops)), tops / np.sqrt(np.mean(moved**2, axis=1))
 
@@ -120,7 +124,7 @@ def design_input(
         even = even.of_motion(motion)
         for _ in range(TRIES if np.isfinite(min(limits)) else 1):
             allowed = limits / crest
-            motion, crest = realised(experiment.best(min(rms, allowed[0]), allowed[1], spread))
+            motion, crest = realised(experiment.best(min(rms, allowed[0]), allowed[1:], spread))
     own = even.of_motion(motion)
     known = experiment.here.values
     values, units = {n: value for n, (value, _) in known.items()}, {n: unit for n, (_, unit) in known.items()}
@@ -212,23 +216,24 @@ class Experiment(NamedTuple):
         rows = [self.here.gradients[n] / (self.here.values[n][0] or 1.0) for n in self.quantity]
         return np.stack(rows)
 
-    def best(self, rms: float, speed: float, spread: float) -> Float[np.ndarray, " lines"]:
-        """Mean square of every line [m²] such that the quantities become best known, at most of that rms and rms speed.
+    def best(self, rms: float, faster: Float[np.ndarray, "2"], spread: float) -> Float[np.ndarray, " lines"]:
+        """Mean square of every line [m²] such that the quantities become best known, at most of that rms.
 
-        Convex, in shares of steps of the density.
+        `faster`: largest rms of speed [m/s] and acceleration [m/s²]. Convex, in shares of steps of the density.
         """
         steps = steps_of(self.frequency)
         steps = (1 - spread) * steps + spread / len(self.frequency)
         each = rms**2 * np.tensordot(steps, self.lines, 1)
-        fast = (rms / speed) ** 2 * steps @ (2 * np.pi * self.frequency) ** 2
+        omega = 2 * np.pi * self.frequency
+        fast = [(rms / most) ** 2 * steps @ omega ** (2 * order) for order, most in enumerate(faster, start=1)]
 
         def height(share: np.ndarray) -> tuple[float, np.ndarray]:
             reached = np.linalg.solve(self.apart + np.tensordot(share, each, 1), self.rows.T)
             sum_of_variances = np.sum(self.rows.T * reached)
             return np.log(sum_of_variances), -np.einsum("iq,kij,jq->k", reached, each, reached) / sum_of_variances
 
-        within = [scipy.optimize.LinearConstraint(row, -np.inf, 1.0) for row in (np.ones(len(steps)), fast)]
-        begin = np.full(len(steps), 1 / len(steps)) / max(1.0, np.mean(fast))
+        within = [scipy.optimize.LinearConstraint(row, -np.inf, 1.0) for row in (np.ones(len(steps)), *fast)]
+        begin = np.full(len(steps), 1 / len(steps)) / max(1.0, *map(np.mean, fast))
         if np.max(-height(begin)[1]) < NOTHING:
             raise ValueError(f"quantity: no motion within these limits tells of {' and '.join(self.quantity)}: raise rms, "
                              "or choose another band")  # fmt: skip

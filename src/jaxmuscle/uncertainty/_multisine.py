@@ -12,34 +12,34 @@ def multisine(
     power: Float[np.ndarray, " lines"],
     seconds: float,
     samples: int,
-    limits: Float[np.ndarray, "2"],
+    limits: Float[np.ndarray, "3"],
     rng: np.random.Generator,
 ) -> Float[np.ndarray, " samples"]:
     """One period of `Σ_k √(2 p_k) cos(2π n_k t / T + φ_k)`, n_k the `lines`: whole numbers of periods in the record.
 
     The phases start at random. Then the highest peaks are clipped off and the phases of what is left are taken, again and
-    again (time-frequency swapping): of position or velocity, whichever is nearer to its limit (peak [m], speed [m/s];
-    infinite: none). Of several starts the best. The period begins near a zero of slow motion.
+    again (time-frequency swapping): of position, velocity or acceleration, whichever is nearest to its limit ([m], [m/s],
+    [m/s²]; infinite: none). Of several starts the best. The period begins near a zero of slow motion.
 
     **Source:** van der Ouderaa, Schoukens & Renneboog 1988, doi:10.1109/19.2679.
     """
     places, fine = np.rint(lines).astype(int), max(FINE * round(lines[-1]), 64)
-    size, velocity = np.sqrt(2 * power), 2j * np.pi * lines / seconds
-    position_counts = not np.isfinite(limits[0]) and not np.isfinite(limits[1])
-    weights = (1.0 if position_counts else 1 / limits[0], 1 / limits[1])
+    size, rate = np.sqrt(2 * power), 2j * np.pi * lines / seconds
+    # Of every derivative that has a limit: what its spectrum is of that of the position, in units of the limit.
+    scales = [rate**order / limit for order, limit in enumerate(limits) if np.isfinite(limit)] or [np.ones_like(rate)]
     phases = np.exp(2j * np.pi * rng.random((STARTS, len(lines))))
     best, lowest = phases, np.full((STARTS, 1), np.inf)
     for _ in range(ROUNDS):
-        moved, speed = (w * _wave(places, size * phases * d, fine) for w, d in zip(weights, (1.0, velocity), strict=True))
-        peaks = [np.max(np.abs(z), axis=1, keepdims=True) for z in (moved, speed)]
-        worst = np.maximum(*peaks)
+        moved = np.stack([_wave(places, size * phases * scale, fine) for scale in scales])
+        peaks = np.max(np.abs(moved), axis=2)
+        nearest = np.argmax(peaks, axis=0)
+        worst = np.max(peaks, axis=0)[:, None]
         best, lowest = np.where(worst < lowest, phases, best), np.minimum(worst, lowest)
-        faster = peaks[1] > peaks[0]
-        clipped = np.clip(np.where(faster, speed, moved), -CLIP * worst, CLIP * worst)
-        found = np.fft.rfft(clipped, axis=1)[:, places] / np.where(faster, velocity, 1.0)
+        clipped = np.clip(moved[nearest, np.arange(STARTS)], -CLIP * worst, CLIP * worst)
+        found = np.fft.rfft(clipped, axis=1)[:, places] / np.stack(scales)[nearest]
         phases = np.where(found == 0, phases, found / np.maximum(np.abs(found), 1e-300))
     chosen = best[np.argmin(lowest)][None]
-    moved, speed = (_wave(places, size * chosen * d, samples)[0] for d in (1.0, velocity))
+    moved, speed = (_wave(places, size * chosen * d, samples)[0] for d in (1.0, rate))
     slow = np.abs(moved) / np.max(np.abs(moved)) + np.abs(speed) / np.max(np.abs(speed))
     return np.roll(moved, -int(np.argmin(slow)))
 
