@@ -1,5 +1,7 @@
 """What holds for every test: shapes are checked, dtypes are never mixed silently, figures need no screen."""
 
+import contextlib
+import ctypes
 import gc
 import os
 import subprocess
@@ -121,8 +123,10 @@ def pytest_collection_finish() -> None:
 
 def pytest_runtest_setup(item: pytest.Item) -> None:
     shapes.begin_anew()
-    # A command that ran here before keeps only what took long to compile: single operations would be compiled ever again.
+    # A command that ran here before keeps only what took long to compile (single operations would be compiled ever again),
+    # and `jaxmuscle speed` keeps nothing (all later tests would compile their own).
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+    os.environ.pop("JAXMUSCLE_CACHE", None)
     if item.get_closest_marker("gpu") and jax.default_backend() != "gpu":
         pytest.skip("needs a GPU")
 
@@ -155,6 +159,9 @@ def _forget_compiled_programs():
         forget()
         jax.clear_caches()
         gc.collect()
+        # What was freed stays with the process, which then would be full for ever: give it back to the system.
+        with contextlib.suppress(OSError, AttributeError):  # where the C library is another
+            ctypes.CDLL(None).malloc_trim(0)
 
 
 @pytest.fixture
