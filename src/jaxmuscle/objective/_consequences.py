@@ -25,7 +25,7 @@ def frequency_of(part: PartResiduals) -> Float[Array, " bins"]:
 
 
 BATCH = 32
-POINTS, EACH = 128, 8
+POINTS, EACH = 128, 2
 LATEST = 4
 
 

@@ -19,7 +19,7 @@ from jaxmuscle.model._signals import AbstractSignal, Constant
 from jaxmuscle.model._tasks import AbstractTask, State
 from jaxmuscle.spectra._settings import WINDOW
 
-from ._equilibrium import HOLD, equilibrium
+from ._equilibrium import HOLD, equilibrium, mechanics
 
 
 class Linearisation(NamedTuple):
@@ -92,31 +92,32 @@ def settled(task: AbstractTask, time: float = HOLD) -> AbstractTask:
     """
     traced = not all(is_concrete(leaf) for leaf in jax.tree.leaves(task))
     point = equilibrium(task, time) if traced else np.asarray(linearised(task, time).system.point).tolist()
-    levels = _inputs(as_arrays(task), np.array([time]))
+    levels = _inputs(_signals(as_arrays(task)), np.array([time]))
     held = {name: Constant(level[0] if traced else float(np.asarray(level)[0])) for name, level in levels.items()}
     found = task.with_parts(**held, initial=tuple(point))
     return found if traced else as_numbers(found)
 
 
 @kept
-def _inputs(task: AbstractTask, times: Float[Array | np.ndarray, " times"]) -> dict[str, Float[Array, " times"]]:
-    """Values at some times of every input that is a function of time."""
-    return {name: jax.vmap(signal)(jnp.asarray(times)) for name, signal in _signals(task).items()}
+def _inputs(
+    signals: dict[str, AbstractSignal], times: Float[Array | np.ndarray, " times"]
+) -> dict[str, Float[Array, " times"]]:
+    """Their values at some times."""
+    return {name: jax.vmap(signal)(jnp.asarray(times)) for name, signal in signals.items()}
 
 
 def _signals(task: AbstractTask) -> dict[str, AbstractSignal]:
+    """Every input that is a function of time."""
     found = {field.name: getattr(task, field.name) for field in dataclasses.fields(task)}
     return {name: value for name, value in found.items() if isinstance(value, AbstractSignal)}
 
 
-@kept
-def _compiled(task: AbstractTask, time: float) -> LinearTask:
-    return LinearTask.of(task, linearise(task, time))
+_compiled = kept(linearise)
 
 
 def linearised(task: AbstractTask, time: float = HOLD) -> LinearTask:
     """`LinearTask.of`, compiled."""
-    return _compiled(as_arrays(task), time)
+    return LinearTask.of(as_arrays(task), _compiled(mechanics(task), time))
 
 
 def check_equilibrium(task: Any, point: np.ndarray, A: np.ndarray) -> float:
@@ -151,7 +152,7 @@ def check_inputs(task: AbstractTask, window: tuple[float, float] = WINDOW) -> No
         return
     times = np.append(np.linspace(*window, LOOKS), HOLD)
     with jax.enable_x64(True):
-        seen = {name: np.asarray(values) for name, values in _inputs(as_doubles(task), times).items()}
+        seen = {name: np.asarray(values) for name, values in _inputs(_signals(as_doubles(task)), times).items()}
     for name, values in seen.items():
         off = np.abs(values[:-1] - values[-1])
         if np.max(off) > MOVING * np.max(np.abs(values)):

@@ -20,7 +20,7 @@ from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.model._white_noise import BandLimitedNoise, WhiteNoise
 from jaxmuscle.spectra._settings import WINDOW, SpectrumSettings
 
-from ._equilibrium import HOLD
+from ._equilibrium import HOLD, mechanics
 from ._expected import covariance_operator, expected_moments
 from ._linearised import Linearisation, linearised
 
@@ -139,7 +139,7 @@ def _inputs_of(parts: _Parts, sources: tuple[_Source, ...], states: int) -> tupl
 def negative_coefficients(task: AbstractTask) -> tuple[str, ...]:
     """Sentences about coefficients that noise and harmonic make negative for more than 1 % of the time."""
     with jax.enable_x64(True):
-        parts = jax.tree.map(np.asarray, _parts(as_doubles(task)))
+        parts = jax.tree.map(np.asarray, _parts(mechanics(as_doubles(task))))
     matrix, white, inputs = _inputs_of(parts, parts.noises, 0)
     rows = inputs[: len(CHANNELS)]
     covariance = solve_continuous_lyapunov(matrix, -white)
@@ -171,7 +171,8 @@ def second_order(task: AbstractTask, settings: SpectrumSettings | None = None) -
     with jax.enable_x64(True):
         system = linearised(arrays).system
         moments, _ = expected_moments(arrays, settings, WINDOW)
-        hessians, parts, system = jax.tree.map(np.asarray, (_hessians(arrays, system), _parts(arrays), system))
+        bare = mechanics(arrays)
+        hessians, parts, system = jax.tree.map(np.asarray, (_hessians(bare, system), _parts(bare), system))
     n = len(system.A)
     matrix, white, inputs = _inputs_of(parts, (*parts.noises, parts.harmonic), n)
     matrix[:n, :n] = system.A

@@ -17,9 +17,9 @@ from jaxmuscle._common.text import listed
 from jaxmuscle._common.types import Key, Seed
 from jaxmuscle.model._stream import Draws
 from jaxmuscle.model._task import AbstractTask, require_task
-from jaxmuscle.response._equilibrium import fastest_rate
+from jaxmuscle.response._equilibrium import fastest_rate, mechanics
 from jaxmuscle.response._linearised import LinearTask, check_equilibrium, check_inputs, linearised
-from jaxmuscle.spectra._settings import WINDOW, Sampling
+from jaxmuscle.spectra._settings import WINDOW, Sampling, SpectrumSettings
 
 from ._batch import Recipe, run_seeds
 from ._grid import Grid, parts_for
@@ -197,8 +197,8 @@ def trajectories(
     draws: Draws = Draws(),  # noqa: B008
 ) -> Trajectory:
     """Every seed of one task in one program, finite or not; arrays stay where they were computed."""
-    recipe = Recipe(plan.grid, plan.sampling, True, task.settings, draws=draws)
-    found = run_seeds(as_arrays(task), as_arrays(linear), key, seeds, recipe, mesh)
+    recipe = Recipe(plan.grid, plan.sampling, True, SpectrumSettings(), draws=draws)
+    found = run_seeds(mechanics(task), None if linear is None else mechanics(linear), key, seeds, recipe, mesh)
     grid = plan.grid
     return Trajectory(task, found["states"], found["output"], seeds, plan.rate, grid.dt, grid.substeps, plan.sampling,
                       found["linear"])  # fmt: skip
