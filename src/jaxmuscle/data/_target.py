@@ -150,10 +150,10 @@ class Target(Shown, eqx.Module):
     def mean_force(self) -> tuple[float, float] | None:
         """Mean force and its standard error [N]; `None` without a mean in newtons.
 
-        The error: that of the trials' scatter and that of a recording of this length, whichever is larger. The former with
-        Student's t, so that ± 1.96 of it hold 95 % (of three trials or more). The latter from the density S₁ in the lowest
-        bin, `√(S₁ / 2T)`, T the time recorded; 2 % of the mean where the target does not state segments and coefficient of
-        variation, and at least 0.2 %.
+        The error: that of the trials' scatter or that of a recording of this length, whichever is larger. If it is the
+        former, with Student's t, so that ± 1.96 of it hold 95 % (of three trials or more). The latter from the density S₁ in
+        the lowest bin, `√(S₁ / 2T)`, T the time recorded; 2 % of the mean where the target does not state segments and
+        coefficient of variation, and at least 0.2 %.
         """
         if self.mean is None or self.unit not in NEWTONS or self.quantity != "force":
             return None
