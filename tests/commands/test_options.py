@@ -31,7 +31,7 @@ PATHS = ("missing.csv", "folder", "..", "r\n.csv", "x\1y.csv")  # no argument ho
 # Zero is one of these; a number below 0 one of the others.
 ZERO = {"seed", "skip_rows", "max_gap", "rungs", "delay", "spread", "process_id", "rung", "alpha"}
 SIGNED = {"delay"}
-LARGE = {"max_gap", "delay", "mvc", "lever_arm", "rms", "peak", "speed"}  # not yet a mistake
+LARGE = {"max_gap", "delay", "mvc", "lever_arm", "rms", "peak", "speed", "acceleration"}  # not yet a mistake
 FREE = {"output", "force", "as_json"}  # a folder may have any name
 # Known only when the linear response is there, or of no influence where nothing has that name.
 LATER = {("design", "quantity")}
