@@ -22,7 +22,6 @@ POWER = 1 / (1 + (GRID / 1.2) ** 2) + 0.01
 def keep_settings(monkeypatch):
     """Commands switch cache, precision and devices; the tests keep theirs. Messages are not to be broken into lines."""
     monkeypatch.setenv("COLUMNS", "1000")
-    monkeypatch.setenv("JAXMUSCLE_CACHE", os.environ.get("JAXMUSCLE_CACHE", ""))
     jax.devices()  # from now on there can be no more of them
     before = jax.config.jax_compilation_cache_dir, jax.config.jax_enable_x64
     yield

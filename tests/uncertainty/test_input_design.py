@@ -276,7 +276,7 @@ def experiment(quantity):
 def test_the_optimum_obeys_the_equivalence_theorem(quantity):
     """No direction towards any step of the density lowers the variance, and those that are used leave it as it is."""
     made = designed(quantity=quantity, spread=0.0)
-    power, step = experiment(quantity).best(1e-3, np.full(2, np.inf), 0.0), 1e-5
+    power, step = experiment(quantity).best(np.array([1e-3, np.inf, np.inf]), 0.0), 1e-5
     here = criterion(made, power)
     np.testing.assert_allclose(power.sum(), 1e-6, rtol=1e-6)
     for one in steps_of(made.frequency):

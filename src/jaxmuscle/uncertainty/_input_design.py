@@ -123,8 +123,8 @@ def design_input(
         motion = realised(even.power)[0]
         even = even.of_motion(motion)
         for _ in range(TRIES if np.isfinite(min(limits)) else 1):
-            allowed = limits / crest
-            motion, crest = realised(experiment.best(min(rms, allowed[0]), allowed[1:], spread))
+            allowed = np.minimum(limits / crest, [rms, np.inf, np.inf])
+            motion, crest = realised(experiment.best(allowed, spread))
     own = even.of_motion(motion)
     known = experiment.here.values
     values, units = {n: value for n, (value, _) in known.items()}, {n: unit for n, (_, unit) in known.items()}
@@ -216,24 +216,25 @@ class Experiment(NamedTuple):
         rows = [self.here.gradients[n] / (self.here.values[n][0] or 1.0) for n in self.quantity]
         return np.stack(rows)
 
-    def best(self, rms: float, faster: Float[np.ndarray, "2"], spread: float) -> Float[np.ndarray, " lines"]:
-        """Mean square of every line [m²] such that the quantities become best known, at most of that rms.
+    def best(self, allowed: Float[np.ndarray, "3"], spread: float) -> Float[np.ndarray, " lines"]:
+        """Mean square of every line [m²] such that the quantities become best known.
 
-        `faster`: largest rms of speed [m/s] and acceleration [m/s²]. Convex, in shares of steps of the density.
+        `allowed`: largest rms of displacement [m], speed [m/s] and acceleration [m/s²]; that of the displacement is finite.
+        Convex, in shares of steps of the density.
         """
+        rms, omega = allowed[0], 2 * np.pi * self.frequency
         steps = steps_of(self.frequency)
         steps = (1 - spread) * steps + spread / len(self.frequency)
         each = rms**2 * np.tensordot(steps, self.lines, 1)
-        omega = 2 * np.pi * self.frequency
-        fast = [(rms / most) ** 2 * steps @ omega ** (2 * order) for order, most in enumerate(faster, start=1)]
+        used = [(rms / most) ** 2 * steps @ omega ** (2 * order) for order, most in enumerate(allowed)]
 
         def height(share: np.ndarray) -> tuple[float, np.ndarray]:
             reached = np.linalg.solve(self.apart + np.tensordot(share, each, 1), self.rows.T)
             sum_of_variances = np.sum(self.rows.T * reached)
             return np.log(sum_of_variances), -np.einsum("iq,kij,jq->k", reached, each, reached) / sum_of_variances
 
-        within = [scipy.optimize.LinearConstraint(row, -np.inf, 1.0) for row in (np.ones(len(steps)), *fast)]
-        begin = np.full(len(steps), 1 / len(steps)) / max(1.0, *map(np.mean, fast))
+        within = [scipy.optimize.LinearConstraint(row, -np.inf, 1.0) for row in used]
+        begin = np.full(len(steps), 1 / len(steps)) / max(map(np.mean, used))
         if np.max(-height(begin)[1]) < NOTHING:
             raise ValueError(f"quantity: no motion within these limits tells of {' and '.join(self.quantity)}: raise rms, "
                              "or choose another band")  # fmt: skip
