@@ -652,11 +652,12 @@ def test_the_paper_as_json(tmp_path, monkeypatch):
 
 # The long work of a command, its arguments, and what it would overwrite.
 OVERWRITES = {
-    "fit": ("fit", ["fit", "{csv}"], ["fit.json"]),
+    "fit": ("fit", ["fit", "{csv}"], ["fit.json", "spectrum.csv"]),
     "several": ("fit_cohort", ["fit", "{csv}", "vastus-lateralis-26mvc"],
                 ["cohort.csv", "spectrum/fit.json", "vastus-lateralis-26mvc/fit.json"]),
-    "simulate": ("ensemble", ["simulate", "zagrodny-slifkin"], ["trajectories.nc"]),
-    "analyse": ("load_recording", ["analyse", "{csv}", "--save-target", "{out}/held.toml"], ["analysis.json", "held.toml"]),
+    "simulate": ("ensemble", ["simulate", "zagrodny-slifkin"], ["trajectories.nc", "spectrum.csv"]),
+    "analyse": ("load_recording", ["analyse", "{csv}", "--save-target", "{out}/held.toml"],
+                ["analysis.json", "spectrum.csv", "held.toml"]),
     "posterior": ("fit", ["posterior", "{csv}", "--segments", "9"], ["fit.json", "posterior.nc", "posterior.json"]),
     "identifiability": ("fit", ["identifiability", "{csv}", "--segments", "9"], ["fit.json", "identifiability.json"]),
     "compare": ("compare_noise", ["compare", "{csv}"], ["compare.json"]),
@@ -675,7 +676,6 @@ def test_an_earlier_result_is_overwritten_by_force_only(case, file, tmp_path, mo
     assert reached.exit_code == 1 and "the long work was reached" in reached.stderr
     (out / file).parent.mkdir(exist_ok=True)
     (out / file).write_text("a result")
-    (out / "spectrum.csv").write_text("of any command")  # its numbers are in the result, too
     refused = run(*arguments)
     assert refused.exit_code == 2 and refused.stdout == ""
     assert f"{out / file}: is there already; overwrite it with --force" in refused.stderr

@@ -136,6 +136,8 @@ HEADERS = {  # content, what column is asked for, the unit found
     "force_N": ("time_s,force_N\n" + rows(TIME, X, sign=","), "force", "N"),
     "force_pctMVC": ("time_s,force_pctMVC\n" + rows(TIME, X, sign=","), "force", "% MVC"),
     "torque_Nm": ("t_ms,torque_Nm\n" + rows(np.arange(60) * 2, X, sign=","), "torque", "N m"),
+    "load cell": ("time_s,force_kg\n" + rows(TIME, X, sign=","), "force", "kgf"),
+    "pounds": ("time,Force (lbs)\n" + rows(TIME, X, sign=","), "Force", "lbf"),
     "position_mm": ("time,position_mm,note\n" + rows(TIME, X, ["rest"] * 60, sign=","), None, "mm"),
 }  # fmt: skip
 
@@ -200,7 +202,7 @@ BAD = {
     "names of other width": ("Subject 3, left\n" + rows(TIME, X, EMG, sign=","), {}, "write a # before lines that"),
     "number among names": ("time,force\nhigh,1\n" + rows(TIME, X, sign=","), {}, "line 2: '1' cannot be the name"),
     "damaged clock": (HEADERS["time of day"][0].replace("10:00:00.005", "10.00,5"), {}, "line 4: clock '10.00,5' is not"),
-    "kg in units row": ("time,force\ns,kg\n" + rows(TIME, X, sign=","), {}, "column force: unknown unit 'kg'; give `units`"),
+    "bar in units row": ("time,force\ns,bar\n" + rows(TIME, X, sign=","), {}, "force: unknown unit 'bar'; give `units`"),
     "time asked for": ("a,b\n" + rows(TIME, X, sign=","), {"time": "c"}, "no time 'c'; Known: a, b"),
     "no waveform": ('"INFORMATION"\n"a.smr"\n"SUMMARY"\n', {}, "holds no waveform; export one from Spike2"),
     "gap in Spike2": (SPIKE2.format(rows(X) + '"START"\t9\t0.002\n', rows(EMG)), {"column": 0}, "line 78: Force has a gap"),

@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 
 import jaxmuscle as jm
 from jaxmuscle.data import Measure, _steadiness
-from jaxmuscle.data._measure import log_interval, logit_interval, student_interval
+from jaxmuscle.data._measure import likelier_error, log_interval, logit_interval, student_interval
 from jaxmuscle.data._steadiness import RANGES, _error, _interval, _own, _peak, _segments, _stated, _together
 from jaxmuscle.objective._derived import derived_names
 from jaxmuscle.spectra._bin_law import student
@@ -243,6 +243,37 @@ def test_trials_of_different_length_are_noticed():
     long, short = jm.Recording(forces(3, 15.0)[0], RATE), jm.Recording(forces(3, 15.0)[1][:900], RATE)
     assert "the trials last 9 s to 15 s" in jm.steadiness([long, short]).notices[-1]
     assert not jm.steadiness([long, jm.Recording(forces(3, 15.0)[1], RATE)]).notices
+
+
+def test_a_window_with_a_ramp_is_noticed():
+    """From rest to 10 N in 2 s, held for 15 s: all of it, a part with the ramp, and the steady part."""
+    x = np.concatenate([np.zeros(200), np.linspace(0, LEVEL, 200), forces(1, 15.0)[0]])
+    whole = jm.Recording(x, RATE, name="whole")
+    for recording in (whole, whole.steady((2.5, 19.0))):
+        (said,) = (notice for notice in jm.steadiness(recording).notices if "ramp" in notice)
+        assert said.startswith("the level goes from ") and f"{LEVEL:.0f}" in said.split(" to ")[1]
+        assert said in recording.target().notices
+    assert not any("ramp counts" in notice for notice in jm.steadiness(whole.steady()).notices)
+    assert not any("level goes" in n for n in jm.steadiness(jm.Recording(x, RATE, unit="mm")).notices)  # a limb may move
+
+
+def test_a_unit_that_says_nothing_is_noticed():
+    """An EMG that was taken by mistake looks as any signal does."""
+    said = jm.steadiness(jm.Recording(forces(1, 15.0)[0], RATE, unit="mV")).notices
+    assert said[0].startswith("the unit mV does not say what was measured: is it the right column?")
+
+
+def test_trials_that_agree_by_chance_are_noticed():
+    """Of trials that scatter as their own errors say, 1 of 100 groups; where they truly differ, none."""
+    alike = [Measure(value, 0.1, "N^2", "spectrum") for value in (1.0, 1.001, 0.999, 1.0)]
+    assert likelier_error(alike) == pytest.approx(0.05)
+    draws = np.random.default_rng(3).normal(1.0, 0.1, (4000, 4))
+    found = [likelier_error([Measure(float(v), 0.1, "1", "spectrum") for v in row]) is not None for row in draws]
+    assert scipy.stats.binomtest(sum(found), 4000, 0.01).pvalue > 1e-4
+    one = jm.steadiness([jm.Recording(LEVEL + k + forces(1, 15.0)[0], RATE, name=f"{k}") for k in (0.0, 0.1, 0.2)])
+    (said,) = (notice for notice in one.notices if "agree much better" in notice)
+    own = [trial["power_2_4"].stderr for trial in one.trials.values()]
+    assert f"± {np.hypot.reduce(own) / 3:.2g} from 2 to 4 Hz" in said
 
 
 def test_trials_that_are_no_trials_of_one_condition_are_noticed():

@@ -171,13 +171,15 @@ def test_trials_that_differ_widen_the_error_of_their_variation():
     assert wide == pytest.approx(t * scipy.stats.sem(np.log(unlike)), rel=1e-6)
 
 
-@pytest.mark.parametrize(("unit", "known"), [("kN", True), ("% MVC", False), ("N m", False), ("mm", False)])
-def test_only_newtons_are_newtons(unit, known):
+# A kilogram-force is 9.80665 N, a pound-force 4.4482216152605 N, both exactly.
+@pytest.mark.parametrize(("unit", "newtons"), [("kN", 1000), ("kgf", 9.80665), ("gf", 9.80665e-3), ("lbf", 4.4482216152605),
+                                               ("% MVC", None), ("N m", None), ("mm", None)])  # fmt: skip
+def test_only_newtons_are_newtons(unit, newtons):
     x = 0.8 * signal(np.random.default_rng(5))
     target = jm.Recording(x, RATE, unit=unit).target()
-    assert (target.mean_force is not None) == known and target.unit == unit
-    if known:
-        assert target.mean_force[0] == pytest.approx(1000 * np.mean(x), rel=1e-3)
+    assert (target.mean_force is not None) == (newtons is not None) and target.unit == unit
+    if newtons is not None:
+        assert target.mean_force[0] == pytest.approx(newtons * np.mean(x), rel=1e-3)
     assert (target.mean is None) == (unit == "mm")
 
 

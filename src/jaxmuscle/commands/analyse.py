@@ -71,8 +71,9 @@ def analyse(
             raise ValueError(f"--save-target {save_target}: a target is saved as TOML; give a name that ends in .toml")
         if save_target is not None:
             absent(save_target, force=force)
-        writable(output, "analysis.json", force=force)
-        if perturbed(reading):
+        moved = perturbed(reading)
+        writable(output, "analysis.json", "response.csv" if moved else "spectrum.csv", force=force)
+        if moved:
             if save_target is not None or mvc is not None:
                 raise ValueError(
                     "--save-target and --mvc belong to spectra, and this recording has a moved insertion: leave them out"
@@ -113,8 +114,7 @@ def _write(
     figures = write_figure(trials.plot(settings), folder, "analysis", formats)
     write_text(folder / "spectrum.csv", csv_text(columns))
     write_json(folder / "analysis.json", found)
-    notices = target.notices if target is not None else [notice for recording in trials for notice in recording.notices]
-    for notice in dict.fromkeys(notices):
+    for notice in target.notices if target is not None else trials._notices(settings):
         err.print(f"[yellow]notice:[/] {plain(notice)}", highlight=False)
     table = Table(title=plain(trials.name if several else trials[0].source), title_justify="left", show_header=several,
                   box=SIMPLE_HEAD if several else HEAVY_HEAD, padding=(0, 1))  # fmt: skip

@@ -40,7 +40,7 @@ def simulate(
 
         keep_compiled_programs()
         model = task_of(preset, task, observe)
-        writable(output, "trajectories.nc", force=force)
+        writable(output, "trajectories.nc", "spectrum.csv", force=force)
         _simulate(model, seeds, seed, output, formats_of(formats))
 
 

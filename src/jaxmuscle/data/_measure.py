@@ -1,12 +1,16 @@
 """A measured number with its standard error and its 95 % interval."""
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
+import numpy as np
+import scipy
 
 from jaxmuscle.spectra._bin_law import NORMAL, student
 
+RARE = 0.01  # probability of so little scatter
 FARTHEST = 300.0  # logarithm of a factor, so that no end overflows
 
 
@@ -30,6 +34,17 @@ class Measure(eqx.Module):
         error = math.nan if self.stderr is None else self.stderr
         return {"value": self.value, "stderr": error, "low": low, "high": high, "unit": self.unit,
                 "error_from": self.error_from}  # fmt: skip
+
+
+def likelier_error(each: Sequence[Measure]) -> float | None:
+    """The error of a mean by the own errors e of its values, if these scatter (s) so little that it must be chance.
+
+    (n - 1) s² / e² has a chi-squared law of n - 1 degrees of freedom where nothing else than these errors acts, and a
+    larger value where the values truly differ.
+    """
+    errors = np.array([math.nan if m.stderr is None else m.stderr for m in each])
+    scatter = (len(each) - 1) * float(np.var([m.value for m in each], ddof=1)) / float(np.mean(errors**2))
+    return math.hypot(*errors) / len(each) if scipy.special.chdtr(len(each) - 1, scatter) < RARE else None
 
 
 def normal_interval(value: float, error: float) -> tuple[float, float]:

@@ -10,6 +10,7 @@ from jaxtyping import Float
 
 from jaxmuscle.spectra._settings import SpectrumSettings, require
 
+from ._recording_quality import plateau, running_median
 from ._target import Target
 
 if TYPE_CHECKING:
@@ -32,7 +33,9 @@ def pooled_target(
     """The target of one or more recordings of the same unit, see `Trials.target`."""
     unit = recordings[0].unit
     quantity = recordings[0].quantity if quantity is None else quantity
-    require(quantity is not None, "quantity", quantity, f"unit {unit} does not tell; give force, torque, ...")
+    if quantity is None:
+        raise ValueError(f"`quantity`: the unit {unit} does not say what was measured. If it is a force, give `quantity`, "
+                         "as quantity=force; an EMG cannot be fitted. Is it the right column?")  # fmt: skip
     rows = np.stack([np.asarray(recording.spectrum(settings).power) for recording in recordings])
     segments = [recording.segments(settings) for recording in recordings]
     signals = [recording.filtered(settings) for recording in recordings]
@@ -58,14 +61,38 @@ def pooled_target(
         unit=unit,
         trial_power=rows if len(rows) > 1 else None,
         settings=settings,
-        notices=(
-            *_notices(recordings, drifts),
-            *(unlike([r.name for r in recordings], signals, unit) if quantity in ("force", "torque") else ()),
-        ),
+        notices=notices_of(recordings, signals, settings.rate, drifts, quantity),
     )
 
 
-def _notices(recordings: "Sequence[Recording]", more: list[tuple[str, ...]]) -> tuple[str, ...]:
+def notices_of(
+    recordings: "Sequence[Recording]",
+    signals: Sequence[np.ndarray],
+    rate: float,
+    more: Sequence[tuple[str, ...]],
+    quantity: str | None,
+) -> tuple[str, ...]:
+    """What to mind of recordings of one condition, whose windows hold these low-passed signals; `more` of each of them."""
+    unit, held = recordings[0].unit, quantity in ("force", "torque")
+    ramps = [_ramped(x, rate, unit) if held else () for x in signals]
+    each = [(*ramp, *own) for ramp, own in zip(ramps, more, strict=True)]
+    unclear = (f"the unit {unit} does not say what was measured: is it the right column? A coefficient of variation makes "
+               "sense only of a signal that is zero without force, and in proportion to it")  # fmt: skip
+    alike = unlike([r.name for r in recordings], signals, unit) if held else (unclear,) if quantity is None else ()
+    return (*_notices(recordings, each), *alike)
+
+
+def _ramped(x: Float[np.ndarray, " times"], rate: float, unit: str) -> tuple[str, ...]:
+    """What to say where a window holds more than one level: a ramp is in it, or rest."""
+    if plateau(x, rate) == (0, x.size):
+        return ()
+    level = running_median(x, rate)
+    return (f"the level goes from {level.min():.3g} to {level.max():.3g} {unit} within this window: it holds more than the "
+            "steady part, and a ramp counts as unsteadiness. Give a window of one level; without --window (in Python "
+            "steady()) it is looked for",)  # fmt: skip
+
+
+def _notices(recordings: "Sequence[Recording]", more: Sequence[tuple[str, ...]]) -> tuple[str, ...]:
     """Those of every trial, each once, with the names of the trials unless all say so; the steady parts in one."""
     said = [(notice, r.name) for r, own in zip(recordings, more, strict=True) for notice in (*r.notices, *own)]
     windows = [f"{notice.removeprefix(FOUND)} in {name}" for notice, name in said if notice.startswith(FOUND)]

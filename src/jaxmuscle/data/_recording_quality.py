@@ -135,6 +135,15 @@ def clipping(x: Float[np.ndarray, " times"], rate: float, start: float) -> list[
     return notices
 
 
+def running_median(x: Float[np.ndarray, " times"], rate: float) -> Float[np.ndarray, " times"]:
+    """The running median over 1 s."""
+    return scipy.ndimage.median_filter(x, _size(x, rate), mode="nearest")
+
+
+def _size(x: Float[np.ndarray, " times"], rate: float) -> int:
+    return min(round(SMOOTH * rate), x.size)
+
+
 def plateau(x: Float[np.ndarray, " times"], rate: float) -> tuple[int, int] | None:
     """The steady part of a ramp-and-hold, as the index of its first sample and of the first one after it.
 
@@ -146,8 +155,7 @@ def plateau(x: Float[np.ndarray, " times"], rate: float) -> tuple[int, int] | No
 
     **Returns:** the two indices, or `None` if there is no such stretch.
     """
-    size = min(round(SMOOTH * rate), x.size)
-    s = scipy.ndimage.median_filter(x, size, mode="nearest")
+    s, size = running_median(x, rate), _size(x, rate)
     low, high = float(s.min()), float(s.max())
     if high - low <= RAMP * max(abs(low), abs(high)):
         return 0, x.size

@@ -21,15 +21,14 @@ from jaxmuscle.spectra._fluctuations import BANDS, dfa, variance_spectrum
 from jaxmuscle.spectra._measures import regularity
 from jaxmuscle.spectra._settings import require
 
-from ._measure import Measure, log_interval, logit_interval, student_interval
-from ._pooled import unlike
+from ._measure import Measure, likelier_error, log_interval, logit_interval, student_interval
+from ._pooled import notices_of, unlike
 from ._recording import RECORDED, SEGMENTS, SHORTEST, Recording
 
 if TYPE_CHECKING:
     import pandas
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure, SubFigure
-
 
 ALL = "all"
 PARTS, SLOWEST = 4, 4  # parts of a recording; ordinates that say how sure its mean is
@@ -119,8 +118,9 @@ def _of_errors(count: int) -> str:
         return (f"± is the standard error. It is estimated within {'the' if count == 1 else 'each'} recording: for "
                 "entropies and DFA from its four parts, for the peak from its Welch segments, for all else from its "
                 "spectrum.")  # fmt: skip
-    return (f"± is the standard error, from the scatter between the {count} trials. A fit may state larger errors, because "
-            "it assumes that trials scatter at least as much as by chance.")  # fmt: skip
+    return (f"± is the standard error, from the scatter between the {count} trials. A fit states larger errors of mean "
+            "and variation: it takes at least the scatter by chance within the trials, and stretches the error of few "
+            "trials so that ± 1.96 of it is a 95 % interval.")  # fmt: skip
 
 
 def _plain(measures: dict[str, Measure]) -> dict[str, Any]:
@@ -217,12 +217,11 @@ def steadiness(recordings: Recording | Iterable[Recording]) -> Steadiness:
     many = len(each) >= ENOUGH
     peak = _peak(segments if many else [*np.concatenate(segments)[:, None]], "trials" if many else "segments")
     together = {name: _together([m[name] for m in own]) for name in own[0]} | {"peak_frequency": peak}
-    said = [f"{name}: {notice}" for name, recording in zip(names, each, strict=True) for notice in recording.notices]
     together = _stated(together, len(each), sum(map(len, segments)))
-    alike = unlike(names, signals, each[0].unit) if each[0].quantity in ("force", "torque") else ()
-    if alike and len(each) < ENOUGH:
-        alike = (*alike, "the errors do not contain how much two trials differ: for that give three or more")
-    notices = (*said, *_mind(durations, together), *alike)
+    said = notices_of(each, signals, float(RECORDED.rate), [()] * len(each), each[0].quantity)
+    if len(each) < ENOUGH and each[0].quantity in ("force", "torque") and unlike(names, signals, each[0].unit):
+        said = (*said, "the errors do not contain how much two trials differ: for that give three or more")
+    notices = (*said, *_mind(durations, together, own))
     return Steadiness(together, trials, durations, each[0].unit, each[0].quantity, notices)
 
 
@@ -234,13 +233,17 @@ def _same_unit(each: list[Recording]) -> None:
         raise ValueError(f"recordings: units differ ({told}); {remedy}")
 
 
-def _mind(durations: dict[str, float], together: dict[str, Measure]) -> Iterable[str]:
+def _mind(durations: dict[str, float], together: dict[str, Measure], own: list[dict[str, Measure]]) -> Iterable[str]:
     short, long = min(durations.values()), max(durations.values())
     if long > ALIKE * short:
         yield (f"the trials last {short:.3g} s to {long:.3g} s: what is slow (variation, power below 0.5 Hz, DFA exponent) "
                "grows with the length, so choose windows of one length")  # fmt: skip
     if math.isnan(together[VARIATION].value):
         yield "the mean is near zero: there is no coefficient of variation"
+    likelier = {name: likelier_error([m[f"power{name}"] for m in own]) for name in RANGES} if len(own) >= ENOUGH else {}
+    if told := [f"± {error:.2g} from {_range(*RANGES[name])}" for name, error in likelier.items() if error is not None]:
+        yield ("in some bands the trials happen to agree much better than recordings of this length do: "
+               f"{', '.join(told)} is a more likely error of the power than the one in the table")  # fmt: skip
 
 
 def _own(x: Float[np.ndarray, " times"], unit: str) -> dict[str, Measure]:

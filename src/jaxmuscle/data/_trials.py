@@ -13,7 +13,7 @@ from jaxmuscle._common.text import folded
 from jaxmuscle.spectra._settings import SpectrumSettings, require
 from jaxmuscle.spectra._welch import Spectrum
 
-from ._pooled import pooled_target
+from ._pooled import notices_of, pooled_target
 from ._recording import Recording, recorded_settings
 from ._recording_files import load_columns, load_recording
 from ._recording_table import Table
@@ -100,6 +100,11 @@ class Trials(Shown, Sequence[Recording]):
         each, weights = [r.spectrum(settings) for r in self], [r.segments(settings) for r in self]
         power = np.average([one.power for one in each], axis=0, weights=weights)
         return Spectrum(each[0].frequency, power, each[0].settings, each[0].unit)
+
+    def _notices(self, settings: SpectrumSettings | str | None = None) -> tuple[str, ...]:
+        """What to mind of the recordings and their windows."""
+        chosen, quantity = recorded_settings(settings), self.recordings[0].quantity
+        return notices_of(self.recordings, [r.filtered(chosen) for r in self], chosen.rate, [()] * len(self), quantity)
 
     def plot(self, settings: SpectrumSettings | str | None = None, ax: Any = None) -> Any:
         """Draw the windows and the spectra of all recordings, that of one as `Recording.plot`; returns the figure."""

@@ -13,12 +13,14 @@ from jaxmuscle.spectra._settings import require
 from ._target_fields import Quantity
 
 UNITS: dict[str, Quantity | None] = {
-    "N": "force", "mN": "force", "kN": "force", "% MVC": "force", "N m": "torque", "N cm": "torque", "N mm": "torque",
+    "N": "force", "mN": "force", "kN": "force", "kgf": "force", "gf": "force", "lbf": "force", "% MVC": "force",
+    "N m": "torque", "N cm": "torque", "N mm": "torque",
     "m": "displacement", "cm": "displacement", "mm": "displacement", "um": "displacement", "m/s^2": "acceleration",
     "mm/s^2": "acceleration", "g": "acceleration", "mg": "acceleration", "V": None, "mV": None, "a.u.": None,
 }  # fmt: skip
 _SPELLINGS = {"nm": "N m", "ncm": "N cm", "nmm": "N mm", "%mvc": "% MVC", "pctmvc": "% MVC", "%": "% MVC",
-              "\u03bcm": "um", "au": "a.u.", "newton": "N", "newtons": "N", "volt": "V", "volts": "V"}  # fmt: skip
+              "\u03bcm": "um", "au": "a.u.", "newton": "N", "newtons": "N", "volt": "V", "volts": "V",
+              "kg": "kgf", "kp": "kgf", "lb": "lbf", "lbs": "lbf"}  # of a signal: what a load cell weighs  # fmt: skip
 _SI = {"force": NEWTONS, "torque": {"N m": 1.0, "N cm": 1e-2, "N mm": 1e-3},
        "displacement": {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6},
        "angle": {"rad": 1.0, "deg": math.pi / 180}}  # fmt: skip
@@ -27,7 +29,7 @@ _SECONDS = {1.0: "s sec secs sek seg second seconds sekunden secondes segundos",
             1e-3: "ms msec msecs millisec milliseconds", 1e-6: "us µs usec"}  # fmt: skip
 SECONDS = {name: scale for scale, names in _SECONDS.items() for name in names.split()}
 _BRACKETS = re.compile(r"(.*?)\s*[\[(]([^\[\]()]+)[\])]\s*")
-_SUFFIX = re.compile(r"(.+?)(?:_|\s*/\s*)(N|mN|kN|pctMVC|Nm|Ncm|Nmm|m|cm|mm|um|µm|V|mV|s|ms|us|deg|rad)\s*")
+_SUFFIX = re.compile(r"(.+?)(?:_|\s*/\s*)(N|mN|kN|kgf?|gf|lbf|lbs?|pctMVC|Nm|Ncm|Nmm|m|cm|mm|um|µm|V|mV|s|ms|us|deg|rad)\s*")
 
 
 def known_unit(unit: str) -> str | None:
