@@ -334,7 +334,7 @@ def test_verdict_in_words():
     )
     assert said[1].startswith("the data prefer pink to band-limited: AIC lower by 8.0, held-out score higher by 8.0")
     assert said[2].startswith("a harmonic and no harmonic cannot be told apart") and said[2].endswith(
-        "to tell them apart, the AIC must differ by 12.8 or more"
+        "the AIC must differ by 12.8 or more, since chance alone would find some frequency that fits a little better"
     )
     tremor = dataclasses.replace(found.best, noise="tremor", aic=-1e3, harmonic=False)
     richer = dataclasses.replace(found, rows=(*found.rows, tremor)).verdict

@@ -127,7 +127,7 @@ NO_PLATEAU = {
 
 @pytest.mark.parametrize("case", NO_PLATEAU)
 def test_no_plateau_is_said(case):
-    with pytest.raises(ValueError, match=r"no steady part was found.* Give the part yourself|Welch segments needed"):
+    with pytest.raises(ValueError, match=r"no steady part was found.* give the part yourself|Welch segments needed"):
         Recording(NO_PLATEAU[case], 100, name=case).steady()
 
 

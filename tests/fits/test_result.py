@@ -244,7 +244,7 @@ def test_text_shows_what_is_known_and_what_is_not():
         "converged: 1 of 2 starts reach a fit as good as this (cost within 5 %)",
         "c_w 6.667 ± 0.013",  # 16.667 N over a mean of 2.5 N
         "corner_frequency 0.333 ± 0.010 above 0.31 Hz",
-        "products and ratios that the data determine, though not each factor alone: k_w / c_w",
+        "though not each factor alone (jaxmuscle identifiability has values): k_w / c_w",
         "not determined: do not interpret these values (per newton of mean force): k_w",
         "the data leave open: - all stiffness and damping can be multiplied by one number",
         "stiffness and damping are stated here per newton of mean force. In fit.json (Python: result['K_w0'], "

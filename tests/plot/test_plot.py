@@ -327,7 +327,7 @@ def test_the_parts_of_a_model_with_tremor_are_areas_that_add_up_to_the_fit():
     figure = plot.fit(found)
     linear, logarithmic, _, _ = panels(figure)
     labels = [label for label in key(figure) if label.endswith("% of power")]
-    assert [label.partition(",")[0] for label in labels] == ["floor", "relaxation", "tremor (whole)"]
+    assert [label.partition(",")[0] for label in labels] == ["floor", "relaxation", "tremor (all bins)"]
     assert sum(int(label.split(", ")[1].split()[0]) for label in labels) == pytest.approx(100, abs=2)
     top = max(path.vertices[:, 1].max() for area in linear.collections[-3:] for path in area.get_paths())
     assert top == pytest.approx(found.fitted.max())
@@ -379,7 +379,7 @@ def test_fit_draws_the_fitted_spectrum_twice_with_target_and_harmonic():
     linear, logarithmic, _, _ = panels(plot.fit(found))
     for ax, scale in ((linear, "linear"), (logarithmic, "log")):
         assert (ax.get_xscale(), ax.get_yscale()) == (scale, scale)
-        np.testing.assert_array_equal(named(ax, "target").get_ydata(), found.target.proportional_power)
+        np.testing.assert_array_equal(named(ax, "data").get_ydata(), found.target.proportional_power)
         np.testing.assert_array_equal(named(ax, "fit").get_ydata(), found.fitted)
         held = 100 * np.sum(found.fitted * found.harmonic_share)
         assert named(ax, f"harmonic: 3.90 Hz, {held:.2g} % of power").get_xdata() == [3.9]
@@ -441,7 +441,7 @@ def test_fit_draws_the_profile_over_the_frequency():
 def test_fit_of_a_reconstruction_says_so():
     aim = load_target("slifkin-newell-1999-35mvc")
     figure = plot.fit(result(target=aim))
-    assert figure.get_suptitle() == "slifkin-newell-1999-35mvc (reconstructed)" and "target, reconstructed" in key(figure)
+    assert figure.get_suptitle() == "slifkin-newell-1999-35mvc (reconstructed)" and "data, reconstructed" in key(figure)
 
 
 def test_a_failed_fit_still_shows_the_target_and_the_reason():
@@ -569,7 +569,7 @@ def test_components_add_up_to_the_fit(log):
     ax = plot.components(found, log=log)
     labels = [text.get_text() for text in ax.get_legend().get_texts()]
     parts = [label for label in labels if label.endswith(" % of power")]
-    assert [part.partition(",")[0] for part in parts] == ["floor", "relaxation", "tremor (whole)"]
+    assert [part.partition(",")[0] for part in parts] == ["floor", "relaxation", "tremor (all bins)"]
     if log:
         total = np.sum([np.nan_to_num(named(ax, part).get_ydata()) for part in parts], axis=0)
     else:
@@ -577,7 +577,7 @@ def test_components_add_up_to_the_fit(log):
         total = np.array([last[np.isclose(last[:, 0], x), 1].max() for x in f])
     np.testing.assert_allclose(total, found.fitted, rtol=1e-12)
     np.testing.assert_array_equal(named(ax, "fit").get_ydata(), found.fitted)
-    held = [found.components[part.partition(",")[0].removesuffix(" (whole)")] for part in parts]
+    held = [found.components[part.partition(",")[0].removesuffix(" (all bins)")] for part in parts]
     shares = [100 * np.sum(found.fitted * share) for share in held]
     assert parts == [f"{part.partition(',')[0]}, {share:.0f} % of power" for part, share in zip(parts, shares, strict=True)]
 

@@ -50,4 +50,5 @@ def name_of_all(names: Sequence[str]) -> str:
     same = "".join(each[0] for each in letters)
     if any(name[len(same) :][:1].isdigit() for name in names):  # half of a number is none
         same = same.rstrip("0123456789")
+    same = re.sub(r"(?<=.)[_\- .]+[A-Za-z]$", "", same)  # a lone letter that stood before the numbers: S07_t1, S07_t2
     return same.rstrip("_- .") or f"{len(names)} trials"

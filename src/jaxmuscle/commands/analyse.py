@@ -114,7 +114,8 @@ def _write(
     figures = write_figure(trials.plot(settings), folder, "analysis", formats)
     write_text(folder / "spectrum.csv", csv_text(columns))
     write_json(folder / "analysis.json", found)
-    for notice in target.notices if target is not None else trials._notices(settings):
+    whole = target is not None and (several or target.mvc_fraction is not None)  # prints its notices itself
+    for notice in () if whole and not out.quiet else trials._notices(settings) if target is None else target.notices:
         err.print(f"[yellow]notice:[/] {plain(notice)}", highlight=False)
     table = Table(title=plain(trials.name if several else trials[0].source), title_justify="left", show_header=several,
                   box=SIMPLE_HEAD if several else HEAVY_HEAD, padding=(0, 1))  # fmt: skip
@@ -128,7 +129,7 @@ def _write(
     if any(summary.peaks.local_maxima for summary in summaries):
         out.print("A maximum stands between two bins: it is interpolated. Local maxima may be chance. Whether a peak is "
                   "real says jaxmuscle steadiness.", highlight=False)  # fmt: skip
-    if target is not None and (several or target.mvc_fraction is not None):
+    if whole:
         out.print(plain(target), highlight=False)
     written = [f"{folder}/analysis.json, spectrum.csv", *figures]
     if target is not None and save_target is not None:

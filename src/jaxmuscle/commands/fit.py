@@ -1,5 +1,6 @@
 """`jaxmuscle fit`."""
 
+import contextlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any
@@ -323,6 +324,8 @@ def _fit_one(fit: Callable[[Any, Any], Any], called: str, folder: Path, formats:
     except KeyboardInterrupt:
         if printed:
             raise
+        with contextlib.suppress(OSError):
+            folder.rmdir()  # made for this fit, and empty
         err.print(f"interrupted: {NOTHING}")
         raise typer.Exit(interrupted()) from None
     record(folder / "fit.json")

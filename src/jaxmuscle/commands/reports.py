@@ -18,8 +18,8 @@ SPELT_OUT = {"carried": "multiplied, to come to the mean force"}  # names of set
 STATE = 4  # the column of a fit's card that says whether the data determine a number
 PARAMETERS = ("name", "value", "95 % interval", "unit", "what it is")
 FIGURES = {
-    "fit": "Points: target, with the range of one standard deviation. Blue line: fit. Bars: residuals, up where the target "
-    "lies above the fit; the grey bands are one and two standard deviations. Orange-red bars are beyond them.",
+    "fit": "Points: the data, with the range of one standard deviation. Blue line: fit. Bars: residuals, up where the data "
+    "lie above the fit; the grey bands are one and two standard deviations. Orange-red bars are beyond them.",
     "stiffness": "Points: measured dynamic stiffness with two standard errors either way. Blue line: fit.",
     "cohort": "What the data of at least half of the targets determine, with standard errors. Spectra: every target (thin), "
     "the geometric mean of each group with its standard error (thick).",

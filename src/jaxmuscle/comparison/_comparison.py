@@ -85,9 +85,11 @@ class Decision(Printed, Result, eqx.Module):
         if self.unsettled:
             whose = " and of ".join(self.unsettled)
             return f"{better} and {worse} are not compared: the search of {whose} did not converge"
+        apart = f"to tell them apart, the AIC must differ by {self.needed:.3g} or more"
+        apart += ", since chance alone would find some frequency that fits a little better" * (self.needed > NEEDED)
         if abs(self.aic_gain) >= self.needed:
             return f"{open_}: AIC and held-out score disagree (for {better}: {numbers})"
-        return f"{open_} (for {better}: {numbers}); to tell them apart, the AIC must differ by {self.needed:.3g} or more"
+        return f"{open_} (for {better}: {numbers}); {apart}"
 
 
 def decided(names: tuple[str, str], a: Evidence, b: Evidence, needed: float = NEEDED) -> Decision:
@@ -327,6 +329,8 @@ class Comparison(Printed, Result, eqx.Module):
             line += f"{'' if p is None else probability(p).removeprefix('p ').removeprefix('= '):>9}"
             lines.append(f"{line}  {held if row.success else 'failed'}")
         lines.append(LEGEND)
+        if self.target.mean is not None:
+            lines.append("  The fit of these recordings also uses their mean force. So its p and AIC are a little different")
         called = [f"{name} ({RUNGS[rung]})" for name, rung in RICHER.items() if any(row.noise == name for row in self.rows)]
         lines += [f"  the richer models that `fit` tries: {'; '.join(called)}"] * bool(called)
         said = [f"left out: {noise}: {why}" for noise, why in self.left_out.items()]

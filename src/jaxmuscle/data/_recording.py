@@ -199,8 +199,8 @@ class Recording(Shown, eqx.Module):
             found = everything if self.quantity == "acceleration" else plateau(even.whole, even.rate)
             if found is None:
                 raise ValueError(f"{self.name}: no steady part was found: the signal must stay within 10 % of one level for "
-                                 "at least half of the time under load, and longer than 2 s. Give the part yourself: "
-                                 "--window a:b (in Python steady((a, b))), between "
+                                 "at least half of the time under load, and longer than 2 s. Is it the right column? Then "
+                                 "give the part yourself: --window a:b (in Python steady((a, b))), between "
                                  f"{self.start:g} and {self.stop:g} s")  # fmt: skip
             window = (self.start + found[0] / even.rate, min(self.start + found[1] / even.rate, self.stop))
             notices = (*notices, UNRAMPED if found == everything else f"{FOUND}{window[0]:.2f} s to {window[1]:.2f} s")

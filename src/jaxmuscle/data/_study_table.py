@@ -228,7 +228,7 @@ def _checked(places: Iterable[tuple[str, dict[str, Any]]], folder: Path, source:
         if twin is not row:
             raise ValueError(f"{row.place}: trial {row.trial} of {row.person} is there already, at {twin.place}")
     if len(group) < 2:
-        raise ValueError(f"{source}: holds {len(group)} people; a study needs at least 2 (one person: jaxmuscle.fit)")
+        raise ValueError(f"{source}: holds {len(group)} people; a study needs at least 2 (of one: jaxmuscle fit TRIALS)")
     return rows
 
 

@@ -96,8 +96,9 @@ def gains(ladder: tuple[Rung, ...], *, describes: bool | None, datum: str = "bin
 
 def passed_over(ladder: tuple[Rung, ...]) -> tuple[str, ...]:
     """Which models between those of a table are missing there, and why, in sentences."""
-    return tuple(f"model {number} was not tried, since model {before.number} already describes the data. But the harmonic "
-                 f"of model {before.number} may be a tremor, so model {after.number} was tried"
+    return tuple(f"model {before.number} already describes the data, so model {number} was not tried. But the harmonic of "
+                 f"model {before.number} is significant (p < {SIGNIFICANT:g}) and may be a tremor, so model {after.number} "
+                 "was tried as well"
                  for before, after in itertools.pairwise(ladder) if before.p >= ADEQUATE
                  for number in range(before.number + 1, after.number))  # fmt: skip
 
@@ -157,7 +158,7 @@ def climb(first: Plan, models: Models, descend: Descend, keep: Callable[[Climbed
         plan = plan._replace(settings=plan.settings | {"starts": len(points)})
         stages: list[Stage] = []
         begin, share = place * DESCENDED / len(numbers), DESCENDED / len(numbers)
-        telling = _telling(plan, f"model {place + 1} of up to {len(numbers)}", begin, begin + share)
+        telling = _telling(plan, f"model {number} of 0 to {models.top}", begin, begin + share)
         telling.problem.tell(rung_name(number), 0.0)
         known = descend(telling, points, stages)
         if known is None:

@@ -57,8 +57,8 @@ from ._tables import (
 STRETCH = 5.0
 UNSETTLED = 1e-3
 UNCHECKED = (
-    "not done: the check by new simulations, the test of other frequencies of the harmonic, and its p-value (--quick and "
-    "check_seeds=0 leave these out)"
+    "not done: the check by new simulations, the test of other frequencies of the harmonic, and its p-value. "
+    "--quick (check_seeds=0) leaves these out, and so does an interruption"
 )
 TOGETHER = (
     "fitted by the formula alone: no correction and no check by simulation, no profile and no p-value of the harmonic. For "

@@ -41,15 +41,19 @@ WHAT_TO_DO = (
 def card_of(result: "FitResult") -> Card:
     """The result as text, and as a table of all its numbers: those that the data determine first, then what was fixed."""
     rows = []
+    silent = all(float(part.task.harmonic.amplitude) == 0 for part in result.parts.values())  # then it has no frequency
     fixed = {name: p for name, p in result.parameters.items() if not p.free}
     for name, p in result.as_shown(once(fixed, result.found)).items():
+        if silent and base_of(name).startswith("harmonic_"):
+            continue
         state = ("determined" if p.stderr is not None else "not determined") if p.free else "fixed"
         row, unit = PARAMETERS.get(base_of(name)), "" if p.unit == "1" else p.unit
         words = MEANINGS.get(base_of(name), "") if row is None else row.meaning.partition(";")[0]
         rows.append((name, p.in_words(), p.interval_in_words(), unit, state, words))
     order = ("determined", "not determined", "fixed")
     rows.sort(key=lambda row: order.index(row[4]))
-    remarks = (f"{_head(result)}: {result.message}", *_gains(result), *result.advice, *result.notices, *result.remarks)
+    remarks = (f"{_head(result)}: {result.message}", *_gains(result), *result.advice, *result.notices, *result.remarks,
+               *_held(result))  # fmt: skip
     return Card(text_of(result), _heading(result), COLUMNS, tuple(rows), remarks)
 
 
@@ -86,7 +90,7 @@ def text_of(result: "FitResult") -> str:
     lines += _table(title + _per_newton(result, rows), rows, " 95 % interval    " * intervals)
     lines += [f"  {sentence}" for sentence in (*_counted(rows, every), *_by_band(result, bands))]
     fixed = [name for name in result.products if name not in result.parameters]
-    said = "products and ratios that the data determine, though not each factor alone"
+    said = "products and ratios that the data determine, though not each factor alone (jaxmuscle identifiability has values)"
     lines += [f"  {said}: {', '.join(map(_as_people_say, fixed))}"] if fixed else []
     loose = {name: p for name, p in every.items() if name not in shown and p.free}
     title = f"not determined: do not interpret these values{_per_newton(result, loose)}"
@@ -191,13 +195,16 @@ def _beside(name: str, p: Estimate) -> str:
 
 
 def _counted(shown: Mapping[str, Estimate], every: Mapping[str, Estimate]) -> list[str]:
-    """From where on each tremor's share in a table counts, in a sentence."""
+    """What the numbers in a table count where the model has a tremor, in sentences."""
     sentences = []
     for name in shown:
         base, at, target = name.partition("@")
         rhythm = every.get(f"tremor_frequency{at}{target}")
         if base == "tremor_share" and rhythm is not None:
             sentences.append(f"{name}: counted from {0.5 * rhythm.value:.2g} Hz on, half of the tremor's frequency")
+        if base == "high_frequency_floor" and rhythm is not None:
+            sentences.append(f"{name}: holds the tremor, too (it is the mean from 8 to 12 Hz). Do not report it beside the "
+                             "tremor")  # fmt: skip
     return sentences
 
 

@@ -10,8 +10,13 @@ from jaxmuscle._common.text import choices
 from ._spectra import target as draw_target
 from ._style import BLUE, GREEN, ORANGE, PURPLE, SKY, axes_or_new, log_axis, styled
 
-PARTS = {"floor": ("0.75", "floor"), "relaxation": (SKY, "relaxation"), "harmonic": (ORANGE, "harmonic"),
-         "tremor": (GREEN, "tremor (whole)"), "resonance_2": (PURPLE, "resonance 2 (whole)")}  # fmt: skip
+PARTS = {
+    "floor": ("0.75", "floor"),
+    "relaxation": (SKY, "relaxation"),
+    "harmonic": (ORANGE, "harmonic"),
+    "tremor": (GREEN, "tremor (all bins)"),
+    "resonance_2": (PURPLE, "resonance 2 (all bins)"),
+}
 RHYTHMS = {"harmonic": "harmonic", "tremor": "tremor in the drive", "resonance_2": "resonance 2 in the drive"}
 LEAST = 1e-4  # share of the power below which a part is not drawn
 DECADE = 10.0  # by which a part may lie below the spectrum to be seen
@@ -32,6 +37,13 @@ def parts_of_power(ax: Axes, part: Any, *, log: bool, named: bool = True) -> Non
             continue
         ax.fill_between(frequency, below, below + power, color=color, alpha=0.7, lw=0, zorder=2, label=label)
         below = below + power
+
+
+def lowest(part: Any, seen: float) -> float:
+    """How far a logarithmic axis goes down from `seen`, the least power: all parts show, at most a decade below."""
+    powers = [_power_of(part, name) for name in PARTS]
+    peaks = [float(np.max(power)) / 2 for power in powers if float(np.sum(power)) > LEAST]
+    return max(min([seen, *peaks]), seen / DECADE)
 
 
 def rhythms(ax: Axes, part: Any) -> None:
@@ -88,7 +100,7 @@ def components(result: Any, ax: Axes | None = None, target: str | None = None, *
     ax = axes_or_new(ax)
     draw_target(part.target, ax, log=log)
     dots, fitted = ax.lines[0], np.asarray(part.fitted)
-    dots.set(label="target", linewidth=0.0)
+    dots.set(label="data", linewidth=0.0)
     ax.plot(part.frequency_hz, fitted, color=BLUE, label="fit", zorder=4)
     parts_of_power(ax, part, log=log)
     if log:

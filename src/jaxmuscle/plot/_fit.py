@@ -11,7 +11,7 @@ from matplotlib.figure import Figure, SubFigure
 
 from jaxmuscle._common.text import probability
 
-from ._components import mark, parts_of_power, rhythms
+from ._components import lowest, mark, parts_of_power, rhythms
 from ._spectra import target
 from ._stiffness import gain, phase, stiffness_residuals
 from ._style import (
@@ -117,11 +117,11 @@ def _spectra(ax: Axes, part: Any, *, log: bool, title: str = "") -> None:
     frequency, fitted = np.asarray(part.frequency_hz), np.asarray(part.fitted)
     target(part.target, ax, log=log)
     dots = ax.lines[0]
-    dots.set_label("target, reconstructed" if part.target.provenance == "reconstructed" else "target")
+    dots.set_label("data, reconstructed" if part.target.provenance == "reconstructed" else "data")
     if np.isfinite(fitted).any():
         dots.set_linewidth(0.0)
         ax.plot(frequency, fitted, color=BLUE, label="fit", zorder=4)
-        if set(part.components) - {"relaxation", "floor", "harmonic"}:
+        if _parts_are_drawn(part):
             parts_of_power(ax, part, log=log, named=not log)
             rhythms(ax, part)
         else:
@@ -136,11 +136,17 @@ def _spectra(ax: Axes, part: Any, *, log: bool, title: str = "") -> None:
     without_legend(ax)
 
 
+def _parts_are_drawn(part: Any) -> bool:
+    """Of a model richer than the base one."""
+    return bool(set(part.components) - {"relaxation", "floor", "harmonic"})
+
+
 def _log_limits(ax: Axes, part: Any, fitted: Any) -> None:
     band = part.target.sampling_band()
     seen = np.concatenate([part.target.proportional_power, fitted, *(band or ())])
     seen = seen[np.isfinite(seen) & (seen > 0)]
-    ax.set_ylim(seen.min() / 1.4, seen.max() * 1.4)
+    low = lowest(part, float(seen.min())) if _parts_are_drawn(part) else seen.min()
+    ax.set_ylim(low / 1.4, seen.max() * 1.4)
     log_axis(ax, "y")
 
 
@@ -196,7 +202,7 @@ def _stretch(ax: Axes, part: Any, relative: bool) -> None:
     label = "Force / mean" if relative else output_label(task.output_name, task.output_unit)
     output = output / np.mean(output) if relative and output.size else output
     ax.set(xlabel="Time (s)", ylabel=label)
-    ax.set_title("One simulated path")
+    ax.set_title("One simulated recording")
     if not output.size and np.isfinite(part.fitted).all():
         _say(ax, "not simulated", color=GREY)
         return
