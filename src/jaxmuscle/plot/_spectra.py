@@ -97,7 +97,7 @@ def target(target: Any, ax: Axes | None = None, *, log: bool = False) -> Axes:
     shown = slice(None) if not log else frequency > 0
     if band is not None:
         low, high = band
-        label = "± 1 SD (assumed)" if target.provenance == "reconstructed" else "± 1 SD of the measured power"
+        label = "± 1 SD (assumed)" if target.provenance == "reconstructed" else "± 1 SD of the data"
         ax.fill_between(frequency[shown], low[shown], high[shown], color=shade(0.14), lw=0, label=label, zorder=1)
     name = target.name if len(target.name) <= 40 else f"{target.name[:39]}…"
     style: dict[str, Any] = {"color": ink(), "lw": 0.6, "marker": "o", "ms": 2.8, "zorder": 3}
