@@ -257,6 +257,22 @@ def test_text_shows_what_is_known_and_what_is_not():
     assert str(failed_result()).startswith("Not fitted: no start has a finite spectrum")
 
 
+def test_the_methods_paragraph_says_what_a_reader_needs_to_repeat_the_fit():
+    source = "2 trials: a.csv, column F, 1000 Hz, window 5.8 s to 23.5 s; b.csv, column F, 1000 Hz, window 5 s to 23.6 s"
+    settings = jm.SpectrumSettings(filter_direction="both", sampling="filtered")
+    target = jm.Target("made", np.ones(30), segments=[12, 14], source=source, settings=settings)
+    said = made_result(target=target).methods()
+    for words in ("2 recordings of force (26 Welch segments), sampled at 1000 Hz: a part of 17.7 to 18.6 s of each",
+                  "Butterworth, order 9, 30 Hz, forwards and backwards", "Hann window, 256 samples, 50 % overlap",
+                  "from 0.39 to 11.72 Hz", "describes the data: chi2 per bin 0.90 (expected 0.86), p = 0.4",
+                  "(standard deviations): k_w 5e+05 N/m^3 (1).", "with activation (chi2 per bin 0.90, p = 0.3, AIC -260.0)",
+                  "Held fixed were", "m_w = 0.5 kg", "Software: jaxmuscle 0.1, jax 0.8"):  # fmt: skip
+        assert words in said, (words, said)
+    assert "nan" not in said and "None" not in said
+    assert "We analysed the force spectrum made" in made_result().methods()
+    assert made_result(success=False).methods() is None
+
+
 def test_text_counts_trials_and_segments_and_tells_how_much_the_trials_differ():
     def printed(**given):
         return str(made_result(target=jm.Target("made", POWER, **given))).splitlines()

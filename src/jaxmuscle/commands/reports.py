@@ -53,6 +53,8 @@ def fit_report(result: "FitResult", figure: Any, folder: Path) -> None:
                  pages.table(PARAMETERS, rows["not determined"])]  # fmt: skip
     if rows["fixed"]:
         body += [pages.heading("What was fixed"), pages.table(PARAMETERS, rows["fixed"])]
+    if methods := result.methods():
+        body += [pages.heading("For your methods section"), pages.paragraph(methods)]
     body += _data(result.targets)
     body += _how(result.settings | {"method": result.method, "seed": result.seed}, result.versions)
     pages.write_page(folder / REPORT, result.title, body)

@@ -27,6 +27,7 @@ from jaxmuscle.objective._derived import derived_names
 from ._adequacy import Adequacy
 from ._fit_file import FORMAT, FORMATS, FitTable, PartTable, disagreement
 from ._ladder import Rung
+from ._methods import methods_of_fit
 from ._part import Estimate, FittedPart, Start, estimates_to_table, met, part_to_table, read_estimates, read_part
 from ._result_text import WHAT_TO_DO, card_of, in_use, once, per_newton
 
@@ -178,9 +179,8 @@ class FitResult(Result, eqx.Module):
 
         Empty where a mean force or a dynamic stiffness was given, and where the output is no force.
         """
-        if len(self.parts) > 1 or self.settings.get("mean_force") is not None or self.only.stiffness is not None:
-            return {}
-        if self.task.output_unit != "N":
+        known = len(self.parts) > 1 or self.settings.get("mean_force") is not None
+        if known or self.only.stiffness is not None or self.task.output_unit != "N":
             return {}
         mean = self.derived["mean"].value if "mean" in self.derived else np.nan
         return {n: self.derived[n].value / mean for n in ("K_w0", "K_z0", "C_w0", "C_z0") if n in self.derived}
@@ -230,6 +230,10 @@ class FitResult(Result, eqx.Module):
                         "without a harmonic that show one as strong by chance")  # fmt: skip
         return tuple(said)
 
+    def methods(self) -> str | None:
+        """A paragraph for the methods section of a paper; None for several targets, a moved insertion, a failed fit."""
+        return methods_of_fit(self)
+
     def plot(self, ax: "Axes | None" = None) -> "Figure | SubFigure":
         """The figure of the fit."""
         return plot.fit(self, ax)
@@ -269,9 +273,7 @@ def to_table(result: FitResult) -> dict[str, Any]:
         "undetermined": list(result.undetermined),
         "ladder": [rung._asdict() for rung in result.ladder],
         "singular_values": with_nulls(result.singular_values),
-        "starts": [
-            {"cost": s.cost, "success": s.success, "steps": s.steps, "values": list(s.values)} for s in result.starts
-        ],
+        "starts": [vars(s) | {"values": list(s.values)} for s in result.starts],
         "profile": None if profile is None else dict(zip(PROFILE, map(with_nulls, profile), strict=True)),
         "harmonic_p_value": result.harmonic_p_value,
         "notices": list(result.notices),

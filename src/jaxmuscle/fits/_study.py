@@ -31,9 +31,10 @@ from jaxmuscle.objective._derived import DERIVED
 
 from ._cohort import CohortResult, fit_cohort
 from ._differences import CORRECTIONS, Difference, change, corrected, difference, paired
+from ._methods import methods_of_study
 from ._part import Estimate, estimates_to_table
 from ._result_text import ALIASES
-from ._study_words import methods_paragraph, report_lines
+from ._study_words import report_lines
 
 if TYPE_CHECKING:
     import pandas
@@ -158,7 +159,7 @@ class StudyResult(Printed, Result, eqx.Module):
 
     def methods(self) -> str:
         """A paragraph for the methods section of a paper: people, recordings, spectra, model, statistics, versions."""
-        return methods_paragraph(self)
+        return methods_of_study(self)
 
     def plot(self, ax: "Axes | None" = None, *, proportional: bool = True) -> "Figure | SubFigure":
         """Spectra of people and means of groups, a panel for each condition; see `jaxmuscle.plot.study`."""

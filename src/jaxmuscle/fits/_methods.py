@@ -1,0 +1,173 @@
+"""The paragraph for the methods section of a paper: of a study, and of a fit to one spectrum or to trials of one person."""
+
+import platform
+import re
+from collections import Counter
+from typing import TYPE_CHECKING
+
+import scipy
+
+from jaxmuscle._common.environment import versions
+from jaxmuscle._common.text import probability
+from jaxmuscle.model._parameters import PARAMETERS
+from jaxmuscle.model._rungs import RUNGS
+from jaxmuscle.spectra._settings import SpectrumSettings
+
+from ._study_words import counted, people_in_words, range_of, trials_in_words
+
+if TYPE_CHECKING:
+    from ._result import FitResult
+    from ._study import StudyResult
+
+NAMES = {
+    "holm": "Holm's method, which bounds the chance of any false positive",
+    "fdr": "the method of Benjamini and Hochberg, which bounds the expected share of false positives",
+}
+DETREND = {"constant": "mean removed", "linear": "straight line removed", "none": "mean not removed"}
+TESTS = {
+    "groups": "groups within each condition by Welch's t test",
+    "conditions": "conditions within people by the paired t test",
+    "interaction": "the change between conditions of two groups by Welch's t test",
+}
+WINDOWED = re.compile(r"([\d.]+) Hz, window ([\d.]+) s to ([\d.]+) s")  # in the source of a target
+
+
+def methods_of_study(study: "StudyResult") -> str:
+    """People, recordings, spectra, model, fit, statistics and versions, in sentences."""
+    s = study.cells[0].target.settings
+    window = study.options["reading"].get("window")
+    judged = [result.adequate for result in study.cohort.results.values() if result.adequate is not None]
+    rates = [rate for cell in study.cells for rate in cell.rates]
+    named = {None: "the steady part of each recording", "all": "each recording as a whole"}
+    part = f"{window[0]:g} s to {window[1]:g} s" if isinstance(window, tuple | list) else named[window]
+    whose = "person and condition" if any(study.conditions) else "person"
+    noise = "" if study.options["noise"] is None else f" with {study.options['noise']} noise"
+    said = [
+        f"We analysed {people_in_words(study)}: {trials_in_words(study)}.",
+        f"Recordings (sampled at {range_of(rates)} Hz) were resampled to {s.rate:g} Hz and {_low_pass(s)}; {part} was "
+        "analysed unless another window was specified.",
+        _welch(s),
+        f"Spectra of trials of one {whose} were averaged, weighted by their number of Welch segments. Where trials "
+        "scattered more than expected from these, all errors were widened accordingly.",
+        f"A stochastic rheological muscle model{noise} was fitted to every averaged spectrum, its coefficient of variation "
+        f"and, where recorded in newtons, its mean force (linear response, Levenberg-Marquardt, {study.options['starts']} "
+        "starts, log power weighted by the scatter of Welch's estimate).",
+        f"All spectra were fitted with the same model ({RUNGS[study.rung]}){_choice(study)}.",
+        f"The model describes {sum(judged)} of {len(judged)} spectra (p >= 0.01); the errors of the others were widened.",
+        *_statistics(study),
+        _software(versions()),
+    ]
+    return " ".join(said)
+
+
+def methods_of_fit(result: "FitResult") -> str | None:
+    """Data, spectrum, model, fit, verdict, what was assumed, versions; None for several targets and a moved insertion."""
+    if len(result.parts) > 1 or not result.success or not result.only.fitted.size or result.only.stiffness is not None:
+        return None
+    target, set_to = result.target, result.settings
+    fitted = "the spectrum" + ", its coefficient of variation" * bool(set_to.get("coefficient_of_variation"))
+    fitted += ", the mean force" * (set_to.get("mean_force") is not None)
+    simulated = f", corrected by {set_to['seeds']} simulations" if result.method == "linear" and set_to.get("seeds") else ""
+    checked = f" and checked by {set_to['check_seeds']} new ones" * bool(set_to.get("check_seeds"))
+    how = "in linear response" if result.method == "linear" else "by simulation (Monte Carlo)"
+    said = [
+        _data(result),
+        _welch(target.settings),
+        f"A stochastic rheological muscle model ({result.only.model}) was fitted to {' and '.join(fitted.rsplit(', ', 1))} "
+        f"{how} (Levenberg-Marquardt, {set_to['starts']} starts, {set_to['residual']} power weighted by its scatter, seed "
+        f"{result.seed}{simulated}{checked if simulated else ''}).",
+        *_tried(result),
+        f"The model {result.verdict}.",
+        *_assumed(result),
+        _software(result.versions),
+    ]
+    return " ".join(said)
+
+
+def _data(result: "FitResult") -> str:
+    target, s = result.target, result.target.settings
+    segments = "" if target.segments is None else f" ({sum(target.segments)} Welch segments)"
+    read = [tuple(map(float, found)) for found in WINDOWED.findall(target.source)]
+    if not read:
+        return f"We analysed the {target.quantity} spectrum {target.name}{segments}."
+    lengths = [round(stop - start, 1) for _, start, stop in read]
+    several = len(read) > 1
+    averaged = " Their spectra were averaged, weighted by their number of Welch segments." if several else ""
+    if target.dispersion is not None:
+        averaged += (f" The scatter between trials was {target.dispersion[0]:.2f} ± {target.dispersion[1]:.2f} times what "
+                     "the segments explain; all errors are widened by this factor if it exceeds 1.")  # fmt: skip
+    return (f"We analysed {counted(len(read), 'recording')} of {target.quantity}{segments}, sampled at "
+            f"{range_of([rate for rate, *_ in read])} Hz: a part of {range_of(lengths)} s{' of each' * several}, after the "
+            f"recording had been resampled to {s.rate:g} Hz and {_low_pass(s)}.{averaged}")  # fmt: skip
+
+
+def _tried(result: "FitResult") -> list[str]:
+    if len(result.ladder) < 2:
+        return []
+    each = "; ".join(f"{rung.model} (chi2 per bin {rung.chi2_per_bin:.2f}, {probability(rung.p)}, AIC {rung.aic:.1f})"
+                     for rung in result.ladder)  # fmt: skip
+    chosen = next(rung.model for rung in result.ladder if rung.chosen)
+    return [f"Models were tried from the simplest on: {each}. We report the fit of: {chosen}."]
+
+
+def _assumed(result: "FitResult") -> list[str]:
+    """Priors of what was free, and the values of what was not."""
+    centre, sd = (result.settings.get(name, {}) for name in ("prior_centre", "prior_sd"))
+    units = {name: f" {row.unit}" * (row.unit != "1") for name, row in PARAMETERS.items()}
+    priors = ", ".join(f"{name} {value:.4g}{units.get(name, '')} ({sd[name]:.2g})"
+                       for name, value in centre.items() if sd.get(name) is not None)  # fmt: skip
+    silent = float(result.task.harmonic.amplitude) == 0
+    held = [f"{name} = {p.value:.4g}{units.get(name, '')}" for name, p in result.parameters.items()
+            if not p.free and not (silent and name.startswith("harmonic_"))]  # fmt: skip
+    stated = f"Priors (of positive parameters log-normal) had these centres (standard deviations): {priors}."
+    return [stated] * bool(priors) + ([f"Held fixed were {', '.join(held)}."] if held else [])
+
+
+def _welch(s: SpectrumSettings) -> str:
+    return (f"Power spectra were estimated by Welch's method ({_window(s)}, {s.length} samples, {100 * s.overlap:g} % "
+            f"overlap, {DETREND[s.detrend]}) from {s.frequency[0]:.2f} to {s.frequency[-1]:.2f} Hz.")  # fmt: skip
+
+
+def _low_pass(s: SpectrumSettings) -> str:
+    if s.filter_cutoff is None:
+        return "not low-pass filtered"
+    ways = "forwards and backwards" if s.filter_direction == "both" else "forwards"
+    return f"low-pass filtered (Butterworth, order {s.filter_order}, {s.filter_cutoff:g} Hz, {ways})"
+
+
+def _software(numbers: dict[str, str]) -> str:
+    listed = ", ".join(f"{name} {number}" for name, number in numbers.items())
+    return f"Software: {listed}, scipy {scipy.__version__}, Python {platform.python_version()}."
+
+
+def _window(s: SpectrumSettings) -> str:
+    return f"{s.tapers} Slepian tapers" if s.window == "dpss" else f"{s.window.capitalize()} window"
+
+
+def _choice(study: "StudyResult") -> str:
+    if len(study.aic) < 2:
+        return ""
+    return (f", of the models tried ({'; '.join(RUNGS[n] for n in study.aic)}) the one with the lowest AIC summed over all "
+            "spectra; groups and conditions had no part in this choice")  # fmt: skip
+
+
+def _statistics(study: "StudyResult") -> list[str]:
+    found = study.differences()
+    if not found:
+        return []
+    families = Counter(d.kind for d in found)
+    tests = "; ".join(f"{TESTS[kind]} ({counted(n, 'comparison')})" for kind, n in families.items())
+    correction = NAMES.get(study.options["correction"])
+    p = (f"p-values were corrected by {correction}, for all comparisons of the same kind together" if correction
+         else "p-values are not corrected for the number of comparisons")  # fmt: skip
+    left = [d.left_out for d in found if d.left_out]
+    selected = (
+        [f"A quantity that a person's fit does not determine was left out for that person (in {len(left)} of {len(found)} "
+         f"comparisons, {range_of(left)} people), which is a selection."]
+        if left else []
+    )  # fmt: skip
+    return [
+        f"We compared {tests}. In a comparison each person counted once; quantities were not log-transformed. Each "
+        f"{100 * (1 - study.options['alpha']):g} % interval is for a single comparison; {p}.",
+        *selected,
+    ]
