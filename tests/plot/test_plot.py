@@ -523,7 +523,7 @@ def test_steadiness_shows_every_trial_and_the_value_of_all(count, unit, label):
     power, variation, regularity = figure.axes
     assert power.get_ylabel() == label and power.get_yscale() == "log"
     assert [tick.get_text() for tick in power.get_xticklabels()] == ["0 to\n0.5", "12 to\n30"]
-    dots = [line for ax in figure.axes for line in ax.lines if line.get_label() == "trials"]
+    dots = [line for ax in figure.axes for line in ax.lines if line.get_label() == "trials, in their order"]
     assert [line.get_ydata().size for line in dots] == ([6, 9, 9] if count > 1 else [])
     np.testing.assert_allclose(variation.containers[0].lines[0].get_ydata(), [31, 41, 51])
     np.testing.assert_allclose(regularity.containers[0].lines[0].get_ydata(), [0.61, 0.71, 0.81])
