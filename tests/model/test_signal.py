@@ -190,3 +190,16 @@ def test_a_table_gives_its_signal_and_two_derivatives_at_every_grid_point(name, 
         # and with respect to what the signal itself depends on
         slope = jax.grad(lambda level: Tabulated.of(SmoothStep(level), interval, 9000)(2.0))(3.0)
         np.testing.assert_allclose(slope, 1.0, rtol=1e-6)
+
+
+def test_a_table_holds_its_first_and_last_value_beyond_its_ends():
+    signal = Decay(2.0, start=0.0, time_constant=0.3)  # moves from the first point on
+    table = Tabulated.of(signal, 0.1, 5)
+    for t, at in ((-1.0, 0.0), (0.0, 0.0), (0.1, 0.1), (0.4, 0.4), (9.0, 0.4)):
+        assert table(jnp.asarray(t)) == signal(jnp.asarray(at)), t
+
+
+def test_the_documented_values_of_a_decay_are_its_defaults():
+    assert [float(Decay()(jnp.asarray(t))) for t in (0.0, 5.0)] == [1.0, 1.0]
+    p = 2.0 / 3.0
+    np.testing.assert_allclose(Decay()(jnp.asarray(7.0)), 2 * np.exp(-p) - np.exp(-2 * p), rtol=1e-6)
