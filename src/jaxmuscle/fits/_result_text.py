@@ -91,7 +91,7 @@ def text_of(result: "FitResult") -> str:
     lines += [f"  {sentence}" for sentence in (*_counted(rows, every), *_by_band(result, bands))]
     fixed = [name for name in result.products if name not in result.parameters]
     said = "products and ratios that the data determine, though not each factor alone (jaxmuscle identifiability has values)"
-    lines += [f"  {said}: {', '.join(map(_as_people_say, fixed))}"] if fixed else []
+    lines += [f"  {said}: {', '.join(map(as_people_say, fixed))}"] if fixed else []
     loose = {name: p for name, p in every.items() if name not in shown and p.free}
     title = f"not determined: do not interpret these values{_per_newton(result, loose)}"
     lines += _table(title, loose) if loose else []
@@ -271,7 +271,7 @@ def _stiffness(part: FittedPart) -> list[str]:
             f"{part.chi2_per_point:.2f}"]  # fmt: skip
 
 
-def _as_people_say(product: str) -> str:
+def as_people_say(product: str) -> str:
     """A product of parameters by the names of the table above it."""
     return re.sub(r"\w+", lambda word: in_use(word[0]) or word[0], spelt(product))
 

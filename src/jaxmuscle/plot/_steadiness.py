@@ -63,7 +63,8 @@ def _dots(ax: Axes, steadiness: Any, names: dict[str, str], scale: float = 1.0) 
     each = scale * np.array([[trial[name].value for trial in trials] for name in names.values()])
     at = np.arange(len(names))
     if len(trials) > 1:
-        ax.plot((at[:, None] + beside).ravel(), each.ravel(), "o", ms=2.8, color=SKY, zorder=3, label="trials, in their order")
+        label = "trials, in their order"
+        ax.plot((at[:, None] + beside).ravel(), each.ravel(), "o", ms=2.8, color=SKY, zorder=3, label=label)
     found = [steadiness.measures[name] for name in names.values()]
     value = scale * np.array([m.value for m in found])
     ends = scale * np.array([(np.nan, np.nan) if m.interval is None else m.interval for m in found]).T

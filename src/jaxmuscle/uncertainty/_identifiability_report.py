@@ -13,8 +13,8 @@ from jaxmuscle._common.cards import Printed, Result
 from jaxmuscle._common.files import write_json
 from jaxmuscle._common.tables import frame
 from jaxmuscle._common.text import WIDTH
-from jaxmuscle.fits._result_text import ALIASES, RELATIVE
-from jaxmuscle.objective._covariance import DETERMINED, spelt
+from jaxmuscle.fits._result_text import ALIASES, RELATIVE, as_people_say
+from jaxmuscle.objective._covariance import DETERMINED
 
 if TYPE_CHECKING:
     import pandas
@@ -235,7 +235,7 @@ def _present(report: IdentifiabilityReport) -> list[str]:
 
 
 def _products(outlook: Outlook) -> str:
-    return ", ".join(f"{spelt(name)} (± {100 * error:.2g} %)" for name, error in outlook.products.items())
+    return ", ".join(f"{as_people_say(name)} (± {100 * error:.2g} %)" for name, error in outlook.products.items())
 
 
 def _next(report: IdentifiabilityReport) -> list[str]:
@@ -247,14 +247,21 @@ def _next(report: IdentifiabilityReport) -> list[str]:
     if (best := _most(report)) is not None:
         count = free - best.determined
         rest = f"{count} of {free} combinations would stay open" if count else "nothing would stay open"
-        label = f"{letter(report.designs.index(best))}, " if best in report.designs else ""
-        lines += _wrapped(f"most would be learnt from {label}{best.name}: {rest}", 4)
+        label = " and ".join(_letters(report, best))
+        lines += _wrapped(f"most would be learnt from {label}, {best.name}: {rest}", 4)
     for number, design in enumerate(report.designs):
         count = "" if design.failed else f" ({design.determined} of {free} combinations determined)"
         lines += _wrapped(f"{design}{count}", 8, f"    {letter(number):<2}  ")
     for pair in report.telling_pairs[:PAIRS_TOLD]:
-        lines += _wrapped(str(pair), 8, "    two ")
+        label = "+".join(_letters(report, pair))
+        lines += _wrapped(str(pair).replace(pair.name, "both together"), 8, f"    {label:<3} ")
     return lines + _wrapped(TIRING, 4)
+
+
+def _letters(report: IdentifiabilityReport, outlook: Outlook) -> list[str]:
+    """The letters of a design, or of the two of a pair."""
+    alone = [letter(i) for i, design in enumerate(report.designs) if design.name == outlook.name]
+    return alone or [letter(i) for i, d in enumerate(report.designs) if d.name in outlook.name.split(TOGETHER)]
 
 
 def _details(report: IdentifiabilityReport) -> list[str]:
@@ -272,9 +279,9 @@ def _table(report: IdentifiabilityReport) -> list[str]:
     names = told(report.present.quantities)
     possible = [(letter(i), d) for i, d in enumerate(report.designs) if d.failed is None]
     wide = max(24, *(1 + len(name) for name in names))
-    lines = _wrapped(f"standard errors in percent of the value. In brackets: not determined. >>: {FAR} % or more. prior: "
-                     "without data. now: with the data of the fit"
-                     + ". A, B, ...: with that measurement added" * bool(possible), 4, "  ")  # fmt: skip
+    lines = _wrapped("standard errors in percent of the value. In brackets: not determined, since about a third or more of "
+                     f"the error without data is left. >>: {FAR} % or more. prior: without data. now: with the data of the "
+                     "fit" + ". A, B, ...: with that measurement added" * bool(possible), 4, "  ")  # fmt: skip
     if report.mean_force is not None:
         lines += _wrapped("no mean force in newtons was given: forces, stiffness and damping are stated per newton of mean "
                           f"force (that of the fitted muscle is {report.mean_force:.3g} N)", 4, "  ")  # fmt: skip
