@@ -47,7 +47,7 @@ SUBJECTS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
             "response/_characteristics",
             "response/_scaling",
         ),
-        ("expected", "sensitivity", "static", "scaling", "control", "fit"),
+        ("expected", "sensitivity", "static", "scaling", "second_order", "control", "fit"),
     ),
     "spectra": (
         ("spectra/_welch", "spectra/_settings", "spectra/_measures", "spectra/_neighbours", "spectra/_mean"),

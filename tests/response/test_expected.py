@@ -404,8 +404,9 @@ def test_line_is_the_spectrum_of_a_noise_free_simulation(x64, name):
 
 
 @pytest.mark.slow
-def test_an_envelope_that_does_not_change_is_a_constant_one(x64):
-    task = references.quiet(jm.Isometric(5.0, 0.003))
+@pytest.mark.parametrize("c_w", [60.0, 6000.0])  # the slow one has not forgotten by 5 s where it started from
+def test_an_envelope_that_does_not_change_is_a_constant_one(x64, c_w):
+    task = references.quiet(jm.Isometric(5.0, 0.003, c_w=c_w))
     still = task.with_parts(harmonic=jm.Harmonic(0.003, 4.25, 0.7, Constant(0.5)))
     decayed = task.with_parts(harmonic=jm.Harmonic(0.003, 4.25, 0.7, Decay(0.5, 0.5)))
     # The low-pass starts at t = 0 in one and long before in the other: by 5 s that is forgotten, to rounding.
