@@ -496,7 +496,7 @@ def test_several_targets_have_a_folder_each(tmp_path, monkeypatch):
 def test_the_exit_code_says_whether_it_converged(result, code, word, tmp_path, monkeypatch):
     monkeypatch.setattr(jm, "fit", lambda *_, **__: result)
     (tmp_path / "fit.png").write_text("of an earlier fit")
-    outcome = run("fit", csv_file(tmp_path), "--out", tmp_path)
+    outcome = run("fit", csv_file(tmp_path, name="mine.csv"), "--out", tmp_path)
     assert outcome.exit_code == code
     assert outcome.stdout.startswith(word) and "made (user)" in outcome.stdout
     assert result.message in " ".join(outcome.stdout.split())
@@ -516,7 +516,8 @@ def test_options_reach_the_fit(tmp_path, monkeypatch):
     monkeypatch.setattr(jm, "fit", fake)
     fixed = ("--fix", "noise_K_z=0", "--fix", "noise_C_z = 0")
     many = ("--free", " c_w ,k_w,", "--starts", 3, "--seeds", 9, "--seed", 4, "--segments", 7, "--residual", "linear")
-    assert run("fit", csv_file(tmp_path), "--noise", "white", *fixed, *many, "--out", tmp_path).exit_code == 0
+    path = csv_file(tmp_path, name="mine.csv")
+    assert run("fit", path, "--noise", "white", *fixed, *many, "--out", tmp_path).exit_code == 0
     expected = {"free": ["c_w", "k_w"], "fix": {"noise_K_z": 0.0, "noise_C_z": 0.0}, "noise": "white", "starts": 3,
                 "method": "linear", "residual": "linear", "seeds": 9, "key": 4}  # fmt: skip
     assert {name: seen[name] for name in expected} == expected
@@ -684,6 +685,15 @@ def test_an_earlier_result_is_overwritten_by_force_only(case, file, tmp_path, mo
     assert (out / file).read_text() == "a result"  # until there is a new one
 
 
+@pytest.mark.parametrize("force", [(), ("--force",)])
+def test_a_spectrum_is_not_replaced_by_its_own_fit(tmp_path, force):
+    path = csv_file(tmp_path)  # spectrum.csv, as a fit calls what it writes
+    before = path.read_text()
+    refused = run("fit", path, "--segments", "9", "--out", tmp_path, *force)
+    assert refused.exit_code == 2 and f"the result would replace {path}" in refused.stderr
+    assert path.read_text() == before
+
+
 def test_a_fit_that_is_taken_up_is_no_obstacle(tmp_path, monkeypatch):
     made_result().save(tmp_path / "fit.json")
     monkeypatch.setattr(jm, "posterior", REACHED)
@@ -744,7 +754,7 @@ def test_the_spectrum_of_a_fit_is_compared(success, tmp_path, monkeypatch):
 def test_a_fit_is_replaced(tmp_path, monkeypatch):
     for seed, force in ((1, ()), (2, ("--force",))):
         monkeypatch.setattr(jm, "fit", lambda *_, seed=seed, **__: made_result(seed=seed))
-        assert run("fit", csv_file(tmp_path), "--out", tmp_path, *force).exit_code == 0
+        assert run("fit", csv_file(tmp_path, name="mine.csv"), "--out", tmp_path, *force).exit_code == 0
         assert jm.load_result(tmp_path / "fit.json").seed == seed
 
 

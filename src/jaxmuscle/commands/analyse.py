@@ -72,7 +72,7 @@ def analyse(
         if save_target is not None:
             absent(save_target, force=force)
         moved = perturbed(reading)
-        writable(output, "analysis.json", "response.csv" if moved else "spectrum.csv", force=force)
+        writable(output, "analysis.json", "response.csv" if moved else "spectrum.csv", force=force, reads=paths)
         if moved:
             if save_target is not None or mvc is not None:
                 raise ValueError(

@@ -124,10 +124,16 @@ def show(result: object, *, success: bool) -> None:
     out.print(plain("\n".join(rest)), highlight=False, soft_wrap=True)
 
 
-def writable(folder: Path, *results: str, force: bool = False) -> None:
-    """Fail before the long work, not after it: also where one of the results is there already, unless it may go."""
+def writable(folder: Path, *results: str, force: bool = False, reads: Iterable[str] = ()) -> None:
+    """Fail before the long work, not after it: also where one of the results is there already, unless it may go.
+
+    What the command itself `reads` is never replaced.
+    """
     if folder.exists() and not folder.is_dir():
         raise ValueError(f"--out {folder}: is a file; give the name of a folder")
+    for name in reads:
+        if Path(name).resolve() in [(folder / result).resolve() for result in results]:
+            raise ValueError(f"--out {folder}: the result would replace {name}, the input: give another folder")
     absent(*(folder / name for name in results), force=force)
     folder.mkdir(parents=True, exist_ok=True)
     if not os.access(folder, os.W_OK | os.X_OK):
