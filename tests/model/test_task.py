@@ -272,3 +272,14 @@ def test_what_cannot_be_a_part_of_a_task_or_its_call_is_named():
                          check=True)  # fmt: skip
     for (expression, message), said in zip(WRONG_PARTS.items(), ran.stdout.splitlines(), strict=True):
         assert message in said, expression
+
+
+@pytest.mark.parametrize(("kind", "name", "value"), [
+    (jm.Isometric, "m_w", 0.0), (jm.PrescribedForce, "m_z", 0.0), (jm.Isometric, "harmonic_frequency", 0.0),
+    (jm.Isometric, "noise_cutoff", 0.0), (jm.Isometric, "k_w", np.inf),
+    (jm.Isometric, "P_w", np.nan), (jm.Isometric, "x_z", np.inf), (jm.PrescribedForce, "F_ext", np.nan),
+])  # fmt: skip
+def test_a_constructor_refuses_what_replace_refuses(kind, name, value):
+    for make in (lambda: kind(**{name: value}), lambda: kind().replace(**{name: value})):
+        with pytest.raises(ValueError, match=f"{name} = {value}.*(must be positive|give a finite number)"):
+            make()

@@ -386,3 +386,10 @@ def test_a_trajectory_is_a_tree():
     doubled = eqx.tree_at(lambda r: r.output, run, 2 * run.output)
     assert float(doubled.output[-1]) == 2 * float(run.output[-1])
     assert bool(run.finite)
+
+
+def test_a_task_whose_equations_are_not_finite_is_refused():
+    broken = eqx.tree_at(lambda task: task.muscle.stiffness_w.k, jm.Isometric(), float("nan"))
+    for task in (broken, jm.Isometric(initial=(np.nan, 0.0))):
+        with pytest.raises(jm.errors.OperatingPointError, match="not finite where it starts: one of its numbers is NaN"):
+            jm.simulate(task, jax.random.key(0))

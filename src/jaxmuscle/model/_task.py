@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxmuscle._common.arrays import _is_scalar, is_concrete, require
+from jaxmuscle._common.arrays import _is_scalar, checked, is_concrete, require
 from jaxmuscle._common.cards import Card, Shown, in_columns
 from jaxmuscle._common.types import Scalar
 from jaxmuscle.spectra._settings import SpectrumSettings
@@ -38,6 +38,7 @@ from ._white_noise import BandLimitedNoise
 
 State = Float[Array, " states"]
 Task = TypeVar("Task", bound="AbstractTask")
+FINITE = "give a finite number"
 
 
 # What a field must be, and how one is written.
@@ -246,7 +247,8 @@ def fill(task: AbstractTask, fields: Mapping[str, Any], parameters: Mapping[str,
     if parameters:
         made = assigned(task, dict(parameters))
         for field in dataclasses.fields(task):
-            object.__setattr__(task, field.name, getattr(made, field.name))
+            part = getattr(made, field.name)  # its numbers are others than those that it was made with
+            object.__setattr__(task, field.name, checked(part) if isinstance(part, eqx.Module) else part)
 
 
 def require_task(task: Any, example: str) -> None:
@@ -260,6 +262,11 @@ def require_task(task: Any, example: str) -> None:
 def check_task(task: AbstractTask) -> None:
     if task.initial is not None and len(task.initial) != len(task.state_names):
         raise ValueError(f"initial has {len(task.initial)} entries, {type(task).__name__} needs {task.state_names}")
+    for name in ("P_w", "F_ext", "x_z"):
+        value = getattr(task, name) if name in {field.name for field in dataclasses.fields(task)} else 0.0
+        level = getattr(value, "level", value)
+        if _is_scalar(level):
+            require(jnp.isfinite(level) if not is_concrete(level) else np.isfinite(level), f"{name} = {level}: {FINITE}")
     check_own(task.muscle)
     _check_noise(task)
 

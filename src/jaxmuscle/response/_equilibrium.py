@@ -92,7 +92,11 @@ def fastest_rate(task: AbstractTask, duration: float) -> float:
     """Largest |eigenvalue| [1/s] at the start and under the inputs at mid-run and end, for the stability of a step."""
     with jax.enable_x64(True):
         _, jacobians = _linearisations(mechanics(task), np.array([duration / 2, duration]))
-        return float(max(np.abs(np.linalg.eigvals(j)).max() for j in np.asarray(jacobians) if np.all(np.isfinite(j))))
+        rates = [np.abs(np.linalg.eigvals(j)).max() for j in np.asarray(jacobians) if np.all(np.isfinite(j))]
+    if not rates:
+        raise OperatingPointError(f"the equations of this {type(task).__name__} are not finite where it starts: one of its "
+                                  "numbers is NaN or infinite, or a mass or a damping that it divides by is 0")  # fmt: skip
+    return float(max(rates))
 
 
 @kept

@@ -212,7 +212,8 @@ def require_finite(found: Trajectory, where: str = "") -> None:
     if bad.size:
         raise SimulationError(
             f"{len(bad)} seed(s) did not stay finite ({listed(bad)}) in {type(found.task).__name__}{where} at dt = "
-            f"{found.dt} s, {found.substeps} sub-step(s): lower the noise amplitude or dt. Parameters: {told(found.task)}"
+            f"{found.dt} s, {found.substeps} sub-step(s): lower dt or the noise amplitude, or leave substeps out. "
+            f"Parameters: {told(found.task)}"
         )
 
 
