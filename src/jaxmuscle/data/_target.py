@@ -46,7 +46,7 @@ class Target(Shown, eqx.Module):
     - `coefficient_of_variation`: standard deviation over mean of each trial, a fraction. It is that of the force as the
       spectrum sees it, low-passed as `settings` say. An acceleration has none, since its mean is zero.
     - `mvc_fraction`: mean level as a fraction of the maximal voluntary contraction.
-    - `mean`, `unit`: mean force or torque of each trial, and its unit. A mean force in a unit of force fixes the scale of force
+    - `mean`, `unit`: mean force or torque of each trial, and its unit. A mean in a unit of force fixes its scale
       in a fit.
     - `trial_power`: spectrum of each trial [unit²/Hz], shape `(trials, bins)`; `proportional_power` is their mean, weighted
       with `segments`.
