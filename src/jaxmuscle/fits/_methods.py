@@ -55,7 +55,7 @@ def methods_of_study(study: "StudyResult") -> str:
         f"All spectra were fitted with the same model ({RUNGS[study.rung]}){_choice(study)}.",
         f"The model describes {sum(judged)} of {len(judged)} spectra (p >= 0.01); the errors of the others were widened.",
         *_statistics(study),
-        _software(versions()),
+        f"{_software(versions())}, scipy {scipy.__version__}, Python {platform.python_version()}.",
     ]
     return " ".join(said)
 
@@ -79,7 +79,7 @@ def methods_of_fit(result: "FitResult") -> str | None:
         *_tried(result),
         f"The model {result.verdict}.",
         *_assumed(result),
-        _software(result.versions),
+        f"{_software(result.versions)}.",
     ]
     return " ".join(said)
 
@@ -136,8 +136,7 @@ def _low_pass(s: SpectrumSettings) -> str:
 
 
 def _software(numbers: dict[str, str]) -> str:
-    listed = ", ".join(f"{name} {number}" for name, number in numbers.items())
-    return f"Software: {listed}, scipy {scipy.__version__}, Python {platform.python_version()}."
+    return f"Software: {', '.join(f'{name} {number}' for name, number in numbers.items())}"
 
 
 def _window(s: SpectrumSettings) -> str:

@@ -203,8 +203,8 @@ def _counted(shown: Mapping[str, Estimate], every: Mapping[str, Estimate]) -> li
         if base == "tremor_share" and rhythm is not None:
             sentences.append(f"{name}: counted from {0.5 * rhythm.value:.2g} Hz on, half of the tremor's frequency")
         if base == "high_frequency_floor" and rhythm is not None:
-            sentences.append(f"{name}: holds the tremor, too (it is the mean from 8 to 12 Hz). Do not report it beside the "
-                             "tremor")  # fmt: skip
+            sentences.append(f"{name}: is the mean of the highest third of the bins, tremor included. Do not report it "
+                             "beside the tremor")  # fmt: skip
     return sentences
 
 

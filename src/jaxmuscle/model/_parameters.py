@@ -273,7 +273,7 @@ def _with_values(task: Any, values: dict[str, Any]) -> Any:
             )
             finite = np.isfinite(value) if is_concrete(value) else jax.numpy.isfinite(value)
             require(finite, f"{name} = {value}: give a finite number")
-            require(finite & (value >= row.lower) & (value <= row.upper), message)
+            require((value >= row.lower) & (value <= row.upper), message)
         path = _path(task, name)
         index = path[-1] if isinstance(path[-1], int) else None
         fields = path[:-1] if index is not None else path

@@ -38,7 +38,6 @@ from ._white_noise import BandLimitedNoise
 
 State = Float[Array, " states"]
 Task = TypeVar("Task", bound="AbstractTask")
-FINITE = "give a finite number"
 
 
 # What a field must be, and how one is written.
@@ -262,11 +261,11 @@ def require_task(task: Any, example: str) -> None:
 def check_task(task: AbstractTask) -> None:
     if task.initial is not None and len(task.initial) != len(task.state_names):
         raise ValueError(f"initial has {len(task.initial)} entries, {type(task).__name__} needs {task.state_names}")
-    for name in ("P_w", "F_ext", "x_z"):
-        value = getattr(task, name) if name in {field.name for field in dataclasses.fields(task)} else 0.0
-        level = getattr(value, "level", value)
-        if _is_scalar(level):
-            require(jnp.isfinite(level) if not is_concrete(level) else np.isfinite(level), f"{name} = {level}: {FINITE}")
+    for field in dataclasses.fields(task):
+        value = getattr(task, field.name)
+        level = getattr(value, "level", value)  # of an input that is a signal
+        if _is_scalar(level) and is_concrete(level):
+            require(np.isfinite(level), f"{field.name} = {level}: give a finite number")
     check_own(task.muscle)
     _check_noise(task)
 
