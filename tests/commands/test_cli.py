@@ -25,6 +25,7 @@ import jaxmuscle as jm
 from jaxmuscle import paper
 from jaxmuscle._common.arrays import as_arrays
 from jaxmuscle._common.environment import UNDIVIDED_LOOPS, keep_compiled_programs
+from jaxmuscle.commands.console import write_fit
 from jaxmuscle.commands.main import app
 from jaxmuscle.paper._claims import claims_json
 from jaxmuscle.paper._verdicts import Row
@@ -653,12 +654,11 @@ def test_the_paper_as_json(tmp_path, monkeypatch):
 
 # The long work of a command, its arguments, and what it would overwrite.
 OVERWRITES = {
-    "fit": ("fit", ["fit", "{csv}"], ["fit.json", "spectrum.csv"]),
+    "fit": ("fit", ["fit", "{csv}"], ["fit.json"]),
     "several": ("fit_cohort", ["fit", "{csv}", "vastus-lateralis-26mvc"],
                 ["cohort.csv", "spectrum/fit.json", "vastus-lateralis-26mvc/fit.json"]),
-    "simulate": ("ensemble", ["simulate", "zagrodny-slifkin"], ["trajectories.nc", "spectrum.csv"]),
-    "analyse": ("load_recording", ["analyse", "{csv}", "--save-target", "{out}/held.toml"],
-                ["analysis.json", "spectrum.csv", "held.toml"]),
+    "simulate": ("ensemble", ["simulate", "zagrodny-slifkin"], ["trajectories.nc"]),
+    "analyse": ("load_recording", ["analyse", "{csv}", "--save-target", "{out}/held.toml"], ["analysis.json", "held.toml"]),
     "posterior": ("fit", ["posterior", "{csv}", "--segments", "9"], ["fit.json", "posterior.nc", "posterior.json"]),
     "identifiability": ("fit", ["identifiability", "{csv}", "--segments", "9"], ["fit.json", "identifiability.json"]),
     "compare": ("compare_noise", ["compare", "{csv}"], ["compare.json"]),
@@ -692,6 +692,40 @@ def test_a_spectrum_is_not_replaced_by_its_own_fit(tmp_path, force):
     refused = run("fit", path, "--segments", "9", "--out", tmp_path, *force)
     assert refused.exit_code == 2 and f"the result would replace {path}" in refused.stderr
     assert path.read_text() == before
+
+
+def test_the_spectrum_of_another_command_is_kept(tmp_path, capsys):
+    """`fit`, `analyse` and `simulate` write different tables as spectrum.csv, by default into one folder."""
+    path, result = tmp_path / "spectrum.csv", made_result()
+    path.write_text("frequency_hz,power,proportional_power\n1,2,3\n")
+    (tmp_path / "spectrum-other.csv").write_text("still another\n")
+    write_fit(result, tmp_path)
+    assert " ".join(capsys.readouterr().err.replace(str(tmp_path), "").split()) == (
+        "notice: /spectrum.csv was there, from another command. It is kept as /spectrum-other-2.csv."
+    )
+    assert path.read_text().startswith("frequency_hz,target,fitted,")
+    assert (tmp_path / "spectrum-other.csv").read_text() == "still another\n"
+    assert (tmp_path / "spectrum-other-2.csv").read_text() == "frequency_hz,power,proportional_power\n1,2,3\n"
+    write_fit(result, tmp_path)  # its own is replaced
+    assert capsys.readouterr().err == "" and len(list(tmp_path.glob("spectrum*.csv"))) == 3
+
+
+@pytest.mark.slow
+def test_analyse_and_simulate_keep_the_spectrum_of_another_command(tmp_path):
+    tremor = tmp_path / "trial.csv"
+    time = np.arange(0, 20, 0.01)
+    force = 10 + 0.1 * np.sin(2 * np.pi * 8 * time) + 0.05 * np.random.default_rng(0).standard_normal(time.size)
+    tremor.write_text("time_s,force_N\n" + "".join(f"{t:.2f},{f:.6f}\n" for t, f in zip(time, force, strict=True)))
+    out = tmp_path / "out"
+    assert run("analyse", tremor, "--out", out).exit_code == 0
+    first = (out / "spectrum.csv").read_text()
+    simulated = run("simulate", "zagrodny-slifkin", "--seeds", 2, "--out", out)
+    assert simulated.exit_code == 0 and "It is kept as" in " ".join(simulated.stderr.split())
+    assert (out / "spectrum-other.csv").read_text() == first
+    second = (out / "spectrum.csv").read_text()
+    again = run("analyse", tremor, "--out", out, "--force")
+    assert again.exit_code == 0 and (out / "spectrum.csv").read_text() == first
+    assert (out / "spectrum-other-2.csv").read_text() == second
 
 
 def test_a_fit_that_is_taken_up_is_no_obstacle(tmp_path, monkeypatch):

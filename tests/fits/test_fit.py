@@ -755,8 +755,8 @@ def test_the_answer_comes_before_the_checks_and_an_interruption_in_them_keeps_it
     assert kept.success and kept.parameters == found.parameters
     assert not found.stretch[0].size and found.harmonic_p_value is None
     assert [n for n in kept.notices if n not in found.notices] == [
-        "not done: the check by new simulations, the test of other frequencies of the harmonic, and its p-value (--quick "
-        "and check_seeds=0 leave these out)"
+        "not done: the check by new simulations, the test of other frequencies of the harmonic, and its p-value. "
+        "--quick (check_seeds=0) leaves these out, and so does an interruption"
     ]
     # The checks change no estimate, but for the spectrum's own numbers, which they simulate.
     whole, quick = jm.fit(jm.Isometric(), simple_target(), **given), found

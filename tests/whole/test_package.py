@@ -114,6 +114,7 @@ def test_the_installed_command_fits_a_bundled_target(installed):
     assert "simulate.png" in run(command, "simulate", "zagrodny-slifkin", "--seeds", "2", cwd=installed, **users)
     assert (installed / "out" / "simulate.png").read_bytes().startswith(b"\x89PNG")
     printed = run(command, "fit", TARGET, "--starts", "20", "--out", "out", cwd=installed)
+    assert (installed / "out" / "spectrum-other.csv").exists()  # that of the simulation
     assert max(map(len, printed.splitlines())) <= 80
     assert TARGET in printed and "Written: out/fit.json" in printed
     result = jm.load_result(installed / "out" / "fit.json")

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from .console import absent, csv_text, err, out, plain, record, reporting, writable
+from .console import absent, csv_text, err, keep_other_spectrum, out, plain, record, reporting, writable
 from .options import READING, Force, Formats, Json, Output, Recordings, SpectrumName, Window, formats_of
 from .recordings import perturbed, read_perturbed, read_trials, reads_perturbed, unused, windows_of
 
@@ -72,7 +72,7 @@ def analyse(
         if save_target is not None:
             absent(save_target, force=force)
         moved = perturbed(reading)
-        writable(output, "analysis.json", "response.csv" if moved else "spectrum.csv", force=force, reads=paths)
+        writable(output, "analysis.json", *["response.csv"] * moved, force=force, reads=paths)
         if moved:
             if save_target is not None or mvc is not None:
                 raise ValueError(
@@ -112,6 +112,7 @@ def _write(
     if several and target is not None:
         found["dispersion"] = target.dispersion
     figures = write_figure(trials.plot(settings), folder, "analysis", formats)
+    keep_other_spectrum(folder, columns)
     write_text(folder / "spectrum.csv", csv_text(columns))
     write_json(folder / "analysis.json", found)
     whole = target is not None and (several or target.mvc_fraction is not None)  # prints its notices itself

@@ -3,6 +3,7 @@
 import contextlib
 import csv
 import io
+import itertools
 import json
 import os
 import re
@@ -124,6 +125,9 @@ def show(result: object, *, success: bool) -> None:
     out.print(plain("\n".join(rest)), highlight=False, soft_wrap=True)
 
 
+SPECTRUM = "spectrum.csv"  # of several commands
+
+
 def writable(folder: Path, *results: str, force: bool = False, reads: Iterable[str] = ()) -> None:
     """Fail before the long work, not after it: also where one of the results is there already, unless it may go.
 
@@ -132,7 +136,7 @@ def writable(folder: Path, *results: str, force: bool = False, reads: Iterable[s
     if folder.exists() and not folder.is_dir():
         raise ValueError(f"--out {folder}: is a file; give the name of a folder")
     for name in reads:
-        if Path(name).resolve() in [(folder / result).resolve() for result in results]:
+        if Path(name).resolve() in [(folder / result).resolve() for result in (*results, SPECTRUM)]:
             raise ValueError(f"--out {folder}: the result would replace {name}, the input: give another folder")
     absent(*(folder / name for name in results), force=force)
     folder.mkdir(parents=True, exist_ok=True)
@@ -145,6 +149,20 @@ def absent(*results: Path, force: bool) -> None:
     for path in results:
         if path.exists() and not force:
             raise ValueError(f"{path}: is there already; overwrite it with --force, or give another name")
+
+
+def keep_other_spectrum(folder: Path, columns: Iterable[str]) -> None:
+    """Give the spectrum.csv of another command, which has other columns, a name of its own, and say so."""
+    path = folder / SPECTRUM
+    with contextlib.suppress(FileNotFoundError):
+        with path.open(encoding="utf-8", errors="replace") as file:
+            if file.readline().strip() == ",".join(columns):
+                return
+        numbers = itertools.chain([""], (f"-{n}" for n in itertools.count(2)))
+        kept = next(name for n in numbers if not (name := folder / f"spectrum-other{n}.csv").exists())
+        path.rename(kept)
+        err.print(f"[yellow]notice:[/] {plain(path)} was there, from another command. It is kept as {plain(kept)}.",
+                  highlight=False)  # fmt: skip
 
 
 def csv_text(columns: dict[str, Any]) -> str:
@@ -214,6 +232,7 @@ def write_fit(result: "FitResult", folder: Path, formats: Iterable[str] = (), *,
 
     tables = fit_tables(result)
     earlier = [f"{table}-{name}.csv" for name in parts_of(folder / "fit.json") for table in ("spectrum", "stiffness")]
+    keep_other_spectrum(folder, next(iter(result.parts.values())).columns())
     remove(folder, *tables, *earlier, REPORT)
     remove_figures(folder, "fit")
     result.save(folder / "fit.json")

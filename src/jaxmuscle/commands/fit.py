@@ -249,7 +249,7 @@ def fit(
                                  "out --task and --quantity")  # fmt: skip
             options |= simulated | {"starts": starts or 32, "seeds": 0 if quick else seeds or 32}
             given = read_with_holds(target, hold, reading, window)
-            writable(output, "fit.json", "spectrum.csv", force=force, reads=[*target, *hold])
+            writable(output, "fit.json", force=force, reads=[*target, *hold])
             if rung is not None:
                 bases = {"moved": jm.PrescribedLength(), "held": jm.Isometric()}
                 options["tasks"] = {name: jm.on_rung(base, rung) for name, base in bases.items()}
@@ -270,7 +270,7 @@ def fit(
         else:
             unused(reading, "axis", window=window, what="recordings; this is a spectrum")
             aim = aim_of(target[0], task, read)
-        writable(output, "fit.json", "spectrum.csv", force=force, reads=target)
+        writable(output, "fit.json", force=force, reads=target)
         if rung is not None:
             aim = aim[0], jm.on_rung(aim[1], rung)
         converged = _fit_alone(*aim, output, options, [] if quick else formats_of(formats))

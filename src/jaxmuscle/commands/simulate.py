@@ -7,7 +7,7 @@ import typer
 
 import jaxmuscle as jm
 
-from .console import csv_text, out, record, reporting, task_of, writable
+from .console import csv_text, keep_other_spectrum, out, record, reporting, task_of, writable
 from .options import Force, Formats, Json, Observe, OtherTask, Output, Preset, Seed, formats_of
 
 if TYPE_CHECKING:
@@ -40,7 +40,7 @@ def simulate(
 
         keep_compiled_programs()
         model = task_of(preset, task, observe)
-        writable(output, "trajectories.nc", "spectrum.csv", force=force)
+        writable(output, "trajectories.nc", force=force)
         _simulate(model, seeds, seed, output, formats_of(formats))
 
 
@@ -61,6 +61,7 @@ def _simulate(model: "AbstractTask", seeds: int, seed: int, folder: Path, format
     low, high = np.quantile(np.asarray(spectra.proportional), [0.05, 0.95], axis=0)
     columns = {"frequency_hz": np.asarray(mean.frequency), "power": np.asarray(mean.power), "power_stderr": estimate.stderr,
                "proportional_power": np.asarray(mean.proportional), "quantile_05": low, "quantile_95": high}  # fmt: skip
+    keep_other_spectrum(folder, columns)
     write_text(folder / "spectrum.csv", csv_text(columns))
     figures = write_figure(jm.plot.simulation(runs), folder, "simulate", formats)
     files = ["trajectories.nc", "spectrum.csv", *figures]
