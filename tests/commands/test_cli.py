@@ -565,7 +565,7 @@ ENDS = {
     "converged": (lambda *_, **__: made_result(), 0, True),
     "not converged": (lambda *_, **__: failed_result(), 1, True),
     "exploded": (REACHED, 1, False),
-    "bad argument": (raising(ValueError("c_w = -1 N s^2/m^2 is outside [0, inf]")), 2, False),
+    "bad argument": (raising(ValueError("c_w = -1 N s^2/m^2 is outside its range, 0 or more")), 2, False),
     "no file": (raising(FileNotFoundError(2, "No such file or directory", "spectrum.csv")), 2, False),
     "interrupted": (raising(KeyboardInterrupt), 130, False),
     "interrupted with a result": (raising(STOPPED), 130, True),

@@ -322,7 +322,7 @@ BAD = {
     "constant": (text(X * 0 + 3), {"rate": 100}, "column 0: samples: constant at 3"),
     "all empty": (text(TIME, [""] * 40, header="time,force"), {"column": 1}, "holds no number, only gaps"),
     "long gap": (HOLE, {}, "gaps longer than max_gap=0.2 s at 0.100 s to 0.350 s; cut the recording there"),
-    "unit": (text(X), {"rate": 100, "units": "psi"}, "units='psi': unknown. Known: N, mN"),
+    "unit": (text(X), {"rate": 100, "units": "psi"}, "units='psi': known are N, mN"),
     "unit in header": (text(X, header="force (bar)"), {"rate": 100}, "unknown unit 'bar'; give `units`"),
     "axis": (POINT, {"axis": "w"}, "axis='w': choose one of x, y, z, principal"),
     "axis left out": (POINT, {"column": "finger"}, "column='finger' is a point of three columns; give axis"),
@@ -485,7 +485,7 @@ def test_command(tmp_path):
         (("--max-gap", "-1"), "--max-gap -1.0: give a time in s"),
         (("--skip-rows", "9999"), "holds no data"),
         (("--time", "clock"), "no time 'clock'"),
-        (("--units", "psi"), "--units 'psi': unknown. Known"),
+        (("--units", "psi"), "--units 'psi': known are"),
         (("--save-target", "held.csv"), "a target is saved as TOML"),
     ],
 )

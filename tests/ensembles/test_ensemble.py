@@ -222,7 +222,7 @@ def test_draws_of_any_shape_make_a_design():
         (lambda: jm.Sweep.of([]), "at least one task"),
         (lambda: jm.Sweep.design(TASK, {}), "columns of one length"),
         (lambda: jm.Sweep.design(TASK, {"k_w": [1e5, 2e5], "c_w": [1.0]}), "columns of one length"),
-        (lambda: jm.Sweep.design(TASK, {"k_w": [4e5, -1.0]}), "k_w = -1 at point 1 is outside"),
+        (lambda: jm.Sweep.design(TASK, {"k_w": [4e5, -1.0]}), "k_w = -1 at point 1 is outside its range, 0 or more"),
         (lambda: jm.Sweep.design(TASK, {"k_v": [4e5]}), "unknown parameter 'k_v'"),
         (lambda: jm.Sweep.of([TASK], names=["a", "b"]), "names has 2 entries for 1 tasks"),
         (lambda: jm.ensemble(TASK, KEY, seeds=0), "seeds = 0"),

@@ -12,6 +12,7 @@ import jaxmuscle as jm
 
 TARGET = jm.load_target("vastus-lateralis-26mvc")
 TASK = jm.task_for(TARGET)
+BOUNDS = {"harmonic_frequency": (3.0, 9.0)}
 ALONE = {"rungs": 0, "seeds": 0, "check_seeds": 0, "starts": 16}
 
 
@@ -47,6 +48,24 @@ def test_coordinates_and_parameters(problem):
     with pytest.raises(ValueError, match=r"harmonic_frequency = 99\.0 lies outside"):
         problem.theta({"harmonic_frequency": 99.0})
     assert str(problem).startswith("problem of vastus-lateralis-26mvc") and "<table>" in problem._repr_html_()
+
+
+@pytest.mark.slow
+def test_values_are_traced_on_their_way_to_theta_and_exact_beside_a_bound():
+    """A log density of parameters in their units, as `problem.theta` under `jit` and `grad` makes it."""
+    problem = jm.problem(TASK, TARGET, free=("k_w", "x_z", "harmonic_frequency"), bounds=BOUNDS)
+    start = {name: float(TASK[name]) for name in problem.names}
+    back = jax.jit(lambda values: problem.parameters(problem.theta(values)))
+    for values in ({"k_w": 3e5, "x_z": -0.003, "harmonic_frequency": 3.0001}, {"harmonic_frequency": 8.9999}):
+        given = start | values
+        assert problem.parameters(problem.theta(given)) == pytest.approx(given, rel=1e-9)
+        assert {name: float(value) for name, value in back(given).items()} == pytest.approx(given, rel=1e-9)
+    slopes = jax.jacrev(lambda values: problem.parameters(problem.theta(values)))(start)
+    for name in start:  # the way there and back is the identity
+        of_each = {other: float(slope) for other, slope in slopes[name].items()}
+        assert of_each == pytest.approx({n: float(n == name) for n in start}, abs=1e-9)
+    assert np.isnan(back(start | {"harmonic_frequency": 9.5})["harmonic_frequency"])
+    assert np.isfinite(back(start | {"harmonic_frequency": 9.5})["k_w"])
 
 
 @pytest.mark.slow

@@ -67,6 +67,18 @@ def test_a_muscle_of_ones_own_is_looked_at(method, wrong, message):
     assert jax.jit(lambda m: jm.Isometric(muscle=Own(m))["m_w"])(0.3) == pytest.approx(0.3)
 
 
+@pytest.mark.parametrize("wrong, message", [
+    (lambda self: 1.0, r"Law\.__call__\(q\) cannot be computed: TypeError"),
+    (lambda self, q: 100, r"Law\.__call__\(q\) returns int32 of shape \(\); it must return .* \[N/m or N s/m\]"),
+    (lambda self, q: jnp.ones(2) * q, r"Law\.__call__\(q\) returns float32 of shape \(2,\)"),
+    (lambda self, q: q if q > 0 else 0.0, r"decides .* by values.*jnp\.where"),
+])  # fmt: skip
+def test_a_law_of_ones_own_is_looked_at(wrong, message):
+    law = type("Law", (jm.model.AbstractLaw,), {"__call__": wrong})()
+    with pytest.raises(ValueError, match=message):
+        jm.Isometric(muscle=jm.Muscle(stiffness_w=law))
+
+
 @pytest.mark.parametrize("name", ["P_w", "noise", "noise_K_w", "harmonic_frequency", "activation_time"])
 def test_a_field_of_an_own_muscle_hides_nothing(name):
     named = type("Named", (Own,), {"__annotations__": {name: float}, name: 1.0})

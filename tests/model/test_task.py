@@ -238,7 +238,7 @@ def test_displacement_at_constant_force_oscillates_about_the_equilibrium(x64):
 WRONG_PARTS = {
     "jm.Isometric(noise=jm.PinkNoise)": "noise = the class PinkNoise: give an object",
     "jm.Isometric(noise=0.1)": "noise = 0.1: give an object, as jaxmuscle.PinkNoise",
-    "jm.Isometric(noise='purple')": "noise = 'purple': unknown. Known: white",
+    "jm.Isometric(noise='purple')": "noise = 'purple': known are white",
     "jm.Isometric().replace(noise='pink')": "use task.with_parts(noise=...)",
     "jm.Isometric(harmonic=3.0)": "harmonic = 3.0: give an object, as jaxmuscle.Harmonic",
     "jm.Isometric(activation=0.06)": "activation = 0.06: give an object, as jaxmuscle.Activation",
@@ -283,3 +283,31 @@ def test_a_constructor_refuses_what_replace_refuses(kind, name, value):
     for make in (lambda: kind(**{name: value}), lambda: kind().replace(**{name: value})):
         with pytest.raises(ValueError, match=f"{name} = {value}.*(must be positive|give a finite number)"):
             make()
+
+
+def test_a_class_of_tasks_says_what_it_gives():
+    class Own(jm.model.AbstractTask):
+        def vector_field(self, t, y, u):
+            return y
+
+        def output(self, t, y, u, du):
+            return y[0]
+
+    with pytest.raises(
+        ValueError, match=r"Own does not say its state_names, state_units, output_name, .* as class variables"
+    ):
+        Own()
+
+
+def test_several_tasks_in_one_are_refused_by_name():
+    """As `jax.vmap` returns them; inside it each is one."""
+    several = jax.vmap(lambda k: jm.Isometric().replace(k_w=k))(jnp.array([4e5, 5e5]))
+    for call in (lambda t: jm.simulate(t, KEY), lambda t: jm.ensemble(t, KEY, seeds=2), jm.expected_spectrum):
+        with pytest.raises(ValueError, match=r"task: these are several tasks in one, .* jaxmuscle\.Sweep"):
+            call(several)
+    assert jax.vmap(lambda t: t.replace(c_w=1.0)["k_w"])(several).tolist() == [4e5, 5e5]
+
+
+def test_a_tree_of_other_things_in_the_shape_of_a_task_prints():
+    shapes = jax.tree.map(np.shape, jm.Isometric())
+    assert repr(shapes).startswith("Isometric(") and repr(shapes.noise).startswith("BandLimitedNoise(amplitude=(4,)")

@@ -252,18 +252,28 @@ def test_what_does_not_stay_finite_is_named(x64):
 @pytest.mark.parametrize(
     "settings, message",
     [
-        ({"dt": 3e-3}, r"dt = 0.003 s does not divide the sampling interval 0.01 s: use one of 0.01, 0.005"),
-        ({"dt": 0.02}, "does not divide"),
+        (
+            {"dt": 3e-3},
+            r"dt = 0.003 s does not divide the sampling interval 0.01 s: use one of 0.0025, 0.002, 0.001, 0.0005 s",
+        ),
+        ({"dt": 0.02}, "too coarse"),
+        ({"dt": 0.0045}, "does not divide the sampling interval 0.01 s: use one of 0.00333333333, 0.0025, 0.002, 0.001 s"),
+        ({"dt": 0.01}, r"noise_cutoff = 50.0 Hz: use dt <= 0.25 / noise_cutoff = 0.005 s"),
         ({"dt": 0.0}, "dt = 0.0: give a finite number above 0"),
         ({"duration": -1.0}, "duration = -1.0: give a finite number above 0"),
         ({"duration": 1.005}, "duration = 1.005 s is not a whole number of sampling intervals"),
         ({"sampling": "mean"}, "sampling = 'mean' must be one of instant, average, filtered"),
-        ({"sampling": "filtered", "dt": 0.01}, "dt = 0.01 s is a whole sampling interval, .*: use half of it or less"),
     ],
 )
 def test_impossible_grids_are_refused(settings, message):
     with pytest.raises(ValueError, match=message):
         jm.simulate(jm.Isometric(), KEY, **settings)
+
+
+def test_a_step_that_leaves_nothing_to_be_low_passed_is_refused():
+    slow = jm.Isometric(noise_cutoff=20.0)
+    with pytest.raises(ValueError, match=r"dt = 0\.01 s is a whole sampling interval, .*: use half of it or less"):
+        jm.simulate(slow, KEY, sampling="filtered", dt=0.01)
 
 
 def test_a_traced_duration_says_that_it_is_traced():
@@ -393,3 +403,20 @@ def test_a_task_whose_equations_are_not_finite_is_refused():
     for task in (broken, jm.Isometric(initial=(np.nan, 0.0))):
         with pytest.raises(jm.errors.OperatingPointError, match="not finite where it starts: one of its numbers is NaN"):
             jm.simulate(task, jax.random.key(0))
+
+
+@pytest.mark.slow
+def test_the_runs_of_an_ensemble_are_taken_by_their_place():
+    runs = jm.ensemble(jm.Isometric(), KEY, seeds=3)
+    assert len(runs) == 3 and [int(run.seeds) for run in runs] == [0, 1, 2]
+    for place in (0, 2, -1):
+        for name in ("states", "output", "seeds", "linear"):
+            np.testing.assert_array_equal(getattr(runs[place], name), getattr(runs, name)[place])
+    np.testing.assert_array_equal(runs[1].output, jm.simulate(jm.Isometric(), KEY, seed=1).output)
+    np.testing.assert_array_equal(runs[1:].output, runs.output[1:])
+    with pytest.raises(IndexError, match=r"\[3\]: there are 3 seeds, 0 to 2"):
+        runs[3]
+    with pytest.raises(TypeError, match="this trajectory is one run"):
+        runs[0][0]
+    mapped = jax.vmap(lambda k: jm.simulate(jm.Isometric(), k))(jax.random.split(KEY, 2))
+    assert mapped[1].task["m_w"] == 0.5 and mapped[1].output.shape == runs[0].output.shape

@@ -26,8 +26,8 @@ ELSEWHERE = {
 BELOW = {"docs/gallery.md"}  # its program is read instead
 RUN_HERE = {
     "README.md", "docs/coming-from-diffrax.md", "docs/coming-from-matlab.md", "docs/ensembles.md", "docs/fit-a-csv.md",
-    "docs/fitting.md", "docs/force.md", "docs/how-to/own-optimiser.md", "docs/how-to/report-results.md",
-    "docs/identifiability.md", "docs/index.md", "docs/python.md", "docs/recordings.md",
+    "docs/fitting.md", "docs/force.md", "docs/how-to/own-noise.md", "docs/how-to/own-optimiser.md",
+    "docs/how-to/report-results.md", "docs/identifiability.md", "docs/index.md", "docs/python.md", "docs/recordings.md",
     "docs/reference/figures.md", "docs/scaling.md", "docs/tutorial.md", "docs/uncertainty.md",
 }  # fmt: skip
 FEWER_SEEDS = {"seeds=100_000": "seeds=1_000"}
@@ -229,6 +229,13 @@ def test_own_optimisers():
     finally:
         jax.config.update("jax_enable_x64", False)
     assert names["found"].success and names["result"].success and len(names["draws"]) == 20
+
+
+@pytest.mark.slow
+def test_own_noise():
+    names = pages.run("docs/how-to/own-noise.md")
+    assert names["result"].success and 0.05 < names["result"].task["noise_corner"] < 20
+    assert np.max(np.abs(names["estimate"].nonlinearity)) < 0.05 and np.isfinite(names["slope"]).all()
 
 
 @pytest.mark.slow

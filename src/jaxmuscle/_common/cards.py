@@ -1,14 +1,21 @@
 """What an object says of itself: as text where it is printed, as a table in a notebook."""
 
 import abc
+import dataclasses
 import html
 import textwrap
 from collections.abc import Iterable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import equinox as eqx
+import jax
+import numpy as np
+
+from .arrays import is_concrete
 from .text import WIDTH, folded
 
 LEAST = 24  # columns that are left to words
+FEW = 10  # numbers that are shown each
 
 
 class Card(NamedTuple):
@@ -57,6 +64,20 @@ class Shown(abc.ABC):
 
     def _repr_html_(self) -> str:
         return self._card()._repr_html_()
+
+
+class Spelled:
+    """Shows itself as the call that makes it, with all fields and their numbers."""
+
+    def __repr__(self) -> str:
+        fields = ", ".join(f"{field.name}={_spelled(getattr(self, field.name))}" for field in dataclasses.fields(self))  # pyright: ignore[reportArgumentType]
+        return f"{type(self).__name__}({fields})"
+
+
+def _spelled(value: Any) -> str:
+    if isinstance(value, float | np.ndarray | np.generic | jax.Array) and is_concrete(value) and np.size(value) <= FEW:
+        return repr(np.asarray(value).tolist())
+    return repr(value) if isinstance(value, Spelled | tuple) else eqx.tree_pformat(value)
 
 
 class Printed(Shown):

@@ -38,7 +38,7 @@ def write_figure(
     wanted = list(dict.fromkeys(formats))
     unknown = [kind for kind in wanted if kind not in FORMATS]
     if unknown:
-        raise ValueError(f"formats: {unknown[0]!r} is no format of a figure. {choices(unknown[0], FORMATS)}")
+        raise ValueError(f"formats: {unknown[0]!r} is no format of a figure: {choices(unknown[0], FORMATS)}")
     for kind in wanted:
         with replacing(folder / f"{name}.{kind}") as temporary, matplotlib.rc_context(SETTINGS):
             if kind == "png" and pixels is not None:

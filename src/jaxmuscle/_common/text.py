@@ -49,8 +49,7 @@ def choices(word: object, options: Iterable[str]) -> str:
     options = list(options)
     plain = {option.lower(): option for option in options}
     near = difflib.get_close_matches(str(word).lower(), plain, n=1, cutoff=0.4)
-    hint = f"did you mean {plain[near[0]]!r}?" if near else "unknown."
-    return f"{hint} Known: {', '.join(options)}"
+    return f"did you mean {plain[near[0]]!r}? Known: {', '.join(options)}" if near else f"known are {', '.join(options)}"
 
 
 def listed(items: Sequence | np.ndarray) -> str:

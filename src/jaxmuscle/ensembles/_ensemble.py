@@ -128,9 +128,10 @@ def ensemble(  # pyright: ignore[reportInconsistentOverload]
     is left out, or NaN, and listed in `failed`. `ValueError` for a store that exists already or was made with other
     settings; `OSError` for one that cannot be written; `ProcessLostError` if another process died.
     """
-    if not isinstance(task, AbstractTask | Sweep):
+    if not isinstance(task, Sweep):
         for each in task if isinstance(task, list | tuple) else [task]:
             require_task(each, "ensemble(task, key, seeds=...)")
+    if not isinstance(task, AbstractTask | Sweep):
         task = Sweep.of(task)
     if store is not None and not isinstance(store, str | Path):
         raise ValueError(f"store = {store!r}: give a path or a URL")

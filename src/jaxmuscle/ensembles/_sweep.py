@@ -85,7 +85,8 @@ class Sweep(Shown, eqx.Module):
             low, high = (-np.inf, np.inf) if row is None else (row.lower, row.upper)
             bad = np.flatnonzero(~((column >= low) & (column <= high) & np.isfinite(column)))
             if bad.size:
-                raise ValueError(f"{name} = {column[bad[0]]:g} at point {bad[0]} is outside [{low}, {high}]")
+                span = "a finite number" if row is None else row.range
+                raise ValueError(f"{name} = {column[bad[0]]:g} at point {bad[0]} is outside its range, {span}")
         with jax.enable_x64(True):
             put = jax.jit(jax.vmap(lambda row: as_arrays(task).replace(**row)))
             made = Sweep(jax.tree.map(np.asarray, put(columns)), columns)

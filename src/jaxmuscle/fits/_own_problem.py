@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxmuscle._common.arrays import all_concrete, require
 from jaxmuscle._common.cards import Card, Shown
 from jaxmuscle._common.text import choices
 from jaxmuscle._common.types import Scalar
@@ -16,6 +17,7 @@ from jaxmuscle.data._as_target import as_target
 from jaxmuscle.model._noise import AbstractNoise
 from jaxmuscle.model._noises import with_noise
 from jaxmuscle.model._parameters import PARAMETERS, proper_values
+from jaxmuscle.model._task import require_task
 from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.objective._arguments import FitOptions, at_mean, planned
 from jaxmuscle.objective._consequences import expand
@@ -62,23 +64,25 @@ class Problem(Shown):
         """The parameters by name, in their units."""
         return self.objective.coordinates.values(self._scaled(theta))
 
-    def theta(self, parameters: Mapping[str, float]) -> Float[np.ndarray, " free"]:
+    def theta(self, parameters: Mapping[str, Scalar]) -> Theta:
         """θ of parameters by name, in their units; those not named are at their start. The inverse of `parameters`.
+
+        JAX may trace the values; a traced value outside the bounds of the fit is NaN.
 
         Raises `ValueError` for a name that is not free and for a value outside the bounds of the fit.
         """
-        c = self.fit_problem.coordinates
-        values = c.centre.copy()
-        for name, value in proper_values(parameters).items():
-            if name not in self.names:
-                raise ValueError(f"{name!r} is not free in this problem: {choices(name, self.names)}")
-            values[self.names.index(name)] = value
-        with np.errstate(invalid="ignore", divide="ignore"):
-            found = np.where(c.positive, np.log(values / c.centre), values - c.centre) / c.sd
-        for name, value, here, low, high in zip(self.names, values, found, c.low, c.high, strict=True):
+        c, given = self.fit_problem.coordinates, proper_values(parameters)
+        if unknown := [name for name in given if name not in self.names]:
+            raise ValueError(f"{unknown[0]!r} is not free in this problem: {choices(unknown[0], self.names)}")
+        numbers = [given.get(name, start) for name, start in zip(self.names, c.centre, strict=True)]
+        if not all_concrete(numbers):
+            found = c.at(jnp.stack(jax.tree.map(jnp.asarray, numbers)))
+            return c.from_theta(jnp.where((c.low < found) & (found < c.high), found, jnp.nan), 0.0)
+        found = c.at(np.asarray(numbers, dtype=float))
+        for name, value, here, low, high in zip(self.names, numbers, found, c.low, c.high, strict=True):
             if not low < here < high:
                 raise ValueError(f"{name} = {value} lies outside what this problem can reach: give one inside its bounds")
-        return c.from_theta(found)
+        return c.from_theta(found, 0.0)
 
     def task(self, theta: Theta) -> AbstractTask:
         """The task with these parameters."""
@@ -189,6 +193,12 @@ def problem(
 
     **Returns:** a `Problem`. **Raises:** `ValueError` as `fit` does.
     """
+    require_task(task, "problem(task, target)")
+    require(
+        all_concrete((task, noise)),
+        "task: JAX is tracing it (inside jit, grad or vmap), but a problem is made from numbers. Make it outside, and give "
+        "its functions what changes: problem.log_density(problem.theta({'k_w': ...}))",
+    )
     target = as_target(target)
     with jax.enable_x64(True):
         options = FitOptions(free=free, fix=fix, residual=residual, bounds=bounds, priors=priors,

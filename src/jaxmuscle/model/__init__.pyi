@@ -8,6 +8,9 @@ from ._muscle import QuadraticDamping as QuadraticDamping
 from ._muscle import QuadraticStiffness as QuadraticStiffness
 from ._noise import AbstractNoise as AbstractNoise
 from ._noise import NoiseSum as NoiseSum
+from ._noise import Recursion as Recursion
+from ._noise import ShapingFilter as ShapingFilter
+from ._noise import as_amplitude as as_amplitude
 from ._parameters import PARAMETERS as PARAMETERS
 from ._parameters import Parameter as Parameter
 from ._partition import partition as partition

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxmuscle._common.arrays import require
+from jaxmuscle._common.cards import Spelled
 from jaxmuscle._common.quadrature import NODES, WEIGHTS
 from jaxmuscle._common.types import Scalar
 
@@ -33,7 +34,7 @@ class Transition(NamedTuple):
                 self.fade * ((1 - x) * b - x * a) + self.early_slope * n + self.late_slope * m)  # fmt: skip
 
 
-class Activation(eqx.Module):
+class Activation(Spelled, eqx.Module):
     """`H_a(s) = 1 / (1 + s T)²`, impulse response `t/T² exp(-t/T)`: a twitch with the contraction time T.
 
     It stands between the nervous drive and the active tissue: perturbations of K_w, C_w and P_w, noise and harmonic alike,

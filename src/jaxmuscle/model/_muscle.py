@@ -8,13 +8,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxmuscle._common.arrays import is_concrete, require
+from jaxmuscle._common.arrays import require
+from jaxmuscle._common.cards import Spelled
 from jaxmuscle._common.types import Scalar
 
-from ._parameters import default, muscle_paths
+from ._parameters import default
 
 
-class AbstractLaw(eqx.Module):
+class AbstractLaw(Spelled, eqx.Module):
     """A material coefficient as a function of one kinematic quantity.
 
     Write one class with a `__call__` to replace the paper's quadratic laws, an exponential toe region of a tendon say.
@@ -63,7 +64,7 @@ class QuadraticDamping(AbstractLaw):
 Perturbation = Float[Array, " inputs"]
 
 
-class AbstractMuscle(eqx.Module):
+class AbstractMuscle(Spelled, eqx.Module):
     """A deterministic muscle that takes the perturbations `u = (ΔK_w, ΔK_z, ΔC_w, ΔC_z, ΔP_w / P_w)` as an input.
 
     Active tissue `w` (inner) and passive tissue `z` (at the insertion) move by
@@ -100,75 +101,6 @@ class AbstractMuscle(eqx.Module):
     def contraction_velocity(self, x_w: Scalar, x_z: Scalar, v_z: Scalar, force: Scalar, u: Perturbation) -> Scalar:
         """Velocity v_w [m/s] at which `passive_force` equals `force`; only `PrescribedMotion` asks for it."""
         raise NotImplementedError(f"{type(self).__name__} has no method contraction_velocity")
-
-
-# What is asked of a muscle: the arguments of a method, in words, the shape of what it returns, and what that is.
-ASKED: dict[str, tuple[tuple[str, ...], tuple[int, ...], str]] = {
-    "base": ((), (4,), "an array of four floating-point numbers, K_w0, K_z0 [N/m], C_w0, C_z0 [N s/m]"),
-    "drive": (("force", "u"), (), "one floating-point number [N]"),
-    "active_force": (("x_w", "v_w", "u"), (), "one floating-point number [N]"),
-    "passive_force": (("x_w", "v_w", "x_z", "v_z", "u"), (), "one floating-point number [N]"),
-    "contraction_velocity": (("x_w", "x_z", "v_z", "force", "u"), (), "one floating-point number [m/s]"),
-}
-TAKEN = ("P_w", "F_ext", "x_z", "activation_time", "muscle", "noise", "harmonic", "settings", "initial", "observe")
-TAKEN_BEFORE = ("noise_", "harmonic_", "resonance_")
-_SEEN: set[type] = set()
-
-
-def check_own(muscle: AbstractMuscle) -> None:
-    """Refuse a muscle whose fields hide other parameters of a task, or whose methods do not return what is asked.
-
-    **Raises:** `ValueError` that names the method, what it returns and what is asked. A class is looked at once.
-    """
-    kind = type(muscle)
-    if kind is Muscle or kind in _SEEN:
-        return
-    for name in muscle_paths(muscle):
-        require(name not in TAKEN and not name.startswith(TAKEN_BEFORE), f"{kind.__name__}.{name}: a task has something of "
-                "this name itself. Give the field of your muscle another name")  # fmt: skip
-    for mass in (muscle.m_w, muscle.m_z):
-        require(jnp.ndim(mass) == 0, f"{kind.__name__}: a mass of shape {jnp.shape(mass)}; m_w and m_z are one number each")
-    for method, (arguments, shape, what) in ASKED.items():
-        _check_method(muscle, method, arguments, shape, what)
-    if all(is_concrete(leaf) for leaf in jax.tree.leaves(muscle)):
-        _check_inverse(muscle)
-        _SEEN.add(kind)
-
-
-def _check_method(muscle: AbstractMuscle, method: str, arguments: tuple[str, ...], shape: tuple[int, ...], what: str):
-    """Without computing anything: JAX follows the method with numbers of no value."""
-    call = f"{type(muscle).__name__}.{method}({', '.join(arguments)})"
-    try:
-        found = jax.eval_shape(getattr(muscle, method), *(jnp.zeros(5 if name == "u" else ()) for name in arguments))
-    except NotImplementedError:  # of contraction_velocity, for which few ask
-        return
-    except (jax.errors.ConcretizationTypeError, jax.errors.TracerArrayConversionError) as error:
-        raise ValueError(f"{call} decides or computes by values, with `if`, float() or numpy. While it is compiled they are "
-                         "not known: use jax.numpy, and jnp.where(condition, a, b) instead of `if`") from error  # fmt: skip
-    except Exception as error:
-        raise ValueError(f"{call} cannot be computed: {type(error).__name__}: {error}. A task calls it with one number for "
-                         "each argument, and the five perturbations u: see docs/own-muscle.md") from error  # fmt: skip
-    if not isinstance(found, jax.ShapeDtypeStruct):
-        raise ValueError(f"{call} returns a {type(found).__name__}; it must return {what}")
-    if found.shape != shape or not jnp.issubdtype(found.dtype, jnp.floating):
-        raise ValueError(f"{call} returns {found.dtype} of shape {found.shape}; it must return {what}")
-
-
-def _check_inverse(muscle: AbstractMuscle) -> None:
-    """`contraction_velocity` must be where `passive_force` is as given: at one point in numbers."""
-    x_w, v_w, x_z, v_z = 1e-3, 0.02, 5e-4, 0.01
-    with jax.enable_x64(True):
-        here, moving, there, speed, still = *(jnp.asarray(value) for value in (x_w, v_w, x_z, v_z)), jnp.zeros(5)
-        force = muscle.passive_force(here, moving, there, speed, still)
-        try:
-            found = float(muscle.contraction_velocity(here, there, speed, force, still))
-        except NotImplementedError:
-            return
-    if not abs(found - v_w) <= 0.01 * v_w:
-        where = f"x_w = {x_w} m, x_z = {x_z} m, v_z = {v_z} m/s"
-        raise ValueError(f"{type(muscle).__name__}.contraction_velocity is not the inverse of passive_force: at {where} and "
-                         f"v_w = {v_w} m/s passive_force is {float(force):.4g} N, but for that force contraction_velocity "
-                         f"gives {found:.4g} m/s")  # fmt: skip
 
 
 def _stiffness(k: str, x_ref: str) -> QuadraticStiffness:

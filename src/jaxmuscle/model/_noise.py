@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from jaxmuscle._common.arrays import require
+from jaxmuscle._common.cards import Spelled
 from jaxmuscle._common.types import Scalar
 
 from ._parameters import CHANNELS, INPUTS, default
@@ -82,7 +83,7 @@ class ShapingFilter(eqx.Module):
     L: Float[Array, " inputs"]
 
 
-class AbstractNoise(eqx.Module):
+class AbstractNoise(Spelled, eqx.Module):
     """Noise on the coefficients K_w, K_z, C_w, C_z and the drive P_w, an independent channel each (`shared`: one for all).
 
     `amplitude` is one number for the four coefficients; or four; or five, the last for the drive; or a mapping by name. It
@@ -181,7 +182,14 @@ ACTED_ON = {1: (len(CHANNELS),), len(CHANNELS): tuple(range(len(CHANNELS))), len
 
 
 def as_amplitude(value: Amplitude) -> Scalar:
-    """The paper's structure by default; a number for all coefficients, one each in order, or a mapping by name."""
+    """An amplitude in any form as what a noise keeps: the converter of the field `amplitude`, also of a noise of your own.
+
+        amplitude: float | dict = eqx.field(converter=jm.model.as_amplitude, default=None)
+
+    **Arguments:** `value`, one number for the four coefficients (kept as it is); a list of four, or of five with the drive; a
+    dictionary by `K_w`, `K_z`, `C_w`, `C_z`, `P_w`, of which those left out are 0; or None, the defaults of the parameter
+    table. **Returns:** an array, or the number. **Raises:** `ValueError` for an unknown name or another number of entries.
+    """
     if value is None:
         return np.array([default(f"noise_{c}") for c in CHANNELS])
     if isinstance(value, dict):

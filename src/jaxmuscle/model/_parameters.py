@@ -73,6 +73,14 @@ class Parameter(NamedTuple):
     fit_lower: float = 0.0
     fit_upper: float = math.inf
 
+    @property
+    def range(self) -> str:
+        """What is physically possible, in words."""
+        low, high = (None if math.isinf(bound) else f"{bound:g}" for bound in (self.lower, self.upper))
+        if low is None:
+            return "any number" if high is None else f"{high} or less"
+        return f"{low} or more" if high is None else f"{low} to {high}"
+
 
 PARAMETERS: dict[str, Parameter] = {
     row.name: row
@@ -268,9 +276,8 @@ def _with_values(task: Any, values: dict[str, Any]) -> Any:
             raise ValueError(f"{name} has the shape {np.shape(value)}: a parameter is one number. For several tasks use "
                              f"jaxmuscle.Sweep.grid(task, {name}=[...]), or jax.vmap")  # fmt: skip
         if row is not None:
-            message = (
-                f"{name} = {value}{f' {row.unit}' * (row.unit != '1')} is outside [{row.lower}, {row.upper}]: {row.meaning}"
-            )
+            unit = "" if row.unit == "1" else f" {row.unit}"
+            message = f"{name} = {value}{unit} is outside its range, {row.range}: {row.meaning}"
             finite = np.isfinite(value) if is_concrete(value) else jax.numpy.isfinite(value)
             require(finite, f"{name} = {value}: give a finite number")
             require((value >= row.lower) & (value <= row.upper), message)

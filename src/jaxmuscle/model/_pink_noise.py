@@ -128,5 +128,6 @@ class PinkNoise(AbstractNoise):
     def check_step(self, dt: float) -> None:
         require(
             self.f_high * dt <= 0.25,
-            f"dt = {dt} s is too coarse for pink noise up to f_high = {self.f_high} Hz: use dt <= 0.25 / f_high",
+            f"dt = {dt} s is too coarse for pink noise up to f_high = {self.f_high} Hz: use dt <= 0.25 / f_high"
+            f" = {0.25 / self.f_high} s",
         )

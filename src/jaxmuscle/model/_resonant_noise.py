@@ -90,5 +90,5 @@ class ResonantNoise(AbstractNoise):
         require(
             (self.frequency + self.width) * dt <= 0.1,
             f"dt = {dt} s is too coarse for a resonance at {self.frequency} Hz, {self.width} Hz wide: use "
-            "dt <= 0.1 / (resonance_frequency + resonance_width)",
+            f"dt <= 0.1 / (resonance_frequency + resonance_width) = {0.1 / (self.frequency + self.width)} s",
         )

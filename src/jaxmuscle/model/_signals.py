@@ -13,12 +13,13 @@ import scipy
 from jaxtyping import Array, Float
 
 from jaxmuscle._common.arrays import require
+from jaxmuscle._common.cards import Spelled
 from jaxmuscle._common.types import Scalar
 
 from ._parameters import default
 
 
-class AbstractSignal(eqx.Module):
+class AbstractSignal(Spelled, eqx.Module):
     """A scalar function of time [s] with a `level` (its held value, the parameter a fit can move).
 
     `smoothness` counts its continuous derivatives.
@@ -42,7 +43,7 @@ class Constant(AbstractSignal):
         return self.level + 0.0 * t
 
 
-class Harmonic(eqx.Module):
+class Harmonic(Spelled, eqx.Module):
     """`S(t) = amplitude envelope(t) sin(2π frequency t + phase)`, a fraction of the base stiffness K_j0 of both tissues.
 
     **Arguments:** `amplitude` >= 0 (fraction of K_j0), `frequency` [Hz] > 0, `phase` [rad], `envelope` (a signal with

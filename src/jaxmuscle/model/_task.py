@@ -17,9 +17,10 @@ from jaxmuscle._common.types import Scalar
 from jaxmuscle.spectra._settings import SpectrumSettings
 
 from ._activation import ACTIVE, Activation
-from ._muscle import AbstractMuscle, Muscle, Perturbation, check_own
+from ._muscle import AbstractMuscle, Muscle, Perturbation
 from ._noise import AbstractNoise, NoiseSum
 from ._noise_names import named_noise
+from ._own_parts import check_muscle, check_noise
 from ._parameters import (
     BASE,
     CHANNELS,
@@ -188,7 +189,8 @@ class AbstractTask(Shown, eqx.Module):
         return amplitude * (base if len(noise.acts_on) == len(base) else jnp.append(base, jnp.ones((), base.dtype)))
 
     def _card(self) -> Card:
-        if not (isinstance(self.noise, AbstractNoise) and isinstance(self.muscle, AbstractMuscle)):
+        parts = isinstance(self.noise, AbstractNoise) and isinstance(self.muscle, AbstractMuscle)
+        if not parts or isinstance(self.noise.amplitude, tuple):
             return Card(eqx.tree_pformat(self))  # a tree that JAX or Equinox took apart
         free, noises = usually_free(self), " + ".join(type(part).__name__ for part in self.noise.components)
         facts = [f"noise     {noises}", f"spectrum  {self.settings.name or 'settings of its own'}"]
@@ -256,9 +258,26 @@ def require_task(task: Any, example: str) -> None:
         isinstance(task, AbstractTask),
         f"task: this is of type {type(task).__name__}; give a task first, as jaxmuscle.Isometric(): {example}",
     )
+    if is_batched(task):
+        raise ValueError(
+            "task: these are several tasks in one, as jax.vmap makes them: each number has an axis in front. Give one task: "
+            "inside jax.vmap it is one. For simulations of several, give jaxmuscle.ensemble a jaxmuscle.Sweep"
+        )
+
+
+def is_batched(task: AbstractTask) -> bool:
+    """Whether a task's numbers have an axis in front, as `jax.vmap` returns them."""
+    return any(np.ndim(noise.amplitude) > 1 for noise in task.noise.components)
+
+
+# What a class of tasks says of itself.
+SAID = ("state_names", "state_units", "output_name", "output_unit", "smoothness_needed")
 
 
 def check_task(task: AbstractTask) -> None:
+    if missing := [name for name in SAID if not hasattr(type(task), name)]:
+        raise ValueError(f"{type(task).__name__} does not say its {', '.join(missing)}: a task of your own needs "
+                         f"{', '.join(SAID)} as class variables, as jaxmuscle.Isometric has them")  # fmt: skip
     if task.initial is not None and len(task.initial) != len(task.state_names):
         raise ValueError(f"initial has {len(task.initial)} entries, {type(task).__name__} needs {task.state_names}")
     for field in dataclasses.fields(task):
@@ -266,7 +285,9 @@ def check_task(task: AbstractTask) -> None:
         level = getattr(value, "level", value)  # of an input that is a signal
         if _is_scalar(level) and is_concrete(level):
             require(np.isfinite(level), f"{field.name} = {level}: give a finite number")
-    check_own(task.muscle)
+    check_muscle(task.muscle)
+    for noise in task.noise.components:
+        check_noise(noise)
     _check_noise(task)
 
 

@@ -93,7 +93,8 @@ class BandLimitedNoise(AbstractNoise):
     def check_step(self, dt: float) -> None:
         require(
             self.cutoff * dt <= 0.25,
-            f"dt = {dt} s is too coarse for noise_cutoff = {self.cutoff} Hz: use dt <= 0.25 / noise_cutoff",
+            f"dt = {dt} s is too coarse for noise_cutoff = {self.cutoff} Hz: use dt <= 0.25 / noise_cutoff"
+            f" = {0.25 / self.cutoff} s",
         )
 
 

@@ -68,12 +68,13 @@ class Coordinates(eqx.Module):
         """NumPy for numbers, which needs no compilation, else JAX; with its sigmoid."""
         return (np, expit) if isinstance(given, np.ndarray) and isinstance(self.low, np.ndarray) else (jnp, jax.nn.sigmoid)
 
-    def from_theta(self, theta: Float[np.ndarray, "*batch free"]) -> Float[np.ndarray, "*batch free"]:
-        """The reverse of `theta`, clipped into the bounds."""
-        bounded = np.isfinite(self.low)
-        low, high = np.where(bounded, self.low, 0.0), np.where(bounded, self.high, 1.0)
-        share = np.clip((theta - low) / (high - low), 1e-3, 1 - 1e-3)
-        return np.where(bounded, np.log(share / (1 - share)), theta)
+    def from_theta(self, theta: Numbers, inset: float = 1e-3) -> Numbers:
+        """The reverse of `theta`, clipped into the bounds: off them by a share `inset` of what lies between."""
+        xp, _ = self._library(theta)
+        bounded = xp.isfinite(self.low)
+        low, high = xp.where(bounded, self.low, 0.0), xp.where(bounded, self.high, 1.0)
+        share = xp.where(bounded, xp.clip((theta - low) / (high - low), inset, 1 - inset), 0.5)
+        return xp.where(bounded, xp.log(share / (1 - share)), theta)
 
     def values(self, theta: Float[Array | np.ndarray, " free"]) -> dict[str, Scalar]:
         """Natural values of the parameters at θ."""
@@ -86,6 +87,13 @@ class Coordinates(eqx.Module):
         """Natural values of many θ, in the order of `names`."""
         step = self.sd * theta
         return np.where(self.positive, self.centre * np.exp(np.where(self.positive, step, 0.0)), self.centre + step)
+
+    def at(self, values: Numbers) -> Numbers:
+        """θ of the parameters' natural values, in the order of `names`: the reverse of `values`."""
+        xp, _ = self._library(values)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            ratio = xp.where(self.positive, values, 1.0) / xp.where(self.positive, self.centre, 1.0)
+            return xp.where(self.positive, xp.log(ratio), values - self.centre) / self.sd
 
     def theta_of(self, name: str, values: Float[np.ndarray, "*values"] | float) -> Float[np.ndarray, "*values"]:
         """θ of one positive parameter at natural values."""

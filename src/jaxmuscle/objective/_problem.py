@@ -82,10 +82,7 @@ class Part:
 
     def theta_of(self, task: AbstractTask) -> Float[np.ndarray, " own"]:
         """Its coordinates of a task's values."""
-        c = self.coordinates
-        values = np.array([float(task[name]) for name in c.names])
-        with np.errstate(invalid="ignore", divide="ignore"):
-            return np.where(c.positive, np.log(values / c.centre), values - c.centre) / c.sd
+        return self.coordinates.at(np.array([float(task[name]) for name in self.coordinates.names]))
 
     def scattering_as(self, task: AbstractTask) -> "Part":
         """The part with a coefficient of variation that scatters as that of this task does."""

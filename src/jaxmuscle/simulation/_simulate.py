@@ -23,7 +23,7 @@ from jaxmuscle.spectra._settings import WINDOW, Sampling, SpectrumSettings
 
 from ._batch import Recipe, run_seeds
 from ._grid import Grid, parts_for
-from ._trajectory import Trajectory, one
+from ._trajectory import Trajectory
 
 MAX_RATE_STEP = 0.5
 MAX_SUBSTEPS = 256
@@ -79,7 +79,7 @@ def simulate(
         raise ValueError(f"seed = {seed!r}: one simulation has one seed. For several use jaxmuscle.ensemble(task, key, "
                          "seeds=...), or jax.vmap over seed")  # fmt: skip
     seeds = jnp.asarray([seed_of(seed)], jnp.uint32) if all_concrete(seed) else jnp.atleast_1d(jnp.asarray(seed))
-    result = one(trajectories(task, None, key_of(key), seeds, schedule(task, duration, dt, rate, substeps, sampling)))
+    result = trajectories(task, None, key_of(key), seeds, schedule(task, duration, dt, rate, substeps, sampling))[0]
     require_finite(result)
     return result
 
@@ -144,12 +144,12 @@ def schedule(
             positive(name, value)
     if substeps is not None:
         count("substeps", substeps, 1, MAX_SUBSTEPS)
+    if all_concrete(task):
+        task.check_step(dt)
     every = steps_per_sample(rate, dt, sampling)
     samples = whole(
         float(duration) * rate, f"duration = {duration} s is not a whole number of sampling intervals {1 / rate} s"
     )
-    if all_concrete(task):
-        task.check_step(dt)
     if samples * every > MOST_STEPS:
         raise ValueError(f"duration = {duration} s at dt = {dt} s makes {samples * every} steps, at most {MOST_STEPS} are "
                          "possible: give a shorter duration or a larger dt")  # fmt: skip
@@ -160,8 +160,13 @@ def schedule(
 
 def steps_per_sample(rate: float, dt: float, sampling: str) -> int:
     """Steps of dt in a sampling interval. Raises `ValueError` if dt does not divide it, or leaves nothing to be filtered."""
-    choices = f"{', '.join(f'{1 / rate / n:.6g}' for n in (1, 2, 4, 5, 10, 20))} s"
-    every = whole(1 / (rate * dt), f"dt = {dt} s does not divide the sampling interval {1 / rate} s: use one of {choices}")
+    least = max(math.ceil(1 / (rate * dt)), 1 + (sampling == "filtered"))
+    finer = sorted({least, *(n for n in (2, 4, 5, 10, 20, 50, 100) if n > least)})[
+        :4
+    ]  # a larger dt may not do for the noise
+    choices = f"{', '.join(f'{1 / rate / n:.9g}' for n in finer)} s"
+    apart = f"the sampling interval {1 / rate:.9g} s"
+    every = whole(1 / (rate * dt), f"dt = {dt} s does not divide {apart}: use one of {choices}")
     if every == 1 and sampling == "filtered":
         raise ValueError(f"dt = {dt} s is a whole sampling interval, but sampling = 'filtered' needs points between the "
                          f"samples: use half of it or less, or sampling = 'instant'")  # fmt: skip

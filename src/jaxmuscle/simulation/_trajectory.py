@@ -5,6 +5,7 @@ from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Integer
@@ -15,6 +16,7 @@ from jaxmuscle._common.cards import Card, Shown, facts
 from jaxmuscle._common.environment import versions
 from jaxmuscle.model._parameters import PARAMETERS
 from jaxmuscle.model._stream import VERSION as STREAM
+from jaxmuscle.model._task import is_batched
 from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.response._expected import linear_spectrum
 from jaxmuscle.spectra._decimation import at_every
@@ -57,6 +59,24 @@ class Trajectory(Shown, eqx.Module):
             low, high = (found(np.asarray(self.output)) + 0.0 for found in (np.min, np.max))  # -0 is shown as 0
             known.append(("range", f"{low:.4g} to {high:.4g} {unit}"))
         return facts(f"trajectory of {name} [{unit}]", known)
+
+    def __getitem__(self, place: int | slice | np.ndarray) -> "Trajectory":
+        """The run of one seed by its place (`runs[0]`, `runs[-1]`), without the axis of seeds; or some: `runs[:10]`."""
+        count = self.output.shape[0] if self.output.ndim > 1 else 0
+        if not count:
+            raise TypeError("this trajectory is one run, without seeds to choose from: it is what [i] would give")
+        if isinstance(place, int | np.integer) and not -count <= place < count:
+            raise IndexError(f"[{place}]: there are {count} seeds, 0 to {count - 1}")
+        if is_batched(self.task):  # jax.vmap gives all numbers its axis
+            return jax.tree.map(lambda x: x[place], self)
+
+        def numbers(run):
+            return [run.states, run.output, run.seeds, *[run.linear] * (run.linear is not None)]
+
+        return eqx.tree_at(numbers, self, [x[place] for x in numbers(self)])
+
+    def __len__(self) -> int:
+        return self.output.shape[0] if self.output.ndim > 1 else 1
 
     @property
     def time(self) -> Float[np.ndarray, " samples"]:
@@ -208,9 +228,3 @@ def stack(parts: Iterable[Trajectory], count: int) -> Trajectory:
     joined.setdefault("linear", None)
     return Trajectory(first.task, **joined, rate=first.rate, dt=first.dt, substeps=first.substeps,
                       sampling=first.sampling)  # fmt: skip
-
-
-def one(trajectory: Trajectory) -> Trajectory:
-    """The only seed of an ensemble of one, without its seed axis."""
-    first = (trajectory.states[0], trajectory.output[0], trajectory.seeds[0])
-    return eqx.tree_at(lambda t: (t.states, t.output, t.seeds), trajectory, first)

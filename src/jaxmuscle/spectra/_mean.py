@@ -3,10 +3,13 @@
 from typing import Any
 
 import equinox as eqx
+import jax
 import numpy as np
 from jaxtyping import Array, Float
 
 from jaxmuscle import plot
+from jaxmuscle._common.arrays import is_concrete
+from jaxmuscle._common.cards import Card, Shown, facts
 
 from ._settings import SpectrumSettings
 from ._welch import Spectrum
@@ -14,7 +17,7 @@ from ._welch import Spectrum
 Bins = Float[Array | np.ndarray, " bins"]
 
 
-class SpectrumEstimate(eqx.Module):
+class SpectrumEstimate(Shown, eqx.Module):
     """A Monte Carlo estimate of an expected Welch spectrum.
 
     **Fields**, per bin: `frequency` [Hz]; `power` [`unit`²/Hz] and its standard error `stderr`, with the control variate
@@ -31,6 +34,18 @@ class SpectrumEstimate(eqx.Module):
     seeds: int = eqx.field(static=True)
     settings: SpectrumSettings = eqx.field(static=True)
     unit: str = eqx.field(static=True)
+
+    def _card(self) -> Card:
+        numbers = (self.power, self.stderr, self.plain_stderr)
+        if not all(isinstance(x, jax.Array | np.ndarray) and is_concrete(x) for x in numbers):
+            return Card(eqx.tree_pformat(self))  # a tree that JAX or Equinox took apart
+        power, *errors = (np.asarray(x) for x in numbers)
+        error, plain = (100 * float(np.median(each / power)) for each in errors)
+        rows = [("seeds", f"{self.seeds}"), ("error", f"{error:.2g} % of a bin (median)")]
+        if self.expected is not None:
+            rows.append(("control", f"linear response; without it the error is {plain:.2g} %"))
+        spectrum = self.spectrum._card()
+        return facts(f"mean {spectrum.heading}", [*rows, *spectrum.rows])  # pyright: ignore[reportArgumentType]
 
     @property
     def proportional(self) -> Bins:

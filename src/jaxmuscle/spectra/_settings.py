@@ -13,6 +13,7 @@ import numpy as np
 import scipy
 from jaxtyping import Float
 
+from jaxmuscle._common.cards import Spelled
 from jaxmuscle._common.documents import converted
 from jaxmuscle._common.text import choices
 
@@ -55,7 +56,7 @@ def require(holds: bool | np.bool, name: str, value: object, remedy: str) -> Non
         raise ValueError(f"{name}={value!r}: {remedy}")
 
 
-class SpectrumSettings(eqx.Module):
+class SpectrumSettings(Spelled, eqx.Module):
     """How a spectrum is estimated; every choice the papers leave open is a field.
 
     The defaults are the procedure of Slifkin & Newell (1999, J Exp Psychol HPP 25(3):837-851); `named` has others.
