@@ -412,7 +412,8 @@ def test_the_runs_of_an_ensemble_are_taken_by_their_place():
     for place in (0, 2, -1):
         for name in ("states", "output", "seeds", "linear"):
             np.testing.assert_array_equal(getattr(runs[place], name), getattr(runs, name)[place])
-    np.testing.assert_array_equal(runs[1].output, jm.simulate(jm.Isometric(), KEY, seed=1).output)
+    alone = jm.simulate(jm.Isometric(), KEY, seed=1).output  # computed alone, so rounded otherwise
+    np.testing.assert_allclose(runs[1].output, alone, rtol=1e-6, atol=1e-6)
     np.testing.assert_array_equal(runs[1:].output, runs.output[1:])
     with pytest.raises(IndexError, match=r"\[3\]: there are 3 seeds, 0 to 2"):
         runs[3]
