@@ -186,8 +186,8 @@ def as_amplitude(value: Amplitude) -> Scalar:
 
         amplitude: float | dict = eqx.field(converter=jm.model.as_amplitude, default=None)
 
-    **Arguments:** `value`, one number for the four coefficients (kept as it is); a list of four, or of five with the drive; a
-    dictionary by `K_w`, `K_z`, `C_w`, `C_z`, `P_w`, of which those left out are 0; or None, the defaults of the parameter
+    **Arguments:** `value`, one number for the four coefficients (kept as it is); a list of four, or of five with the drive;
+    a dictionary by `K_w`, `K_z`, `C_w`, `C_z`, `P_w`, of which those left out are 0; or None, the defaults of the parameter
     table. **Returns:** an array, or the number. **Raises:** `ValueError` for an unknown name or another number of entries.
     """
     if value is None:
