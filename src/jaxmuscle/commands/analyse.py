@@ -164,13 +164,16 @@ def _write_perturbed(recording: "PerturbedRecording", settings: str, folder: Pat
     for line in str(response).splitlines():
         if line.startswith(("  gain", "  phase", "  coherence")):
             out.print(plain(line), highlight=False)
-    title = "Spring K, damper B, mass I:\nH = K + iωB - ω²I, and a delay"
+    title = "Spring K, damper B, mass I:\nH = K + iωB - ω²I\n(delay: if fitted beside them)"
     table = Table(title=title, title_justify="left", show_header=False)
     for name, (value, error, unit) in classical.items():
         told = (" ± ".join(rounded(value, error)), unit)
         table.add_row(name, *(told if name != "delay" or error < VAGUE else ("not determined by this response", "")))
     out.print(table)
-    if misfit > MISSED:
+    late = recording.late(settings)
+    for notice in late:
+        err.print(f"[yellow]notice:[/] {plain(notice)}", highlight=False)
+    if misfit > MISSED and not late:
         out.print(f"A spring, a damper and a mass do not describe these points: their chi2 is {misfit:.2g} times what it "
                   "should be. Do not interpret K, B and I. Fit a muscle: jaxmuscle fit FILE --task prescribed-length",
                   highlight=False)  # fmt: skip

@@ -68,6 +68,12 @@ def design(
         from jaxmuscle._common.figures import write_figure
         from jaxmuscle._common.text import folded
 
+        for option, given, unit in (("--rms", rms, "mm"), ("--peak", peak, "mm"), ("--speed", speed, "mm/s"),
+                                    ("--acceleration", acceleration, "m/s²"), ("--seconds", seconds, "s")):  # fmt: skip
+            if given is not None and not 0 < given < float("inf"):
+                raise ValueError(f"{option} {given:g}: give a number of {unit} above 0")
+        if error is not None and not 0 < error < 100:
+            raise ValueError(f"--error {error:g}: give a percentage between 0 and 100, as --error 10")
         keep_compiled_programs()
         writable(output, "motor.csv", "design.json", force=force)
         found = jm.design_input(

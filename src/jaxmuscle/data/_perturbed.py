@@ -24,6 +24,11 @@ from ._units import scale_to_si
 
 SURE = 4.0  # standard errors from which on the sign of the displacement is found
 UNITS = ("N/m", "N s/m", "kg", "s")
+LEAST_MOVED, MOST_MOVED = 0.005, 100.0  # mm rms: what motors move
+WORSE = 2.0  # times chi² over its expectation, without a delay
+NEGATIVE = "the mean force is negative: count the muscle's pull as positive, or the stiffness has the wrong sign"
+NEGATIVE_TURNED = (". With this force the displacement seems to count shortening as positive, so its sign was turned. It "
+                   "will not be once the force is right")  # fmt: skip
 
 
 class PerturbedRecording(Printed, eqx.Module):
@@ -117,12 +122,22 @@ class PerturbedRecording(Printed, eqx.Module):
         require(
             pull.size == moved.size, "displacement", f"{moved.size} samples", f"the force has {pull.size}; give one length"
         )
-        more = ["the mean force is negative: count the muscle's pull as positive, or the stiffness has the wrong sign"]
-        notices = (*notices, *more * bool(np.mean(pull) < 0))
+        if np.isfinite(moved).all() and np.ptp(moved) <= 1e-12 * np.max(np.abs(moved), initial=0.0):
+            raise ValueError(f"displacement: constant at {reach * moved[0]:g} m, so nothing moved the muscle. Take the "
+                             "force alone, as a hold, or choose another column")  # fmt: skip
+        negative = bool(np.mean(pull) < 0)
         pull, moved, begin, said = _shifted(scale * pull, reach * moved, float(rate), delay)
         fields: dict[str, Any] = {"name": name, "source": source, "start": float(start) + begin, "window": window}
         held, given = _recording("force", pull, rate, "N", fields), _recording("displacement", moved, rate, "m", fields)
         turn, more = _sign(held, given, positive)
+        if negative:
+            more = [NEGATIVE + NEGATIVE_TURNED] if turn < 0 and positive is None else [NEGATIVE, *more]
+        size = 1e3 * float(np.std(given.whole))
+        if not LEAST_MOVED < size < MOST_MOVED:
+            other = "mm" if size > MOST_MOVED else "m"
+            odd = "much" if other == "mm" else "little"
+            more.append(f"the displacement is {size:.3g} mm rms, which is {odd} for a motor. If its column is in {other}, "
+                        f"give --displacement-units {other} (Python: displacement_units=)")  # fmt: skip
         return cls(held, _recording("displacement", turn * moved, rate, "m", fields), notices=(*notices, *said, *more))
 
     @property
@@ -223,6 +238,23 @@ class PerturbedRecording(Printed, eqx.Module):
         """
         found = self._second_order(settings, True)
         return float(found.value[3]), float(found.stderr[3])
+
+    def late(self, settings: SpectrumSettings | str | None = None) -> list[str]:
+        """A notice if the force is surely later or earlier than a spring, a damper and a mass explain, else nothing."""
+        try:
+            response = self._response(settings)
+        except ValueError:  # too short or too slow for a response, which says so itself where one is asked for
+            return []
+        if 2 * response.centre.size <= len(UNITS):
+            return []
+        without, found = (second_order_fit(response, delayed) for delayed in (False, True))
+        delay, error = found.value[3], found.stderr[3]
+        if abs(delay) < SURE * error or without.chi2 < WORSE * found.chi2:
+            return []
+        by, when = f"{1e3 * abs(delay):.2g} ± {1e3 * error:.1g} ms", "late" if delay > 0 else "early"
+        return [f"the force comes {by} {when}, beyond what a spring, a damper and a mass explain. A filter in one of the "
+                "channels does that. Correct for the delay that your devices state (--delay, in s; Python: delay=). Else "
+                "damping and stiffness are wrong"]  # fmt: skip
 
     def target(
         self,

@@ -118,7 +118,7 @@ def _ordinates(recording: Any, stiffness: Stiffness, predicted: Any, settings: S
     )
     fluctuation = Recording(force - reply, rate, unit=recording.force.unit, name=recording.name, source=recording.source,
                             start=recording.force.start, window=edges,
-                            notices=recording.notices + cut + (LINEAR,) * (not exact))  # fmt: skip
+                            notices=(*recording.notices, *recording.late(), *cut, *(LINEAR,) * (not exact)))  # fmt: skip
     rest = fluctuation.whole[inside]
     taper = scipy.signal.windows.tukey(len(rest), TAPER)
     f = np.fft.rfftfreq(len(rest), 1 / rate)

@@ -139,7 +139,9 @@ def _chosen(
         forces = [name for name in others if quantity_of(table.units.get(name, "")) in ("force", "torque")]
         forces = forces if len(forces) == 1 else [name for name in forces or others if FORCE.fullmatch(bare(name))]
         if len(forces) == 1:
-            return _Choice(forces[0], forces, f"column {forces[0]} taken, of {listed(others)}")
+            return _Choice(
+                forces[0], forces, f"column {forces[0]} taken, of {listed(others)}" + _moved(table, others, forces[0])
+            )
     if len(others) != 1:
         which = listed(others) or "none"
         raise ValueError(f"{table.file}: holds {len(others)} columns besides the time; choose one with `column`: {which}")
@@ -148,6 +150,15 @@ def _chosen(
 
 def _others(table: Table, time: str | None) -> list[str]:
     return [name for name in table.columns if name != time and name not in table.words]
+
+
+def _moved(table: Table, others: list[str], force: str) -> str:
+    """What to say where a column is a displacement: the answer to a motor is no fluctuation of a hold."""
+    moving = [name for name in others if quantity_of(table.units.get(name, "")) in ("displacement", "angle")]
+    if not moving:
+        return ""
+    return (f". If a motor moved the muscle ({moving[0]}), give both channels: --force-column {force} --displacement "
+            f"{moving[0]} (Python: force=, displacement=). Else its answer to the motor counts as unsteadiness")  # fmt: skip
 
 
 def _point(table: Table, column: str | int | None, axis: str, reference: str | int | None, time: str | None) -> _Choice:

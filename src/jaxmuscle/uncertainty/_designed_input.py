@@ -28,6 +28,8 @@ FEWER_LINES = 1.6  # times as long as a part of a longer motion
 SHORTEST = 1.0  # s of a record that are worth telling of
 SHOWN = 2.0  # times the even density: where a design moves the most
 DOUBTFUL = 0.3  # relative standard error
+ENDURED = 3600.0  # s of a record
+MUCH = 1.3  # times as exact
 LOOSE = 0.33  # a third of the usual prior, 1 in the logarithm
 OPEN = (
     "  a quantity with a larger error than about 33 % will stay 'not determined' in the fit: its error must be at most "
@@ -52,7 +54,8 @@ class DesignedInput(Printed, Result, eqx.Module):
     reaches it, or None; `notices`, what to know before; `elsewhere`, of each quantity that is hardly known so far: its value
     one standard error below and above, and the error that this motion gives there, both in its unit; `masses` [kg] that the
     fit does not have free, and which of them are `held`: the others are fitted with the record,
-    their errors are in the rest.
+    their errors are in the rest; `wider`, a frequency [Hz] twice as high as the band's highest, and the errors with a flat
+    motion up to there, or None; `moved`, whether a moved record is known already.
     """
 
     quantity: tuple[str, ...] = eqx.field(static=True)
@@ -72,6 +75,8 @@ class DesignedInput(Printed, Result, eqx.Module):
     masses: dict[str, float] = eqx.field(default_factory=dict)
     held: tuple[str, ...] = eqx.field(static=True, default=())
     prior: dict[str, float] = eqx.field(default_factory=dict)
+    wider: tuple[float, dict[str, float]] | None = None
+    moved: bool = eqx.field(static=True, default=False)
 
     @property
     def time(self) -> Float[np.ndarray, " samples"]:
@@ -159,6 +164,7 @@ class DesignedInput(Printed, Result, eqx.Module):
             "frequency_hz": self.frequency.tolist(), "density": self.density.tolist(), "quantities": known,
             "elsewhere": {n: [{"value": with_nulls(value), "stderr": with_nulls(error)} for value, error in sides]
                           for n, sides in self.elsewhere.items()},
+            "wider": None if self.wider is None else {"hz": self.wider[0], "stderr": self.wider[1]},
             "masses": {n: {"value": value, "fitted": n not in self.held} for n, value in self.masses.items()},
             "notices": list(self.notices),
         }  # fmt: skip
@@ -205,6 +211,7 @@ class DesignedInput(Printed, Result, eqx.Module):
             f"    {'':<22}{'prior':>10}{'now':>10}{'flat':>10}" + f"{'designed':>10}" * bool(self.moves),
             *rows,
             *([OPEN] if any(self.percent(n, self.stderr) > 100 * LOOSE for n in self.told) else []),
+            *self._wider(),
             *self._by_duration(),
             *self._as_fitted(),
             *ASSUMED,
@@ -214,6 +221,15 @@ class DesignedInput(Printed, Result, eqx.Module):
     def _columns(self) -> tuple[dict[str, float], ...]:
         """The errors that are printed; a motion that is flat itself is no other one."""
         return (self.prior, self.now, self.flat, self.stderr) if self.moves else (self.prior, self.now, self.stderr)
+
+    def _wider(self) -> list[str]:
+        """Whether a band twice as wide tells much more: motions for all that a muscle can do are often too slow."""
+        if self.wider is None or all(self.flat[n] < MUCH * self.wider[1][n] for n in self.quantity):
+            return []
+        low, high = self.frequency[0], self.wider[0]
+        told = " and ".join(f"{n} to {_digits(self.percent(n, self.wider[1]))} %" for n in self.quantity)
+        return [f"  a flat motion up to {high:g} Hz would tell {told}. If your motor can do that, design again with --band "
+                f"{low:.2g}:{high:g} (band=({low:.2g}, {high:g}))"]  # fmt: skip
 
     def _by_duration(self) -> list[str]:
         """The errors by the length of the record, and how long it takes to reach the one that was asked for."""
@@ -228,8 +244,13 @@ class DesignedInput(Printed, Result, eqx.Module):
             goal = f"{' and '.join(self.quantity)} to {100 * error:.3g} % (standard error)"
             if not np.isfinite(seconds):
                 return [*lines, f"  no length of the record tells {goal}: raise rms, or choose another band"]
-            if seconds < SHORTEST:
+            if all(self.percent(name, self.now) <= 100 * error for name in self.quantity):
                 return [*lines, f"  {goal}: what is known without this record is enough for that"]
+            if seconds < SHORTEST:
+                return [*lines, f"  {goal}: less than {SHORTEST:g} s of this motion would tell that. Play one period"]
+            if seconds > ENDURED:
+                return [*lines, f"  to know {goal}, a record of {seconds / 3600:.2g} hours would be needed, which nobody "
+                        "holds: raise rms, or choose another band"]  # fmt: skip
             begin, end = self.window
             period, periods = self.lengthening.seconds, round((end - begin) / self.lengthening.seconds)
             if_so = ", if the muscle is like the one given here" if self._vague() else ""
@@ -277,6 +298,9 @@ class DesignedInput(Printed, Result, eqx.Module):
         if self.moves:
             what = ("That is too vague for a design. First record a minute with a flat motion (--spread 1, spread=1.0). Fit "
                     "it, and design again from that fit")  # fmt: skip
+        if self.moved:
+            what = ("The moved record that was fitted did not tell more. So trust the errors below less, and try a wider "
+                    "band or a larger motion")  # fmt: skip
         said = [f"{name} {'to' if i else 'is known only to'} {error}" for i, (name, error) in enumerate(vague)]
         return [f"  so far {', '.join(said)}. {what}"] * bool(vague)
 

@@ -1,7 +1,7 @@
 """The motion of the insertion from which a quantity becomes best known."""
 
 import dataclasses
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any, NamedTuple
 
 import jax
@@ -36,6 +36,7 @@ CREST = (1.6, 2.0, 2.5)  # of position, velocity and acceleration, to begin with
 ENOUGH = 1e-6
 MOST = 10**8  # samples of a motion
 LONGEST = 1e4  # times the record
+LEAST_SECONDS = 8.0  # of a record, as a fit asks for
 NOTHING = 1e-4  # of the relative variance, by which a motion must lower it
 
 
@@ -73,7 +74,8 @@ def design_input(
     **Arguments:**
 
     - `result` of a fit, or a task, whose usual free parameters are then free with their prior
-    - `quantity`: a free parameter or a derived quantity such as K_w0, K_z0, C_w0, C_z0, K_w_tangent, or several
+    - `quantity`: a free parameter or a derived quantity such as K_w0, K_z0, C_w0, C_z0, K_w_tangent, or several. In a fit of
+      several targets K_w_tangent is that of `target`, else that of the moved record: "K_w_tangent@moved"
     - `rms` [m], `peak` [m], `speed` [m/s], `acceleration` [m/s²]: at most; where the motion would pass `peak`, `speed` or
       `acceleration` it gets smaller or slower
     - `band` [Hz]: from 0.5 Hz on, as drift and slow movements of the person are not in the model
@@ -95,6 +97,9 @@ def design_input(
         require_positive(name, np.float64(1.0) if value is None else value, unit)
     require(0 <= spread <= 1, f"spread = {spread} must be a share, from 0 to 1")
     durations = [float(one) for one in durations]
+    require(
+        seconds >= LEAST_SECONDS, f"seconds = {seconds}: give at least {LEAST_SECONDS:g} s, since less holds no spectrum"
+    )
     for one in durations:
         require_positive("durations", one, "s")
     require(error is None or 0 < error < 1, f"error = {error} must be a share between 0 and 1, 0.1 for 10 %")
@@ -125,7 +130,9 @@ def design_input(
         for _ in range(TRIES if np.isfinite(min(limits)) else 1):
             allowed = np.minimum(limits / crest, [rms, np.inf, np.inf])
             motion, crest = realised(experiment.best(allowed, spread))
-    own = even.of_motion(motion)
+        wide = Lengthening.flat(rms, (band[0], 2 * band[1]), seconds) if 4 * band[1] < rate else None
+        wider = None if wide is None else (2.0 * band[1], experiment.errors_of(wide.within(limits / crest)))
+    own, quantities = even.of_motion(motion), experiment.quantity
     known = experiment.here.values
     values, units = {n: value for n, (value, _) in known.items()}, {n: unit for n, (_, unit) in known.items()}
     now, flat, best = (experiment.errors(p) for p in (None, even.power, own.power))
@@ -137,7 +144,13 @@ def design_input(
                   for n in vague}  # fmt: skip
     notices = missed(result) if isinstance(result, FitResult) else ()
     return DesignedInput(quantities, own, even, motion, float(rate), values, units, now, flat, best, longer, needed, notices,
-                         others, experiment.masses, experiment.held, experiment.by_prior())  # fmt: skip
+                         others, experiment.masses, experiment.held, experiment.by_prior(), wider,
+                         experiment.moved)  # fmt: skip
+
+
+def _named(name: str, known: Mapping[str, Any], targets: Iterable[str | None]) -> str:
+    """A quantity by the name that it has in a fit of several targets, of the first that has it: "K_w_tangent@moved"."""
+    return next((n for n in (name, *(f"{name}@{target}" for target in targets)) if n in known), name)
 
 
 def _elsewhere(
@@ -163,7 +176,9 @@ class Experiment(NamedTuple):
     start: Float[np.ndarray, "free free"]
     apart: Float[np.ndarray, "free free"]
     frequency: Float[np.ndarray, " lines"]
+    informed: Callable[[Lengthening], Float[np.ndarray, "lines free free"]]
     lines: Float[np.ndarray, "lines free free"]
+    moved: bool
 
     @classmethod
     def of(
@@ -187,6 +202,9 @@ class Experiment(NamedTuple):
             problem = dataclasses.replace(problem, parts=tuple(parts))
         told = problem.by_name([dict.fromkeys(TANGENTS if has_tangents(part.task) else ()) for part in problem.parts])
         here = Here.of(problem, seen_here(problem, theta), dict.fromkeys([*derived, *told]))
+        moved = [part.name for part in fitted.parts if part.target.stiffness is not None]
+        targets = [target, *moved, *(part.name for part in fitted.parts)]
+        quantity = tuple(_named(name, here.gradients, targets) for name in quantity)
         for name in quantity:
             if name not in here.gradients:
                 base = name.partition("@")[0]
@@ -203,12 +221,19 @@ class Experiment(NamedTuple):
         start = np.diag(prior) + (here.information if isinstance(given, FitResult) else 0.0)
         apart = start + design_information(problem, theta, dataclasses.replace(design, task=task, lengthening=None))
         own, coordinates = coordinates_of(like, theta, task)
-        lines = np.zeros((len(record.frequency), *start.shape))
-        lines[:, own[:, None], own] = information_of_lines(task, coordinates, theta[own], record.frequency, record.seconds)
+
+        def informed(record: Lengthening) -> np.ndarray:
+            lines = np.zeros((len(record.frequency), *start.shape))
+            found = information_of_lines(task, coordinates, theta[own], record.frequency, record.seconds)
+            lines[:, own[:, None], own] = found
+            return lines
+
         unfitted = [name for name in MASSES if name not in design.like(fitted).coordinates.names]
         masses = {name: float(task[name]) for name in unfitted if name in task.parameter_names}
         held = tuple(name for name in masses if name not in coordinates.names)
-        return cls(here, tuple(quantity), masses, held, prior, start, apart, record.frequency, lines)
+        return cls(
+            here, quantity, masses, held, prior, start, apart, record.frequency, informed, informed(record), bool(moved)
+        )
 
     @property
     def rows(self) -> Float[np.ndarray, "quantities free"]:
@@ -244,7 +269,14 @@ class Experiment(NamedTuple):
 
     def errors(self, power: Float[np.ndarray, " lines"] | None, times: float = 1.0) -> dict[str, float]:
         """Standard errors of all quantities with a motion, if the record is so many `times` as long; without it if None."""
-        record = 0.0 if power is None else self.apart - self.start + np.tensordot(power, self.lines, 1)
+        return self._errors(None if power is None else np.tensordot(power, self.lines, 1), times)
+
+    def errors_of(self, record: Lengthening) -> dict[str, float]:
+        """Standard errors of all quantities with a motion of other lines. Needs double precision."""
+        return self._errors(np.tensordot(record.power, self.informed(record), 1))
+
+    def _errors(self, motion: Float[np.ndarray, "free free"] | None, times: float = 1.0) -> dict[str, float]:
+        record = 0.0 if motion is None else self.apart - self.start + motion
         known = self.start + times * record
         after = np.linalg.pinv(known, hermitian=True)
         return {name: float(np.sqrt(g @ after @ g)) for name, g in self.here.gradients.items()}

@@ -57,6 +57,11 @@ class Lengthening(Printed, Result, eqx.Module):
         lines = lines_in(band, seconds)
         return cls(lines, np.full(len(lines), rms**2 / len(lines)), seconds)
 
+    def within(self, most: Float[np.ndarray, "3"]) -> "Lengthening":
+        """Made smaller, so that displacement [m], speed [m/s] and acceleration [m/s²] are at most so large (rms)."""
+        reached = [np.sqrt(np.sum(self.power * (2 * np.pi * self.frequency) ** (2 * order))) for order in range(3)]
+        return Lengthening(self.frequency, self.power * min(1.0, *(most / reached)) ** 2, self.seconds)
+
     def of_motion(self, displacement: Float[np.ndarray, " samples"]) -> "Lengthening":
         """Its lines in one period of a motion [m]."""
         places = np.rint(self.frequency * self.seconds).astype(int)
