@@ -685,6 +685,15 @@ def test_an_earlier_result_is_overwritten_by_force_only(case, file, tmp_path, mo
     assert (out / file).read_text() == "a result"  # until there is a new one
 
 
+@pytest.mark.parametrize(("option", "value", "words"), [
+    ("--error", "200", "--error 200: give a percentage between 0 and 100"), ("--error", "0", "--error 0: give a perc"),
+    ("--rms", "-1", "--rms -1: give a number of mm above 0"), ("--acceleration", "0", "--acceleration 0: give a num"),
+])  # fmt: skip
+def test_design_refuses_numbers_in_the_units_of_its_options(option, value, words, tmp_path):
+    refused = run("design", "zagrodny-slifkin", f"{option}={value}", "--out", tmp_path)
+    assert refused.exit_code == 2 and words in " ".join(refused.stderr.split())
+
+
 @pytest.mark.parametrize("force", [(), ("--force",)])
 def test_a_spectrum_is_not_replaced_by_its_own_fit(tmp_path, force):
     path = csv_file(tmp_path)  # spectrum.csv, as a fit calls what it writes

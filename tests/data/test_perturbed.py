@@ -1,6 +1,7 @@
 """Recordings of force and displacement: the response and its errors, sign, delay, units, files, what is refused."""
 
 import json
+import re
 
 import numpy as np
 import pages
@@ -213,6 +214,10 @@ def test_a_delay_is_found_and_taken_out():
     back, error = whole.delay(FINE)
     assert abs(back) < CHANCE * error
     assert any("lags by 8 ms" in notice for notice in whole.notices)
+    (said,) = late.late(FINE)
+    assert re.match(r"the force comes [78]\.?\d* ± \S+ ms late, beyond what a spring", said) and not whole.late(FINE)
+    early = recorded(moved[0, :-8], force[0, 8:], 1000.0)
+    assert "ms early" in early.late(FINE)[0] and not recorded(moved[0, :300], force[0, :300], 1000.0).late()
 
 
 def test_part_of_a_sample_is_taken_out():
@@ -247,7 +252,13 @@ def test_sign():
     np.testing.assert_array_equal(recorded(-moved[0], force[0], positive="lengthening").displacement.whole, -moved[0])
     heavy = force[0] + (7.5 - INERTIA) * np.gradient(np.gradient(moved[0], 1 / RATE), 1 / RATE)  # above 2.3 Hz a mass
     np.testing.assert_array_equal(recorded(moved[0], heavy).displacement.whole, moved[0])
-    assert any("mean force is negative" in notice for notice in recorded(moved[0], -force[0]).notices)
+    (pushed,) = recorded(moved[0], -force[0]).notices
+    assert "mean force is negative" in pushed and "It will not be once the force is right" in pushed
+    stated = recorded(-moved[0], -force[0], positive="lengthening").notices
+    assert any("mean force is negative" in notice and "turned" not in notice for notice in stated)
+    for factor, unit in ((1e3, "mm"), (1e-3, "m")):  # the column's unit is another one than it says
+        (size,) = recorded(factor * moved[0], force[0] / factor).notices
+        assert size.endswith(f"give --displacement-units {unit} (Python: displacement_units=)")
     unrelated = recorded(moved[0], force[0, ::-1])
     assert any("--positive lengthening or --positive shortening" in notice for notice in unrelated.notices)
     short = recorded(moved[0, :300], force[0, :300])
@@ -363,9 +374,10 @@ REFUSED = {
         {"force": "force_N", "displacement": "displacement_mm", "lever_arm": 0.1}, "lever_arm=0.1: leave it out"),
     "no unit": ({"force": "force_N", "displacement": "plain"}, "give `displacement_units`, as displacement_units='mm'"),
     "wrong unit": (
-        {"force": "force_N", "displacement": "plain", "displacement_units": "V"}, "unit of a displacement or of its angle"),
+        {"force": "force_N", "displacement": "plain", "displacement_units": "kg"}, "unit of a displacement or of its angle"),
+    "volts": ({"force": "force_N", "displacement": "plain", "displacement_units": "V"}, "in m for each volt, and name"),
     "force in mm": ({"force": "displacement_mm", "displacement": "plain", "displacement_units": "m"}, "unit of a force"),
-    "constant": ({"force": "force_N", "displacement": "still_mm"}, "displacement: samples: constant at"),
+    "constant": ({"force": "force_N", "displacement": "still_mm"}, "m, so nothing moved the muscle. Take the force alone"),
     "column as well": ({"column": "force_N", "force": "force_N", "displacement": "displacement_mm"}, "column='force_N'"),
     "lever arm of a force": ({"column": "force_N", "lever_arm": 0.1}, "it turns a torque into a force, and column force_N"),
     "delay too long": ({"force": "force_N", "displacement": "displacement_mm", "delay": 40.0}, "delay=40.0"),

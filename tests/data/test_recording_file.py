@@ -93,6 +93,15 @@ def test_the_only_column_of_force_is_found(header, tmp_path):
     assert any(notice.startswith("column ") and "taken, of " in notice for notice in found.notices)
 
 
+def test_a_moved_insertion_beside_the_force_is_spoken_of(tmp_path):
+    columns = np.stack([np.arange(500) / 100, *np.random.default_rng(1).standard_normal((2, 500))], axis=1)
+    for name, told in (("displacement (mm)", True), ("angle (deg)", True), ("EMG (mV)", False)):
+        path = tmp_path / "moved.csv"
+        np.savetxt(path, columns, delimiter=",", header=f"time,force (N),{name}", comments="", fmt="%.9g")
+        notices = " ".join(load_recording(path).notices)
+        assert ("If a motor moved the muscle" in notices and "--displacement" in notices) == told
+
+
 def test_several_columns_of_force_are_not_chosen_between(tmp_path):
     path = write(tmp_path, "time,Fx (N),Fy (N),Fz (N)\n" + "".join(f"{i / 100},{i},{i},{i}\n" for i in range(500)))
     with pytest.raises(ValueError, match="holds 3 columns besides the time; choose one"):

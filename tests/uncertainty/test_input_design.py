@@ -24,7 +24,7 @@ from jaxmuscle.uncertainty import Lengthening
 from jaxmuscle.uncertainty._design_information import design_information, information_of, opened, seen_here
 from jaxmuscle.uncertainty._identifiability import fitted_problem
 from jaxmuscle.uncertainty._identifiability_report import TOGETHER
-from jaxmuscle.uncertainty._input_design import Experiment, steps_of
+from jaxmuscle.uncertainty._input_design import Experiment, _named, steps_of
 
 BASE = ("k_w", "k_z", "c_w", "c_z")
 BASES, TANGENTS = ("K_w0", "K_z0", "C_w0", "C_z0"), ("K_w_tangent", "tangent_stiffness")
@@ -370,10 +370,38 @@ def test_longer_records_tell_more_and_the_wanted_error_says_how_long():
         made.to_dict()["needed"]["seconds"] == made.needed[1] and designed(error=1e-9).to_dict()["needed"]["seconds"] is None
     )
     assert "what is known without this record is enough" in " ".join(str(designed(error=0.999)).split())
+    small = " ".join(str(designed(rms=1e-4, error=0.04)).split())
+    assert re.search(r"to 4 % \(standard error\), a record of \S+ hours would be needed, which nobody holds", small)
+    assert "less than 1 s of this motion would tell that. Play one period" in " ".join(
+        str(designed(rms=0.1, error=0.1)).split()
+    )
+    with pytest.raises(ValueError, match="give at least 8 s"):
+        designed(seconds=1.0)
     with pytest.raises(ValueError, match="durations"):
         designed(durations=(0.0,))
     with pytest.raises(ValueError, match="error"):
         designed(error=-0.1)
+
+
+@pytest.mark.slow
+def test_a_wider_band_is_told_of_where_it_tells_more():
+    """As another design says, whose band it is and which is flat."""
+    made = designed(band=(0.1, 1.0))
+    other = designed(band=(0.1, 2.0), spread=1.0)
+    assert made.wider is not None and made.wider[0] == 2.0
+    assert made.wider[1] == pytest.approx(other.flat, rel=1e-6)
+    told = made.flat["K_w0"] > 1.3 * other.flat["K_w0"] and made.stderr["K_w0"] > 0.05 * made.values["K_w0"]
+    assert ("design again with --band 0.1:2 (band=(0.1, 2))" in " ".join(str(made).split())) == told
+    assert designed(band=(0.1, 20.0)).wider is None  # beyond half of the rate
+    slow = designed(band=(0.1, 1.0), speed=1e-3).wider
+    assert slow is not None and slow[1]["K_w0"] > made.wider[1]["K_w0"]
+
+
+def test_a_quantity_of_several_targets_has_its_plain_name():
+    known = {"K_z0": 1.0, "K_w_tangent@held": 1.0, "K_w_tangent@moved": 1.0, "mean@held": 1.0}
+    assert _named("K_w_tangent", known, [None, "moved", "held"]) == "K_w_tangent@moved"
+    assert _named("K_w_tangent", known, ["held", "moved"]) == "K_w_tangent@held"
+    assert [_named(n, known, [None, "moved", "held"]) for n in ("K_z0", "mean", "K")] == ["K_z0", "mean@held", "K"]
 
 
 @pytest.mark.slow

@@ -123,8 +123,8 @@ class PerturbedRecording(Printed, eqx.Module):
             pull.size == moved.size, "displacement", f"{moved.size} samples", f"the force has {pull.size}; give one length"
         )
         if np.isfinite(moved).all() and np.ptp(moved) <= 1e-12 * np.max(np.abs(moved), initial=0.0):
-            raise ValueError(f"displacement: constant at {reach * moved[0]:g} m, so nothing moved the muscle. Take the "
-                             "force alone, as a hold, or choose another column")  # fmt: skip
+            raise ValueError(f"displacement: constant at {reach * moved[0] + 0.0:g} m, so nothing moved the muscle. Take "
+                             "the force alone, as a hold, or choose another column")  # fmt: skip
         negative = bool(np.mean(pull) < 0)
         pull, moved, begin, said = _shifted(scale * pull, reach * moved, float(rate), delay)
         fields: dict[str, Any] = {"name": name, "source": source, "start": float(start) + begin, "window": window}

@@ -184,7 +184,9 @@ ACTED_ON = {1: (len(CHANNELS),), len(CHANNELS): tuple(range(len(CHANNELS))), len
 def as_amplitude(value: Amplitude) -> Scalar:
     """An amplitude in any form as what a noise keeps: the converter of the field `amplitude`, also of a noise of your own.
 
-        amplitude: float | dict = eqx.field(converter=jm.model.as_amplitude, default=None)
+        jm.model.as_amplitude({"K_w": 0.02, "K_z": 0.005})
+
+    A noise of your own has it as `eqx.field(converter=jm.model.as_amplitude, default=None)`.
 
     **Arguments:** `value`, one number for the four coefficients (kept as it is); a list of four, or of five with the drive;
     a dictionary by `K_w`, `K_z`, `C_w`, `C_z`, `P_w`, of which those left out are 0; or None, the defaults of the parameter

@@ -88,6 +88,11 @@ class AbstractTask(Shown, eqx.Module):
     output_unit: ClassVar[str]
     smoothness_needed: ClassVar[tuple[int, ...]]
 
+    def __check_init__(self):
+        if missing := [name for name in SAID if not hasattr(type(self), name)]:
+            raise ValueError(f"{type(self).__name__} does not say its {', '.join(missing)}: a task of your own needs "
+                             f"{', '.join(SAID)} as class variables, as jaxmuscle.Isometric has them")  # fmt: skip
+
     @abc.abstractmethod
     def vector_field(self, t: Scalar, y: State, u: Perturbation) -> State:
         """Time derivative of the state."""
@@ -275,9 +280,6 @@ SAID = ("state_names", "state_units", "output_name", "output_unit", "smoothness_
 
 
 def check_task(task: AbstractTask) -> None:
-    if missing := [name for name in SAID if not hasattr(type(task), name)]:
-        raise ValueError(f"{type(task).__name__} does not say its {', '.join(missing)}: a task of your own needs "
-                         f"{', '.join(SAID)} as class variables, as jaxmuscle.Isometric has them")  # fmt: skip
     if task.initial is not None and len(task.initial) != len(task.state_names):
         raise ValueError(f"initial has {len(task.initial)} entries, {type(task).__name__} needs {task.state_names}")
     for field in dataclasses.fields(task):

@@ -29,7 +29,7 @@ SHORTEST = 1.0  # s of a record that are worth telling of
 SHOWN = 2.0  # times the even density: where a design moves the most
 DOUBTFUL = 0.3  # relative standard error
 ENDURED = 3600.0  # s of a record
-MUCH = 1.3  # times as exact
+MUCH, EXACT = 1.3, 0.05  # times as exact; a relative error that needs no other motion
 LOOSE = 0.33  # a third of the usual prior, 1 in the logarithm
 OPEN = (
     "  a quantity with a larger error than about 33 % will stay 'not determined' in the fit: its error must be at most "
@@ -141,9 +141,9 @@ class DesignedInput(Printed, Result, eqx.Module):
     @property
     def window(self) -> tuple[float, float]:
         """From when to when a record is analysed [s]: whole periods of the motion, after half of one. One period, or as many
-        as reach the error that was asked for."""
+        as reach the error that was asked for, if a person can hold so long."""
         period, seconds = self.lengthening.seconds, 0.0 if self.needed is None else self.needed[1]
-        periods = max(1, int(np.ceil(seconds / period - 1e-9))) if np.isfinite(seconds) else 1
+        periods = max(1, int(np.ceil(seconds / period - 1e-9))) if seconds <= ENDURED else 1
         return period / 2, period / 2 + periods * period
 
     @property
@@ -224,7 +224,9 @@ class DesignedInput(Printed, Result, eqx.Module):
 
     def _wider(self) -> list[str]:
         """Whether a band twice as wide tells much more: motions for all that a muscle can do are often too slow."""
-        if self.wider is None or all(self.flat[n] < MUCH * self.wider[1][n] for n in self.quantity):
+        if self.wider is None or all(self.percent(n, self.stderr) < 100 * EXACT for n in self.quantity):
+            return []
+        if all(self.flat[n] < MUCH * self.wider[1][n] for n in self.quantity):
             return []
         low, high = self.frequency[0], self.wider[0]
         told = " and ".join(f"{n} to {_digits(self.percent(n, self.wider[1]))} %" for n in self.quantity)
