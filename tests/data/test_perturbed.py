@@ -375,7 +375,7 @@ REFUSED = {
     "no unit": ({"force": "force_N", "displacement": "plain"}, "give `displacement_units`, as displacement_units='mm'"),
     "wrong unit": (
         {"force": "force_N", "displacement": "plain", "displacement_units": "kg"}, "unit of a displacement or of its angle"),
-    "volts": ({"force": "force_N", "displacement": "plain", "displacement_units": "V"}, "in m for each volt, and name"),
+    "volts": ({"force": "force_N", "displacement": "plain", "displacement_units": "V"}, "(m for each volt), and name"),
     "force in mm": ({"force": "displacement_mm", "displacement": "plain", "displacement_units": "m"}, "unit of a force"),
     "constant": ({"force": "force_N", "displacement": "still_mm"}, "m, so nothing moved the muscle. Take the force alone"),
     "column as well": ({"column": "force_N", "force": "force_N", "displacement": "displacement_mm"}, "column='force_N'"),

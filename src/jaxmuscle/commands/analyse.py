@@ -164,7 +164,7 @@ def _write_perturbed(recording: "PerturbedRecording", settings: str, folder: Pat
     for line in str(response).splitlines():
         if line.startswith(("  gain", "  phase", "  coherence")):
             out.print(plain(line), highlight=False)
-    title = "Spring K, damper B, mass I:\nH = K + iωB - ω²I\n(delay: if fitted beside them)"
+    title = "Spring K, damper B, mass I:\nH = K + iωB - ω²I\n(the delay is of a second fit)"
     table = Table(title=title, title_justify="left", show_header=False)
     for name, (value, error, unit) in classical.items():
         told = (" ± ".join(rounded(value, error)), unit)

@@ -18,14 +18,13 @@ from ._frequency_response import FrequencyResponse
 from ._measure import Measure, normal_interval
 from ._perturbed_target import perturbed_target
 from ._recording import Recording, recorded_settings
-from ._second_order import SecondOrder, lengthens, second_order_fit
+from ._second_order import SecondOrder, lateness, lengthens, second_order_fit
 from ._target import Target
 from ._units import scale_to_si
 
 SURE = 4.0  # standard errors from which on the sign of the displacement is found
 UNITS = ("N/m", "N s/m", "kg", "s")
 LEAST_MOVED, MOST_MOVED = 0.005, 100.0  # mm rms: what motors move
-WORSE = 2.0  # times chi² over its expectation, without a delay
 NEGATIVE = "the mean force is negative: count the muscle's pull as positive, or the stiffness has the wrong sign"
 NEGATIVE_TURNED = (". With this force the displacement seems to count shortening as positive, so its sign was turned. It "
                    "will not be once the force is right")  # fmt: skip
@@ -245,16 +244,7 @@ class PerturbedRecording(Printed, eqx.Module):
             response = self._response(settings)
         except ValueError:  # too short or too slow for a response, which says so itself where one is asked for
             return []
-        if 2 * response.centre.size <= len(UNITS):
-            return []
-        without, found = (second_order_fit(response, delayed) for delayed in (False, True))
-        delay, error = found.value[3], found.stderr[3]
-        if abs(delay) < SURE * error or without.chi2 < WORSE * found.chi2:
-            return []
-        by, when = f"{1e3 * abs(delay):.2g} ± {1e3 * error:.1g} ms", "late" if delay > 0 else "early"
-        return [f"the force comes {by} {when}, beyond what a spring, a damper and a mass explain. A filter in one of the "
-                "channels does that. Correct for the delay that your devices state (--delay, in s; Python: delay=). Else "
-                "damping and stiffness are wrong"]  # fmt: skip
+        return lateness(response)
 
     def target(
         self,

@@ -158,7 +158,7 @@ def _moved(table: Table, others: list[str], force: str) -> str:
     if not moving:
         return ""
     return (f". If a motor moved the muscle ({moving[0]}), give both channels: --force-column {force} --displacement "
-            f"{moving[0]} (Python: force=, displacement=). Else its answer to the motor counts as unsteadiness")  # fmt: skip
+            f"{moving[0]} (Python: force=, displacement=). Else the answer to the motor counts as unsteadiness")  # fmt: skip
 
 
 def _point(table: Table, column: str | int | None, axis: str, reference: str | int | None, time: str | None) -> _Choice:

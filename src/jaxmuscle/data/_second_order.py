@@ -9,6 +9,8 @@ from jaxtyping import Complex, Float
 from jaxmuscle.spectra._cross_spectrum import Response
 from jaxmuscle.spectra._settings import require
 
+SURE, WORSE = 4.0, 2.0  # a delay that is told of: in standard errors, and chi² without it over chi² with it
+
 
 class SecondOrder(NamedTuple):
     """`value` and `stderr` of K [N/m], B [N s/m], I [kg] and, if fitted, of the delay τ [s]; chi² over its expectation."""
@@ -49,6 +51,20 @@ def second_order_fit(response: Response, delayed: bool) -> SecondOrder:
     expected = 2 * f.size - np.trace(inverse @ found.jac.T @ covariance @ found.jac)
     chi2 = float(2 * found.cost / expected)
     return SecondOrder(found.x * scale, np.sqrt(np.diag(spread) * max(chi2, 1.0)) * scale, chi2)
+
+
+def lateness(response: Response) -> list[str]:
+    """A notice if the force is surely later or earlier than a spring, a damper and a mass explain, else nothing."""
+    if 2 * response.centre.size <= 4:
+        return []
+    without, found = (second_order_fit(response, delayed) for delayed in (False, True))
+    delay, error = found.value[3], found.stderr[3]
+    if abs(delay) < SURE * error or without.chi2 < WORSE * found.chi2:
+        return []
+    by, when = f"{1e3 * abs(delay):.2g} ± {1e3 * error:.1g} ms", "late" if delay > 0 else "early"
+    return [f"the force comes {by} {when}, beyond what a spring, a damper and a mass explain. A filter in one of the "
+            "channels does that. Correct for the delay that your devices state (--delay, in s; Python: delay=). Else damping and "
+            "stiffness are wrong"]  # fmt: skip
 
 
 def lengthens(response: Response) -> float:

@@ -21,7 +21,6 @@ UNITS: dict[str, Quantity | None] = {
 _SPELLINGS = {"nm": "N m", "ncm": "N cm", "nmm": "N mm", "%mvc": "% MVC", "pctmvc": "% MVC", "%": "% MVC",
               "\u03bcm": "um", "au": "a.u.", "newton": "N", "newtons": "N", "volt": "V", "volts": "V",
               "kg": "kgf", "kp": "kgf", "lb": "lbf", "lbs": "lbf"}  # of a signal: what a load cell weighs  # fmt: skip
-VOLTS = ("V", "mV", "volt", "volts")
 _SI = {"force": NEWTONS, "torque": {"N m": 1.0, "N cm": 1e-2, "N mm": 1e-3},
        "displacement": {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6},
        "angle": {"rad": 1.0, "deg": math.pi / 180}}  # fmt: skip
@@ -67,10 +66,10 @@ def scale_to_si(unit: str, argument: str, quantity: str, lever_arm: Any) -> tupl
     turned = {"force": "torque", "displacement": "angle"}[quantity]
     known = known_unit(unit) or _ANGLES.get(unit.strip(" []()").casefold())
     remedy = f"give the unit of a {quantity} or of its {turned}; {choices(unit, (*_SI[quantity], *_SI[turned]))}"
-    if unit.strip(" []()") in VOLTS:
+    if known in ("V", "mV"):
         remedy = (
-            f"volts are of a sensor: multiply by its calibration first, in {'N' if quantity == 'force' else 'm'} for each "
-            f"volt, and name the column with its unit ({'force_N' if quantity == 'force' else 'displacement_mm'})"
+            f"a sensor gives volts. Multiply by its calibration first ({'N' if quantity == 'force' else 'm'} for each volt),"
+            f" and name the column with the new unit ({'force_N' if quantity == 'force' else 'displacement_m'})"
         )
     require(known in _SI[quantity] or known in _SI[turned], argument, unit, remedy)
     if known in _SI[quantity]:

@@ -116,7 +116,7 @@ def check_noise(noise: AbstractNoise) -> None:
         for ours, theirs, what, where in _descriptions(noise, 1e-3):
             if not np.isclose(ours, theirs, rtol=1e-3, atol=1e-3 if what.startswith("the correlation") else 0.0):
                 raise ValueError(f"{kind.__name__}: {what} is {ours:.5g} by {where[0]}, but {theirs:.5g} by {where[1]}. "
-                                 "They describe one noise: see docs/own-muscle.md")  # fmt: skip
+                                 "They describe one noise: see docs/how-to/own-noise.md")  # fmt: skip
     _SEEN.add(kind)
 
 

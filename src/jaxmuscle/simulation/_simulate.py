@@ -161,10 +161,8 @@ def schedule(
 def steps_per_sample(rate: float, dt: float, sampling: str) -> int:
     """Steps of dt in a sampling interval. Raises `ValueError` if dt does not divide it, or leaves nothing to be filtered."""
     least = max(math.ceil(1 / (rate * dt)), 1 + (sampling == "filtered"))
-    finer = sorted({least, *(n for n in (2, 4, 5, 10, 20, 50, 100) if n > least)})[
-        :4
-    ]  # a larger dt may not do for the noise
-    choices = f"{', '.join(f'{1 / rate / n:.9g}' for n in finer)} s"
+    finer = sorted({least, *(n for n in (2, 4, 5, 10, 20, 50, 100) if n > least)})  # a larger dt may not do for the noise
+    choices = f"{', '.join(f'{1 / rate / n:.9g}' for n in finer[:4])} s"
     apart = f"the sampling interval {1 / rate:.9g} s"
     every = whole(1 / (rate * dt), f"dt = {dt} s does not divide {apart}: use one of {choices}")
     if every == 1 and sampling == "filtered":
