@@ -223,7 +223,7 @@ class DesignedInput(Printed, Result, eqx.Module):
         return (self.prior, self.now, self.flat, self.stderr) if self.moves else (self.prior, self.now, self.stderr)
 
     def _wider(self) -> list[str]:
-        """Whether a band twice as wide tells much more: motions for all that a muscle can do are often too slow."""
+        """Whether a band twice as wide tells much more: up to 5 Hz a stiff muscle shows too little of its parts."""
         if self.wider is None or all(self.percent(n, self.stderr) < 100 * EXACT for n in self.quantity):
             return []
         if all(self.flat[n] < MUCH * self.wider[1][n] for n in self.quantity):
