@@ -2,7 +2,7 @@
 
     python benchmarks/perturbed.py PART [--count N]
 
-PART: classical, amplitude, reflex, inertia, active, reference, people, rhythm, richer, seconds, coverage or time.
+PART: classical, amplitude, reflex, inertia, active, reference, people, rhythm, richer, linear, seconds, coverage or time.
 
 Takes a minute to a quarter of an hour each.
 """
@@ -279,6 +279,41 @@ def richer(count: int) -> None:
             _held(fits, truth(muscle))
 
 
+def linear(count: int) -> None:
+    """Linear specimens whose force fluctuates in its own way: one spring, damper and mass, and two parts in series."""
+    rate, length = 500.0, 66_000 // 2
+    f = np.fft.rfftfreq(length, 1 / rate)
+    s = 2j * np.pi * f
+
+    def shaped(rng: np.random.Generator, gain: np.ndarray) -> np.ndarray:
+        drawn = np.fft.irfft(np.fft.rfft(rng.standard_normal(length)) * gain, length)
+        return drawn / np.std(drawn)
+
+    two = 2000 + 60 * s + 0.5 * s**2, 4000 + 15 * s  # as the model's active and passive tissue
+    specimens = {
+        "one spring of 400 N/m": (400 + 10 * s + 0.3 * s**2, 1.2, 0.0, 400.0),
+        "one spring of 3000 N/m, tremor": (3000 + 20 * s + 0.3 * s**2, 1.0, 0.03, 3000.0),
+        "two parts in series, tremor": (two[0] * two[1] / (two[0] + two[1]) + 0.5 * s**2, 1.0, 0.03, 4000 / 3),
+    }
+    for words, (answer, corner, tremor, true) in specimens.items():
+        fits, apart, rng = [], [], np.random.default_rng(21)
+        for _ in range(count):
+            x = 1e-3 * shaped(rng, ((f >= 0.5) & (f <= 10)).astype(float))
+            own = 0.2 * shaped(rng, 1 / (1 + (f / corner) ** 2)) + 0.003 * rng.standard_normal(length)
+            own += tremor * shaped(rng, 1 / np.hypot(f**2 - 8.5**2, 0.8 * f))
+            force = 20.0 + own + np.fft.irfft(np.fft.rfft(x) * answer, length)
+            record = jm.PerturbedRecording.from_array(force, x, rate, positive="lengthening").steady((3.0, 63.0))
+            fits.append(jm.fit(TASK, record, seeds=0, check_seeds=0))
+            seen = fits[-1].target
+            right = jm.Recording.from_array(20.0 + own, rate).steady(record.force.window).target(settings=seen.settings)
+            apart.append(np.log(seen.proportional_power / right.proportional_power))
+        print(f"{words}; fluctuations off by {np.sqrt(np.mean(np.square(apart))):.3f} (rms of the log)")
+        known = [fit["tangent_stiffness"] for fit in fits if fit["tangent_stiffness"].stderr is not None]
+        spread(f"tangent stiffness (known {len(known)}/{count})", [p.value for p in known],
+               [float(p.stderr or 0) for p in known], true)  # fmt: skip
+        print(f"  described: {sum(bool(fit.adequate) for fit in fits)}/{count}", flush=True)
+
+
 def seconds(count: int) -> None:
     """Errors over the length of the recording, and over the amplitude."""
     for length, rms in ((30.0, 1e-3), (60.0, 1e-3), (120.0, 1e-3), (60.0, 0.5e-3), (60.0, 2e-3)):
@@ -323,7 +358,21 @@ def time(count: int) -> None:
 
 PARTS: dict[str, Callable[[int], None]] = {
     part.__name__: part
-    for part in (classical, amplitude, reflex, inertia, active, reference, people, rhythm, richer, seconds, coverage, time)
+    for part in (
+        classical,
+        amplitude,
+        reflex,
+        inertia,
+        active,
+        reference,
+        people,
+        rhythm,
+        richer,
+        linear,
+        seconds,
+        coverage,
+        time,
+    )
 }
 
 

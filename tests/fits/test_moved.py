@@ -15,6 +15,7 @@ from jaxmuscle.commands.console import write_fit
 from jaxmuscle.commands.main import app
 from jaxmuscle.data._perturbed_target import LINEAR
 from jaxmuscle.fits import _perturbed
+from jaxmuscle.fits._checks import reach_notices
 from jaxmuscle.fits._perturbed import seen_with
 from jaxmuscle.simulation._driven import driven
 
@@ -51,6 +52,18 @@ def test_a_response_alone_knows_no_noise_that_would_limit_a_further_measurement(
     assert "no further measurement is tried: the fit has no spectrum" in " ".join(str(report).split())
     with pytest.raises(ValueError, match=r"result: no further measurement is tried.*fit_joint"):
         jm.design_input(result)
+
+
+@pytest.mark.slow
+def test_a_tangent_stiffness_far_from_the_lowest_measured_one_is_called_extrapolated(fitted):
+    result = jm.load_result(fitted[0] / "fit.json")
+    part, known = result.only, result.only.target.stiffness.known
+    lowest = float(np.real(part.stiffness[0]))
+    near, far = (jm.fits.Estimate(lowest - 20.0, "N/m", stderr=error) for error in (15.0, 5.0))
+    assert reach_notices({"tangent_stiffness": near}, result.parts) == ()
+    assert reach_notices({"tangent_stiffness": jm.fits.Estimate(lowest - 20.0, "N/m")}, result.parts) == ()
+    (said,) = reach_notices({"tangent_stiffness@moved": far}, {"moved": part, "held": part})
+    assert f"below {known.frequency[0]:.2g} Hz, where this muscle has {lowest:.4g} N/m" in said and "extrapolated" in said
 
 
 def read(path):
@@ -287,3 +300,81 @@ def test_the_answer_of_a_light_and_damped_muscle_is_taken_off_whole(monkeypatch)
     power, more = (np.mean(t.proportional_power[12:22] * t.coefficient_of_variation[0] ** 2) for t in (seen, linear))
     density = 0.005**2 / (rate / 4) * np.diff(seen.frequency)[0] / 55.0**2  # of the noise that was added, in a bin
     assert power < 2 * density and more > 100 * density
+
+
+RATE, LENGTH = 500.0, 33_000
+AT = np.fft.rfftfreq(LENGTH, 1 / RATE)
+TURN = 2j * np.pi * AT
+PARTS = 2000 + 60 * TURN + 0.5 * TURN**2, 4000 + 15 * TURN  # [N/m] the model's active and passive tissue, both linear
+IN_SERIES = PARTS[0] * PARTS[1] / (PARTS[0] + PARTS[1]) + 0.5 * TURN**2
+
+
+def specimen(seed, bend=None):
+    """A linear specimen that is moved by 1 mm rms, its force with fluctuations of its own; these alone; and `bend` added."""
+    rng = np.random.default_rng(seed)
+
+    def shaped(gain):
+        drawn = np.fft.irfft(np.fft.rfft(rng.standard_normal(LENGTH)) * gain, LENGTH)
+        return drawn / np.std(drawn)
+
+    x = 1e-3 * shaped(((AT >= 0.5) & (AT <= 10)).astype(float))
+    own = 20 + 0.2 * shaped(1 / (1 + AT**2)) + 0.03 * rng.standard_normal(LENGTH)
+    linear = np.fft.irfft(np.fft.rfft(x) * IN_SERIES, LENGTH)
+    force = own + linear + (0.0 if bend is None else bend(x) - linear)
+    return jm.PerturbedRecording.from_array(force, x, RATE, positive="lengthening").steady((3.0, 63.0)), own
+
+
+def near_specimen():
+    """A muscle that answers small movements as the specimen does; but it is nonlinear, as the model is."""
+    x_w = 20 / 4000  # m, by which the mean force stretches the active tissue
+    k_w, k_z = 2000 / (TASK["x_ref_w"] ** 2 + 3 * x_w**2), 4000 / TASK["x_ref_z"] ** 2
+    values = {"k_w": k_w, "k_z": k_z, "c_w": 60.0, "c_z": 15.0, "m_w": 0.5, "m_z": 0.5}
+    pull = 20 + k_w * (TASK["x_ref_w"] ** 2 + x_w**2) * x_w
+    return TASK.replace(**values, P_w=pull, harmonic_amplitude=0.0)
+
+
+def test_the_muscle_of_these_tests_answers_as_the_specimen():
+    at = np.array([0.5, 2.0, 8.0])
+    with jax.enable_x64(True):
+        found = np.asarray(jm.response.dynamic_stiffness(near_specimen(), at))
+    np.testing.assert_allclose(found, IN_SERIES[np.rint(at * LENGTH / RATE).astype(int)], rtol=1e-3)
+
+
+@pytest.mark.parametrize("share", [0.0, 1.0, 2.0])
+def test_what_is_taken_off_is_as_nonlinear_as_the_recording(share):
+    """A specimen with none, all and twice of the model's nonlinear answer: each leaves the fluctuations that were put in."""
+    muscle = near_specimen()
+
+    def bend(x):
+        """The specimen's answer, so much nonlinear: one of steps is right, with the derivatives of all lines."""
+        fine = 4 * LENGTH
+        motion = np.array([4 * np.fft.irfft(TURN**order * np.fft.rfft(x), fine) for order in (0, 1, 2)])
+        whole = np.asarray(driven(muscle, -np.append(motion, motion[:, :1], axis=1), 1 / (4 * RATE)))[::2][:LENGTH]
+        linear = np.fft.irfft(np.fft.rfft(x) * IN_SERIES, LENGTH)
+        return linear + share * (whole - linear)
+
+    with jax.enable_x64(True):
+        recording, own = specimen(3, bend)
+        seen = seen_with(muscle, [recording])
+    alone = jm.Recording.from_array(own, RATE).steady(recording.force.window).target(settings=seen.settings)
+    apart = np.log(seen.proportional_power / alone.proportional_power)
+    assert np.sqrt(np.mean(apart**2)) < 0.1  # left in, the nonlinear answer more than doubles the power near 5 Hz
+    assert np.std(own) / 20 == pytest.approx(seen.coefficient_of_variation[0], rel=0.05)
+    said = [notice for notice in seen.notices if "nonlinearly than the muscle of the model" in notice]
+    assert len(said) == (share != 1.0)
+    if said:
+        assert ("less" if share < 1 else "more") in said[0] and "do not report K_w0" in said[0]
+        found, error = map(float, re.search(r"shows (-?\d+) ± (\d+) %", said[0]).groups())
+        assert abs(found - 100 * share) < 4 * error + 1 and error < 10
+
+
+@pytest.mark.slow
+def test_fluctuations_of_another_origin_do_not_hide_the_answer_from_the_search():
+    """They fall off at 1 Hz, the muscle relaxes at 5 Hz: a search that begins with both at once ends in a wrong muscle."""
+    recording, _ = specimen(5)
+    result = jm.fit(jm.on_rung(TASK, 1), recording, seeds=0, check_seeds=0)
+    for name, true in {"K_w_tangent": 2000, "K_z0": 4000, "C_w0": 60, "C_z0": 15, "tangent_stiffness": 4000 / 3}.items():
+        found = result[name]
+        assert found.stderr is None or abs(found.value - true) < 4 * found.stderr, name
+    assert abs(result["tangent_stiffness"].value - 4000 / 3) < 0.02 * 4000 / 3
+    assert result.only.chi2_per_point < 1.5

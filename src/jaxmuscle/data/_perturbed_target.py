@@ -34,15 +34,31 @@ NODES = 600
 HALF_STEPS = 10  # of the nonlinear muscle in a sampling interval
 LINEAR = ("the response to the movement was taken off as a linear one, since that of the nonlinear muscle could not be "
           "computed. If the motion was large, a part of it is left in the fluctuations")  # fmt: skip
+SURE, MUCH = 4.0, 0.2  # standard errors of a share of the nonlinear response; how far from 1 it is worth a notice
+UNLIKE = ("the force answers the movement {} nonlinearly than the muscle of the model: of the nonlinear part of the "
+          "model's answer ({:.2g} N rms) the recording shows {:.0f} ± {:.0f} %. The fit took off that share, so the "
+          "fluctuations are right. But do not report K_w0: it rests on the model's nonlinearity. Report K_w_tangent and "
+          "tangent_stiffness")  # fmt: skip
 
 Stiffness = Callable[[Float[np.ndarray, " frequencies"]], Complex[np.ndarray, " frequencies"]]
 Motion = Float[np.ndarray, "3 times"]
 Reply = Float[np.ndarray, " steps"]
 
 
+class _Moved(NamedTuple):
+    """One recording at the rate of the settings: force, lengthening about its mean in the window, and what the force does
+    when it follows that: linearly, and by how much differently in the nonlinear muscle (nothing where that is unknown)."""
+
+    force: Float[np.ndarray, " all"]
+    length: Float[np.ndarray, " all"]
+    reply: Float[np.ndarray, " all"]
+    bend: Float[np.ndarray, " all"]
+    exact: bool
+    inside: slice
+
+
 class _Ordinates(NamedTuple):
-    """One recording at the rate of the settings: `length` lengthening and `force` about their means in the window, and what
-    is left of the force."""
+    """The transforms of one recording in its window: lengthening, what is left of the force, and all of what is left."""
 
     f: Float[np.ndarray, " ordinates"]
     length: Complex[np.ndarray, " ordinates"]
@@ -68,7 +84,8 @@ def perturbed_target(
 
     over the ordinates j of a group g, about 0.12 f wide. The response is computed through the whole recording, so neither
     window nor leakage of the input biases Ĥ; where H is the muscle's own, e is its fluctuation alone. Its spectrum, mean and
-    coefficient of variation are the target's. S_E is the measured density of e.
+    coefficient of variation are the target's. S_E is the measured density of e. q is what the response of the nonlinear
+    muscle (`predicted`) differs by from h * l, and β = 1, unless the recordings show another share of q (`_share_shown`).
 
     **Arguments:**
 
@@ -81,7 +98,9 @@ def perturbed_target(
     """
     settings = recorded_settings(settings)
     each = [_measured(recording, settings) if stiffness is None else stiffness for recording in recordings]
-    pieces = [_ordinates(recording, own, predicted, settings) for recording, own in zip(recordings, each, strict=True)]
+    moved = [_moved(recording, own, predicted, settings) for recording, own in zip(recordings, each, strict=True)]
+    share, said = _share_shown(moved, settings) if predicted is not None else (1.0, ())
+    pieces = [_ordinates(*pair, share, said, settings) for pair in zip(recordings, moved, strict=True)]
     fluctuations = [piece.fluctuation for piece in pieces]
     called = name_of_all([recording.name for recording in recordings]) if name is None else name
     target = pooled_target(fluctuations, called, "force", provenance, None, settings)
@@ -105,30 +124,76 @@ def _even(recording: Recording, rate: float) -> tuple[Float[np.ndarray, " all"],
     return even.whole, slice(*span)
 
 
-def _ordinates(recording: Any, stiffness: Stiffness, predicted: Any, settings: SpectrumSettings) -> _Ordinates:
-    rate = settings.rate
-    force, inside = _even(recording.force, rate)
-    moved, _ = _even(recording.displacement, rate)
+def _moved(recording: Any, stiffness: Stiffness, predicted: Any, settings: SpectrumSettings) -> _Moved:
+    force, inside = _even(recording.force, settings.rate)
+    moved, _ = _even(recording.displacement, settings.rate)
     length = moved - np.mean(moved[inside])
-    reply, exact = _response(length, stiffness, predicted, rate)
+    return _Moved(force, length, *_response(length, stiffness, predicted, settings.rate), inside)
+
+
+def _transformed(x: Float[np.ndarray, " all"], inside: slice) -> Complex[np.ndarray, " ordinates"]:
+    here = x[inside] - np.mean(x[inside])
+    return np.fft.rfft(scipy.signal.windows.tukey(len(here), TAPER) * here)
+
+
+def _share_shown(moved: list[_Moved], settings: SpectrumSettings) -> tuple[float, tuple[str, ...]]:
+    """Which share β of the nonlinear muscle's own response q the recordings show, and what is to be said of it.
+
+    With the transforms E of F - h * l and Q of q, both without what in each group of frequencies is in proportion to L,
+
+        β = Σ Re(Q* E) / S_E  /  Σ |Q|² / S_E,     sd² = 1 / (2 Σ |Q|² / S_E)
+
+    1 of a muscle as the model's, 0 of a linear one. So β = 1 unless the recordings contradict that by four errors.
+    """
+    shown = weight = 0.0
+    for one in moved:
+        length, rest, bend = (_transformed(x, one.inside) for x in (one.length, one.force - one.reply, one.bend))
+        f = np.fft.rfftfreq(one.inside.stop - one.inside.start, 1 / settings.rate)
+        density = _smooth(f, np.abs(rest) ** 2)
+        edges = _groups(_lowest([f]), float(settings.frequency[-1]))
+        group = np.digitize(f, edges) - 1
+        used = (group >= 0) & (group < len(edges) - 1)
+        length, rest, bend, density, group = length[used], rest[used], bend[used], density[used], group[used]
+        own = np.zeros((3, len(edges) - 1), complex)
+        for row, x in zip(own, (length, rest, bend), strict=True):
+            np.add.at(row, group, np.conj(length) * x / density)
+        rest, bend = (
+            x - length * (row[group] / np.maximum(np.real(own[0][group]), 1e-300))
+            for x, row in ((rest, own[1]), (bend, own[2]))
+        )
+        shown += float(np.sum(np.real(np.conj(bend) * rest) / density))
+        weight += float(np.sum(np.abs(bend) ** 2 / density))
+    if weight <= 0:
+        return 1.0, ()
+    share, error = shown / weight, 1 / np.sqrt(2 * weight)
+    if abs(share - 1) <= SURE * error:
+        return 1.0, ()
+    size = np.sqrt(np.mean(np.concatenate([one.bend[one.inside] for one in moved]) ** 2))
+    words = "less" if share < 1 else "more"
+    return share, (UNLIKE.format(words, size, 100 * share, 100 * error),) * (abs(share - 1) > MUCH)
+
+
+def _ordinates(recording: Any, moved: _Moved, share: float, said: tuple[str, ...], settings: SpectrumSettings) -> _Ordinates:
+    rate, inside = settings.rate, moved.inside
+    left = moved.force - moved.reply - share * moved.bend
     edges = (recording.force.start + inside.start / rate, recording.force.start + inside.stop / rate)
     asked = tuple(recording.force.start + edge / rate for edge in recording.force.span(rate))
     cut = (
         () if max(abs(a - b) for a, b in zip(asked, edges, strict=True)) < CUT else (SHORTER.format(*asked, *edges, MARGIN),)
     )
-    fluctuation = Recording(force - reply, rate, unit=recording.force.unit, name=recording.name, source=recording.source,
+    linear = () if moved.exact else (LINEAR,)
+    fluctuation = Recording(left, rate, unit=recording.force.unit, name=recording.name, source=recording.source,
                             start=recording.force.start, window=edges,
-                            notices=(*recording.notices, *recording.late(), *cut, *(LINEAR,) * (not exact)))  # fmt: skip
-    rest = fluctuation.whole[inside]
-    taper = scipy.signal.windows.tukey(len(rest), TAPER)
-    f = np.fft.rfftfreq(len(rest), 1 / rate)
-    return _Ordinates(f, np.fft.rfft(taper * length[inside]), np.fft.rfft(taper * (rest - np.mean(rest))), fluctuation)
+                            notices=(*recording.notices, *recording.late(), *cut, *linear, *said))  # fmt: skip
+    f = np.fft.rfftfreq(inside.stop - inside.start, 1 / rate)
+    return _Ordinates(f, _transformed(moved.length, inside), _transformed(fluctuation.whole, inside), fluctuation)
 
 
 def _response(
     length: Float[np.ndarray, " all"], stiffness: Stiffness, predicted: Any, rate: float
-) -> tuple[Float[np.ndarray, " all"], bool]:
-    """What the force does when it follows the lengthening, right from the margin on; and whether it is as `predicted`."""
+) -> tuple[Float[np.ndarray, " all"], Float[np.ndarray, " all"], bool]:
+    """What the force does when it follows the lengthening linearly, right from the margin on; by how much `predicted`
+    differs; and whether that is known."""
     edge = round(0.5 * MARGIN * rate)
     ramp = np.sin(0.5 * np.pi * (np.arange(edge) + 0.5) / edge) ** 2
     tapered = length.copy()
@@ -138,17 +203,22 @@ def _response(
     where, density = scipy.signal.welch(tapered, rate, nperseg=min(1024, len(length)))
     excited = np.interp(f, where, density) >= EXCITED * np.max(density)
     moved = np.where(excited, np.fft.rfft(tapered), 0.0)
+    nodes = np.sinh(np.linspace(0.0, 6.0, NODES)) / np.sinh(6.0) * rate / 2
+    value = stiffness(nodes)
+    smooth = scipy.interpolate.CubicSpline(nodes, np.stack([np.real(value), np.imag(value)]), axis=1)(f)
+    reply = np.fft.irfft((smooth[0] + 1j * smooth[1]) * moved, len(length))
     if predicted is not None:
         fine, turn = HALF_STEPS * len(length), 2j * np.pi * f
         motion = np.stack([HALF_STEPS * np.fft.irfft(turn**order * moved, fine) for order in (0, 1, 2)])
         motion = np.append(motion, motion[:, :1], axis=1)  # which is periodic
-        reply = predicted(motion, 1 / (HALF_STEPS * rate))[:: HALF_STEPS // 2][: len(length)]
-        if np.all(np.isfinite(reply)):
-            return reply, True
-    nodes = np.sinh(np.linspace(0.0, 6.0, NODES)) / np.sinh(6.0) * rate / 2
-    value = stiffness(nodes)
-    smooth = scipy.interpolate.CubicSpline(nodes, np.stack([np.real(value), np.imag(value)]), axis=1)(f)
-    return np.fft.irfft((smooth[0] + 1j * smooth[1]) * moved, len(length)), predicted is None
+        whole = predicted(motion, 1 / (HALF_STEPS * rate))[:: HALF_STEPS // 2][: len(length)]
+        if np.all(np.isfinite(whole)):
+            return reply, whole - reply, True
+    return reply, np.zeros_like(reply), predicted is None
+
+
+def _lowest(each: list[Float[np.ndarray, " ordinates"]]) -> float:
+    return max(LOWEST, LEAST_PERIODS * max(float(f[1]) for f in each))
 
 
 def _groups(lowest: float, highest: float) -> Float[np.ndarray, " edges"]:
@@ -160,8 +230,7 @@ def _groups(lowest: float, highest: float) -> Float[np.ndarray, " edges"]:
 
 def _pooled(pieces: list[_Ordinates], stiffness: Stiffness, name: str, source: str, highest: float) -> FrequencyResponse:
     """The stiffness in groups of frequencies, those of all trials together with weights by their errors."""
-    lowest = max(LOWEST, LEAST_PERIODS * max(float(piece.f[1]) for piece in pieces))
-    edges = _groups(lowest, highest)
+    edges = _groups(_lowest([piece.f for piece in pieces]), highest)
     weight, change, middle = (np.zeros(len(edges) - 1, dtype) for dtype in (float, complex, float))
     for piece in pieces:
         group = np.digitize(piece.f, edges) - 1

@@ -63,8 +63,8 @@ def lateness(response: Response) -> list[str]:
         return []
     by, when = f"{1e3 * abs(delay):.2g} ± {1e3 * error:.1g} ms", "late" if delay > 0 else "early"
     return [f"the force comes {by} {when}, beyond what a spring, a damper and a mass explain. A filter in one of the "
-            "channels does that. Correct for the delay that your devices state (--delay, in s; Python: delay=). Else "
-            "damping and stiffness are wrong"]  # fmt: skip
+            "channels does that; so can a muscle of two parts in series, by a little. If your devices state a delay, "
+            "correct for it (--delay, in s; Python: delay=). Left in, it makes damping and stiffness wrong"]  # fmt: skip
 
 
 def lengthens(response: Response) -> float:

@@ -21,10 +21,11 @@ from jaxmuscle.simulation._trajectory import Trajectory
 from jaxmuscle.spectra._bin_law import BinStatistics, trial_samples
 from jaxmuscle.spectra._settings import WINDOW
 
-from ._part import Estimate, Start, met
+from ._part import Estimate, FittedPart, Start, met
 
 AMBIGUOUS, OTHER = 2.0, 3.0
 PULLED = 3.0  # prior standard deviations
+CLEAR, EXTRAPOLATED = 4.0, 2.0  # standard errors of a response that is seen clearly; of the tangent stiffness
 NONLINEAR = 0.1
 LEFT = 1e-3
 RISEN = 1.5
@@ -225,6 +226,28 @@ def mass_notices(coordinates: Coordinates, theta: Float[np.ndarray, " free"]) ->
                         "pulls it: the force may fluctuate in a way that this muscle cannot, or another mass moves. "
                         "Then stiffness and damping may be wrong by more than their errors. Compare them with K and B of "
                         "jaxmuscle analyse, which look at the response alone")  # fmt: skip
+    return tuple(said)
+
+
+def reach_notices(found: Mapping[str, Estimate], parts: Mapping[str, FittedPart]) -> tuple[str, ...]:
+    """The notice of a tangent stiffness, H(0), that is not what was measured at the lowest frequency of the motion."""
+    said = []
+    for name, p in found.items():
+        if base_of(name) != "tangent_stiffness" or p.stderr is None:
+            continue
+        for part in (part for key, part in parts.items() if name.partition("@")[2] in ("", key)):
+            if part.stiffness is None or part.target.stiffness is None:
+                continue
+            known = part.target.stiffness.known
+            seen = np.flatnonzero(np.abs(part.stiffness) > CLEAR * known.stderr)
+            if not len(seen):
+                continue
+            lowest, there = float(known.frequency[seen[0]]), float(np.real(part.stiffness[seen[0]]))
+            if abs(there - p.value) > EXTRAPOLATED * p.stderr:
+                said.append(f"{name} ({p.value:.4g} N/m) is extrapolated: the motion tells little below {lowest:.2g} Hz, "
+                            f"where this muscle has {there:.4g} N/m. What it does at lower frequencies follows from the "
+                            f"fluctuations alone. What to do: report the stiffness at {lowest:.2g} Hz, or record once more "
+                            "with a slower motion")  # fmt: skip
     return tuple(said)
 
 

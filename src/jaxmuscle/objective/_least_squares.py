@@ -166,7 +166,7 @@ def least_squares(
     none, nothing = np.zeros(len(s), dtype=int), np.full(len(s), np.inf)
     now = _Standing(s, s, nothing, none, none, none, none, none, none, np.arange(len(s)) < count)
     last = np.minimum(np.arange(count + fill), count - 1)
-    data = jax.tree.map(lambda x: np.asarray(x)[last], _for_all(objective.data, count) if data is None else data)
+    data = jax.tree.map(lambda x: np.asarray(x)[last], for_all(objective.data, count) if data is None else data)
     seen = state = None
     for _ in range(max_steps):
         rows = np.flatnonzero(now.active) if batched else np.arange(count)
@@ -186,7 +186,8 @@ def least_squares(
     return now.minima(count)
 
 
-def _for_all(data: Any, count: int) -> Any:
+def for_all(data: Any, count: int) -> Any:
+    """The same data for each of so many starts."""
     return jax.tree.map(lambda x: np.broadcast_to(x, (count, *np.shape(x))), data)
 
 

@@ -1,5 +1,6 @@
 """Where the starts of a fit begin, and which different minima they ended in."""
 
+import dataclasses
 import itertools
 import math
 from collections.abc import Mapping
@@ -11,10 +12,16 @@ from scipy.special import ndtri
 from jaxmuscle.data._target import Target
 
 from ._coordinates import Coordinates
-from ._least_squares import Minima
+from ._least_squares import Minima, for_all, least_squares
 from ._problem import FitProblem
+from ._residuals import Data, Residuals
 
 RANGE = 30.0  # of stiffness and damping, about the default
+RESPONSE = ("k_w", "k_z", "c_w", "c_z", "m_w", "m_z", "P_w")
+MOST, STEPS = 8, 25  # starts that begin at the measured response, and steps that are made to find them
+SEARCHES, AGREEING, SAME, BEHIND = (10, 22), 4, 0.1, 10.0  # by the response alone: how many, how many must agree, to which
+# difference of their costs, and how far above the best one a search ends if it gains little
+UNKNOWN = 1e6  # standard deviation of a log power that is not to count
 
 
 def starting_points(problem: FitProblem, count: int) -> Float[np.ndarray, "starts free"]:
@@ -33,6 +40,7 @@ def starting_points(problem: FitProblem, count: int) -> Float[np.ndarray, "start
     _spread_resonances(problem, theta)
     if any(part.points is not None for part in problem.parts):
         _spread_coefficients(problem, theta)
+        return _on_response(problem, coordinates.from_theta(theta))
     return coordinates.from_theta(theta)
 
 
@@ -67,6 +75,51 @@ def _spread_coefficients(problem: FitProblem, theta: Float[np.ndarray, "starts f
     for pair, factor in zip((("k_w", "k_z"), ("c_w", "c_z")), factors.T, strict=True):
         for column in (i for i, name in enumerate(names) if name.partition("@")[0] in pair):
             theta[rows, column] += factor / problem.coordinates.sd[column]
+
+
+def _on_response(problem: FitProblem, points: Float[np.ndarray, "starts free"]) -> Float[np.ndarray, "starts free"]:
+    """Some of the starts are found in two steps: the muscle by its response alone, then what makes it fluctuate.
+
+    The fluctuations may have another origin than the model says. Then they pull a search that fits both at once into a
+    muscle that does neither. So every other start of the last third begins where the dynamic stiffness alone is fitted
+    best, and where beside this muscle the fluctuations are.
+    """
+    rows = np.arange(2 * len(points) // 3, len(points))[::2][:MOST]
+    if not problem.control or not len(rows):
+        return points
+    names, objective = problem.coordinates.names, problem.linear()
+    answers = np.isin([name.partition("@")[0] for name in names], RESPONSE)
+    answer = _answering(problem, objective)
+    if answer is None:
+        return points
+    points = points.copy()
+    points[np.ix_(rows, answers)] = answer[answers]
+    held = dataclasses.replace(objective, moving=np.where(answers, 0.0, objective.moving))
+    beside = least_squares(held, points[rows], STEPS)
+    points[rows] = np.where(np.isfinite(beside.cost)[:, None], beside.s, points[rows])
+    return points
+
+
+def _answering(problem: FitProblem, objective: Residuals) -> Float[np.ndarray, " free"] | None:
+    """Where the dynamic stiffness alone is fitted best, of some searches and, unless these agree, of more."""
+    spread = np.zeros((2 * sum(SEARCHES), len(problem.coordinates.names)))
+    _spread_coefficients(problem, spread)
+    starts = problem.coordinates.from_theta(spread[1::2])
+    blind = tuple(map(_blind, objective.data))
+    ends, cost = np.zeros((0, starts.shape[1])), np.zeros(0)
+    for some in np.split(starts, np.cumsum(SEARCHES)[:-1]):
+        found = least_squares(objective, some, STEPS, data=for_all(blind, len(some)), margin=BEHIND)
+        ends, cost = np.concatenate([ends, found.s]), np.append(cost, np.where(np.isfinite(found.cost), found.cost, np.inf))
+        if np.sum(cost < np.min(cost) + SAME) >= AGREEING:
+            break
+    return ends[np.argmin(cost)] if np.isfinite(np.min(cost)) else None
+
+
+def _blind(data: Data) -> Data:
+    """The same of a target whose spectrum does not count, nor how large the fluctuations are."""
+    sd, sigma = (np.full_like(own, UNKNOWN) for own in (data.sd, data.sigma))
+    variation = None if data.variation is None else (data.variation[0], np.asarray(UNKNOWN))
+    return dataclasses.replace(data, sd=sd, sigma=sigma, variation=variation)
 
 
 def frequencies_for(problem: FitProblem, name: str, count: int) -> Float[np.ndarray, " starts"]:

@@ -11,7 +11,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure, SubFigure
-from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter, NullLocator
 
 from jaxmuscle._common.text import printable
 
@@ -45,6 +45,7 @@ STYLE: dict[str, Any] = {
 COLUMN = 4.4  # inches: in a column of 85 mm letters of 8 points are those of 6
 ON_DARK = 1.8  # times as strong is a grey on a dark page, to be seen as well
 LINE = 0.17  # inches
+NARROW = 4.0  # from end to end of a logarithmic axis: of so few 1, 2 and 5 may leave one number only
 SIZE = (COLUMN, 3.0)
 LOCK = threading.RLock()  # pyplot and rcParams are those of all threads
 PROPORTIONAL = "Proportional power (fraction per bin)"
@@ -178,9 +179,14 @@ def frequency_axis(ax: Axes, log: bool) -> None:
 
 
 def log_axis(ax: Axes, which: Literal["x", "y"] = "x") -> None:
-    """A logarithmic abscissa or ordinate with plain numbers, as many as have room."""
+    """A logarithmic abscissa or ordinate with plain numbers, as many as have room, and two at least."""
     ax.set(**{f"{which}scale": "log"})
     (low, high), axis, decades = (ax.get_xlim(), ax.xaxis, 1e3) if which == "x" else (ax.get_ylim(), ax.yaxis, 1e2)
-    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if high < decades * low else (1.0,)))
+    narrow = high < NARROW * low
+    axis.set_major_locator(
+        MaxNLocator(4, min_n_ticks=2) if narrow else LogLocator(subs=(1.0, 2.0, 5.0) if high < decades * low else (1.0,))
+    )
+    if narrow:
+        axis.set_minor_locator(NullLocator())
     axis.set_major_formatter(FuncFormatter(lambda x, _: number_in_print(x)))
     axis.set_minor_formatter(NullFormatter())
