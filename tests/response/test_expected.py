@@ -772,6 +772,8 @@ def test_nothing_to_see(x64):
     unmoved = references.quiet(jm.PrescribedForce(5.0, 0.0), harmonic_amplitude=0.0).replace(noise_K_z=0.1)
     with pytest.raises(ValueError, match=r"is zero: .* moves x_z"):
         jm.expected_spectrum(unmoved)
+    with pytest.raises(ValueError, match="is zero: P_w is 0, so that nothing stretches the muscle; set P_w above 0"):
+        jm.expected_spectrum(jm.Isometric(P_w=0.0))
 
 
 @pytest.mark.slow

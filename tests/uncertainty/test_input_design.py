@@ -311,6 +311,10 @@ def test_limits_are_kept():
     assert np.max(np.abs(made.displacement)) <= 1.2e-3 * (1 + 1e-9) and np.max(np.abs(velocity)) <= 8e-3 * (1 + 1e-3)
     assert made.speed == pytest.approx(np.max(np.abs(velocity)), rel=1e-2)
     assert max(made.peak / 1.2e-3, made.speed / 8e-3) > 0.95  # and used
+    limit = "peak" if made.peak / 1.2e-3 > made.speed / 8e-3 else "speed"
+    words = " ".join(str(made).split())
+    assert made.rms < 0.9e-3 and f"limit that you gave with --{limit} ({limit}=) keeps it below 1 mm rms" in words
+    assert "keeps it below" not in str(designed(quantity="K_z0"))
     assert made.gain > 1.0 and made.even.rms < made.rms
 
 

@@ -23,6 +23,7 @@ from ._harmonic_line import harmonic_line
 from ._linearised import Linearisation, linearise
 
 TAIL = 1e-13
+ROUNDING = 1e-20  # of any unit of the output: fluctuations that are smaller are none
 LAGS = 4096  # a program is made for so many samples, for 4 times, 16 times ... as many, and serves all below
 
 
@@ -192,10 +193,12 @@ def linear_spectrum(task: AbstractTask, settings: SpectrumSettings, window: tupl
 def check_power(task: AbstractTask, moments: Moments) -> None:
     """Refuse a spectrum that is zero but for rounding: fluctuations below the last digits of the mean."""
     power, mean = np.asarray(moments.power), float(moments.mean)
-    least = (1e3 * np.finfo(power.dtype).eps * mean) ** 2
+    least = max(1e3 * np.finfo(power.dtype).eps * abs(mean), ROUNDING) ** 2
     if not np.sum(power) * task.settings.resolution > least:
-        raise ValueError(f"the expected spectrum of this {type(task).__name__} is zero: it has neither noise nor a "
-                         f"harmonic that moves {task.output_name}; set noise_K_w, say")  # fmt: skip
+        idle = "P_w" in task.parameter_names and float(task["P_w"]) == 0
+        why = "P_w is 0, so that nothing stretches the muscle; set P_w above 0" if idle else (
+            f"it has neither noise nor a harmonic that moves {task.output_name}; set noise_K_w, say")  # fmt: skip
+        raise ValueError(f"the expected spectrum of this {type(task).__name__} is zero: {why}")
 
 
 def check_line(task: AbstractTask, settings: SpectrumSettings) -> None:

@@ -29,6 +29,7 @@ SHORTEST = 1.0  # s of a record that are worth telling of
 SHOWN = 2.0  # times the even density: where a design moves the most
 DOUBTFUL = 0.3  # relative standard error
 ENDURED = 3600.0  # s of a record
+LIMITS, SMALLER = ("peak", "speed", "acceleration"), 0.9  # a motion this much smaller, or this near to its limit
 MUCH, EXACT = 1.3, 0.05  # times as exact; a relative error that needs no other motion
 LOOSE = 0.33  # a third of the usual prior, 1 in the logarithm
 OPEN = (
@@ -55,7 +56,8 @@ class DesignedInput(Printed, Result, eqx.Module):
     one standard error below and above, and the error that this motion gives there, both in its unit; `masses` [kg] that the
     fit does not have free, and which of them are `held`: the others are fitted with the record,
     their errors are in the rest; `wider`, a frequency [Hz] twice as high as the band's highest, and the errors with a flat
-    motion up to there, or None; `moved`, whether a moved record is known already.
+    motion up to there, or None; `moved`, whether a moved record is known already; `allowed`, the rms [m] that was
+    asked for, and the largest displacement [m], speed [m/s] and acceleration [m/s²], infinite where there is no limit.
     """
 
     quantity: tuple[str, ...] = eqx.field(static=True)
@@ -77,6 +79,7 @@ class DesignedInput(Printed, Result, eqx.Module):
     prior: dict[str, float] = eqx.field(default_factory=dict)
     wider: tuple[float, dict[str, float]] | None = None
     moved: bool = eqx.field(static=True, default=False)
+    allowed: tuple[float, float, float, float] = eqx.field(static=True, default=(0.0, np.inf, np.inf, np.inf))
 
     @property
     def time(self) -> Float[np.ndarray, " samples"]:
@@ -206,6 +209,7 @@ class DesignedInput(Printed, Result, eqx.Module):
             "large" if self.moves else "  this motion is flat itself: no frequency is preferred",
             f"  lengthening of the muscle: {1e3 * self.rms:.3g} mm rms, at most {1e3 * self.peak:.3g} mm to "
             f"either side, {1e3 * self.speed:.3g} mm/s and {self.acceleration:.2g} m/s², {low:.2g} to {high:.2g} Hz",
+            *self._limited(),
             *[f"  most of the motion: {most}"] * bool(most),
             "  expected standard errors, in percent of the value (prior: without any data; now: before this record):",
             f"    {'':<22}{'prior':>10}{'now':>10}{'flat':>10}" + f"{'designed':>10}" * bool(self.moves),
@@ -221,6 +225,25 @@ class DesignedInput(Printed, Result, eqx.Module):
     def _columns(self) -> tuple[dict[str, float], ...]:
         """The errors that are printed; a motion that is flat itself is no other one."""
         return (self.prior, self.now, self.flat, self.stderr) if self.moves else (self.prior, self.now, self.stderr)
+
+    @property
+    def _limit(self) -> str | None:
+        """Which limit keeps the motion smaller than was asked for, by its option, or None."""
+        rms, *limits = self.allowed
+        reached = np.array([self.peak, self.speed, self.acceleration]) / limits
+        return LIMITS[int(np.argmax(reached))] if self.rms < SMALLER * rms and np.max(reached) > SMALLER else None
+
+    def _limited(self) -> list[str]:
+        """Why the motion is smaller than was asked for."""
+        limit = self._limit
+        slower = ", or a band with lower frequencies" * (limit in LIMITS[1:])
+        return [f"  the limit that you gave with --{limit} ({limit}=) keeps it below {1e3 * self.allowed[0]:.3g} mm rms. A "
+                f"motor that can do more{slower} makes it larger"] * (limit is not None)  # fmt: skip
+
+    @property
+    def _larger(self) -> str:
+        """How a record gets to tell more."""
+        return "raise rms" if self._limit is None else f"take a motor that can do more (--{self._limit})"
 
     def _wider(self) -> list[str]:
         """Whether a band twice as wide tells much more: up to 5 Hz a stiff muscle shows too little of its parts."""
@@ -245,14 +268,14 @@ class DesignedInput(Printed, Result, eqx.Module):
             error, seconds = self.needed
             goal = f"{' and '.join(self.quantity)} to {100 * error:.3g} % (standard error)"
             if not np.isfinite(seconds):
-                return [*lines, f"  no length of the record tells {goal}: raise rms, or choose another band"]
+                return [*lines, f"  no length of the record tells {goal}: {self._larger}, or choose another band"]
             if all(self.percent(name, self.now) <= 100 * error for name in self.quantity):
                 return [*lines, f"  {goal}: what is known without this record is enough for that"]
             if seconds < SHORTEST:
                 return [*lines, f"  {goal}: less than {SHORTEST:g} s of this motion would tell that. Play one period"]
             if seconds > ENDURED:
                 return [*lines, f"  to know {goal}, a record of {seconds / 3600:.2g} hours would be needed, which nobody "
-                        "holds: raise rms, or choose another band"]  # fmt: skip
+                        f"holds: {self._larger}, or choose another band"]  # fmt: skip
             begin, end = self.window
             period, periods = self.lengthening.seconds, round((end - begin) / self.lengthening.seconds)
             if_so = ", if the muscle is like the one given here" if self._vague() else ""

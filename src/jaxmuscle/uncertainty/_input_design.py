@@ -145,7 +145,7 @@ def design_input(
     notices = missed(result) if isinstance(result, FitResult) else ()
     return DesignedInput(quantities, own, even, motion, float(rate), values, units, now, flat, best, longer, needed, notices,
                          others, experiment.masses, experiment.held, experiment.by_prior(), wider,
-                         experiment.moved)  # fmt: skip
+                         experiment.moved, (rms, *limits.tolist()))  # fmt: skip
 
 
 def _named(name: str, known: Mapping[str, Any], targets: Iterable[str | None]) -> str:
