@@ -364,7 +364,8 @@ def test_what_is_taken_off_is_as_nonlinear_as_the_recording(share):
     assert len(said) == (share != 1.0)
     if said:
         assert ("less" if share < 1 else "more") in said[0] and "do not report K_w0" in said[0]
-        found, error = map(float, re.search(r"shows (-?\d+) ± (\d+) %", said[0]).groups())
+        found, error = map(float, re.search(r"shows (-?\d+) ± (\d+) % of it", said[0]).groups())
+        assert f"subtracted {'that share' if share else 'none of it'} from the force" in said[0]
         assert abs(found - 100 * share) < 4 * error + 1 and error < 10
 
 

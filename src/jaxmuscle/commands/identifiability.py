@@ -51,5 +51,6 @@ def identifiability(
         stiffness = found.present.quantities.get("K_w0")
         if stiffness is not None and not stiffness.determined:
             out.print("How long must a record with a moved insertion be? For a standard error of 10 %, beginning with a "
-                      f"flat motion, ask: jaxmuscle design {output}/fit.json --quantity K_w_tangent --error 10 --spread 1",
-                      highlight=False, soft_wrap=True)  # fmt: skip
+                      f"flat motion, ask: jaxmuscle design {output}/fit.json --quantity K_w_tangent --error 10 --spread 1. "
+                      "Its errors hold if m_z is about what the motor will move: first fit with your estimate in kg (--fix "
+                      "m_z=2.3, say), if you have not done so", highlight=False, soft_wrap=True)  # fmt: skip

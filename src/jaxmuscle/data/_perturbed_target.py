@@ -34,11 +34,11 @@ NODES = 600
 HALF_STEPS = 10  # of the nonlinear muscle in a sampling interval
 LINEAR = ("the response to the movement was taken off as a linear one, since that of the nonlinear muscle could not be "
           "computed. If the motion was large, a part of it is left in the fluctuations")  # fmt: skip
-SURE, MUCH = 4.0, 0.2  # standard errors of a share of the nonlinear response; how far from 1 it is worth a notice
-UNLIKE = ("the force answers the movement {} nonlinearly than the muscle of the model: of the nonlinear part of the "
-          "model's answer ({:.2g} N rms) the recording shows {:.0f} ± {:.0f} %. The fit took off that share, so the "
-          "fluctuations are right. But do not report K_w0: it rests on the model's nonlinearity. Report K_w_tangent and "
-          "tangent_stiffness")  # fmt: skip
+SURE, NONE, MUCH = 4.0, 2.0, 0.2  # standard errors of a share of the nonlinear response from 1, and from 0; for a notice
+UNLIKE = ("the force answers the movement {} nonlinearly than the muscle of the model. The nonlinear part of the model's "
+          "answer is {:.2g} N rms; the recording shows {:.0f} ± {:.0f} % of it. The fit subtracted {} from the force, so "
+          "the fluctuations are right. But do not report K_w0: it rests on the model's nonlinearity. Report "
+          "tangent_stiffness, and K_w_tangent if it is determined")  # fmt: skip
 
 Stiffness = Callable[[Float[np.ndarray, " frequencies"]], Complex[np.ndarray, " frequencies"]]
 Motion = Float[np.ndarray, "3 times"]
@@ -169,8 +169,10 @@ def _share_shown(moved: list[_Moved], settings: SpectrumSettings) -> tuple[float
     if abs(share - 1) <= SURE * error:
         return 1.0, ()
     size = np.sqrt(np.mean(np.concatenate([one.bend[one.inside] for one in moved]) ** 2))
-    words = "less" if share < 1 else "more"
-    return share, (UNLIKE.format(words, size, 100 * share, 100 * error),) * (abs(share - 1) > MUCH)
+    none = abs(share) <= NONE * error
+    words = UNLIKE.format("less" if share < 1 else "more", size, 100 * share, 100 * error,
+                          "none of it" if none else "that share")  # fmt: skip
+    return 0.0 if none else share, (words,) * (abs(share - 1) > MUCH)
 
 
 def _ordinates(recording: Any, moved: _Moved, share: float, said: tuple[str, ...], settings: SpectrumSettings) -> _Ordinates:

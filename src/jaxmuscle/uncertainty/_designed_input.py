@@ -309,9 +309,9 @@ class DesignedInput(Printed, Result, eqx.Module):
                       "C_w0 and K_w0 wrong, too (docs/perturbed.md has by how much)"]  # fmt: skip
         elif not self.held and any(value != USUAL for value in self.masses.values()):
             lines += [
-                f"  assumed: {values}, as in this fit or preset. A held force tells no mass. If you did not choose these "
-                f"values and know roughly what moves, fit with that (--fix m_w={USUAL:g} --fix m_z={USUAL:g}, say) and "
-                f"design again. The fit of the new record leaves both masses free, and starts them at {USUAL:g} kg"
+                f"  assumed: {values}, as in this fit or preset. A held force tells no mass. Is m_z your estimate "
+                f"of what moves? Then go on. If not, fit with your estimate (--fix m_w={USUAL:g} --fix m_z=KG) and design "
+                f"again. The fit of the new record leaves both masses free, and starts them at {USUAL:g} kg"
             ]
         return lines
 
