@@ -186,6 +186,16 @@ def test_a_bad_spectrum_does_not_hide_behind_a_good_response(result, x64):
     found = re.fullmatch(missed, said)
     assert todo.endswith("look at the residuals of the spectrum in the figure")
     assert found and bins - 7 < float(found[1]) < bins
+    # Much worse, the whole is refused: then it is said that the response is described all the same.
+    changed[:bins] *= 3.0
+    refused = Endpoint(problem, objective, expand(objective, theta[None]).row(0))
+    refused.__dict__["found"] = ended.found._replace(residuals=changed)
+    verdict, (said,) = refused.judged
+    assert not verdict.adequate and re.match(r"taken alone, the model describes the dynamic stiffness \(p = [01.]", said)
+    changed[-2 * points :] *= 10.0
+    neither = Endpoint(problem, objective, expand(objective, theta[None]).row(0))
+    neither.__dict__["found"] = ended.found._replace(residuals=changed)
+    assert neither.judged[1] == ()
 
 
 @pytest.mark.slow

@@ -307,6 +307,16 @@ def test_numbers_that_are_read_in_two_ways_are_said_in_both():
     assert not any(word in str(made_result(derived=alone)) for word in ("above", "counted from"))
 
 
+def test_an_interval_that_is_wider_than_its_error_says_is_to_be_stated():
+    wide = Estimate(0.94, "Hz", 0.12, interval=(0.3, 2.23))
+    usual = Estimate(0.94, "Hz", 0.12, interval=(0.7, 1.2))
+    half_open = Estimate(0.94, "Hz", 0.12, interval=(None, 2.23))
+    words = "half_power_frequency: the interval is much wider than two standard errors to both sides. State the interval"
+    for found in (wide, usual, half_open):
+        text = " ".join(str(made_result(derived={"half_power_frequency": found})).split())
+        assert (words in text) == (found is wide)
+
+
 def test_a_fit_that_misses_the_data_says_so_first():
     missed = Adequacy(145.0, 25.0, 0.001, "the data have more power than the model from 7 to 9 Hz (12.0 standard errors)")
     found = made_result(adequacy=missed, chi2_per_bin=5.0)

@@ -30,6 +30,9 @@ from ._refit import STRENGTHS, Refit, refit_of
 ADEQUATE = 0.01
 ALONE = 2.5  # standard deviations: a single bin beyond the run that is named
 REPLICATES = 999
+ELSEWHERE = (
+    "The misfit is in the other data. What comes from what it describes may still be right: fit that alone, and compare"
+)
 Rows = Float[np.ndarray, "replicates residuals"]
 
 
@@ -168,7 +171,12 @@ def judged(ended: Endpoint) -> tuple[Adequacy | None, tuple[str, ...]]:
         misfit = _misfit(problem, objective, found.residuals, inner)
     kinds = _kinds(problem, objective)
     alone = {words: _tested(found.residuals[rows], rest[:, rows]) for words, rows in kinds.items()}
-    hidden = {words: each for words, each in alone.items() if each[2] < ADEQUATE / len(kinds)} if p >= ADEQUATE else {}
+    if p < ADEQUATE:
+        right = [f"{words} ({probability(each[2])})" for words, each in alone.items() if each[2] >= ADEQUATE]
+        return Adequacy(here, expected, p, misfit), tuple(
+            [f"taken alone, the model describes {' and '.join(right)}. {ELSEWHERE}"] * (bool(right) and len(kinds) > 1)
+        )
+    hidden = {words: each for words, each in alone.items() if each[2] < ADEQUATE / len(kinds)}
     said = tuple(f"the model does not describe {words}, taken alone: chi2 {chi2:.3g}, expected {mean:.3g}, "
                  f"{probability(own)}. The verdict counts all data together and does not show this. What to do: look at the "
                  f"residuals of {words} in the figure"

@@ -29,6 +29,7 @@ ALIASES = {
 }
 LENGTHS = ("x_ref_w", "x_ref_z")
 OTHER_LENGTHS = (0.75, 1.5)  # times x_ref_w
+BROAD = 1.7 * 3.92  # standard errors: an interval that is wider than theirs
 COLUMNS = ("name", "value", "95 % interval", "unit", "in the fit", "what it is")
 WHAT_TO_DO = (
     "what to do: do not interpret the parameters. Report that the model does not describe the data, and report none of its "
@@ -195,8 +196,12 @@ def _beside(name: str, p: Estimate) -> str:
 
 
 def _counted(shown: Mapping[str, Estimate], every: Mapping[str, Estimate]) -> list[str]:
-    """What the numbers in a table count where the model has a tremor, in sentences."""
+    """Which intervals are wider than their errors say, and what numbers count where the model has a tremor, in sentences."""
     sentences = []
+    broad = [name for name, p in shown.items() if _is_broad(p)]
+    if broad:
+        sentences.append(f"{', '.join(broad)}: the interval is much wider than two standard errors to both sides. State the "
+                         "interval: the error holds only near the best value")  # fmt: skip
     for name in shown:
         base, at, target = name.partition("@")
         rhythm = every.get(f"tremor_frequency{at}{target}")
@@ -206,6 +211,12 @@ def _counted(shown: Mapping[str, Estimate], every: Mapping[str, Estimate]) -> li
             sentences.append(f"{name}: is the mean of the highest third of the bins, tremor included. Do not report it "
                              "beside the tremor")  # fmt: skip
     return sentences
+
+
+def _is_broad(p: Estimate) -> bool:
+    """Whether its interval is much wider than its standard error says."""
+    low, high = p.interval or (None, None)
+    return bool(p.stderr) and low is not None and high is not None and high - low > BROAD * (p.stderr or 0.0)
 
 
 def _by_band(result: "FitResult", table: dict[str, Estimate]) -> list[str]:

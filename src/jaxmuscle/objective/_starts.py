@@ -85,10 +85,10 @@ def _on_response(problem: FitProblem, points: Float[np.ndarray, "starts free"]) 
     best, and where beside this muscle the fluctuations are.
     """
     rows = np.arange(2 * len(points) // 3, len(points))[::2][:MOST]
-    if not problem.control or not len(rows):
+    answers = np.isin([name.partition("@")[0] for name in problem.coordinates.names], RESPONSE)
+    if not problem.control or not len(rows) or not np.any(answers):  # of an own muscle nobody knows which parameters answer
         return points
-    names, objective = problem.coordinates.names, problem.linear()
-    answers = np.isin([name.partition("@")[0] for name in names], RESPONSE)
+    objective = problem.linear()
     answer = _answering(problem, objective)
     if answer is None:
         return points
