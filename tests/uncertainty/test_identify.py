@@ -372,6 +372,15 @@ def test_the_report_names_what_it_knows_and_the_fit_does_not():
     said = " ".join(str(found).split())
     assert f"known here, but not determined in the fit: {', '.join(found.open_in_fit)}. The fit is stricter" in said
     assert found.to_dict()["not_determined_in_fit"] == list(found.open_in_fit)
+    # Neither the table nor the figure shows it as determined.
+    row = next(line for line in str(found).splitlines() if line.split()[:1] == ["harmonic_share"])
+    assert row.rstrip().endswith(")")
+    figure = found.plot()
+    (matrix,) = (ax for ax in figure.axes if "bold" in ax.get_title(loc="left"))
+    names = [tick.get_text().replace("\n", "").partition(" ")[0] for tick in matrix.get_yticklabels()]
+    bold = {names[int(cell.get_position()[1])]: cell.get_weight() == "bold" for cell in matrix.texts}
+    assert not bold["harmonic_share"] and bold["corner_frequency"]
+    plt.close(figure)
     other = jm.identifiability(result, result.target, designs=())  # of another target the fit has said nothing
     assert not other.open_in_fit and "not determined in the fit" not in str(other)
 

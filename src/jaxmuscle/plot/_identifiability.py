@@ -37,7 +37,7 @@ def identifiability(report: Any, ax: Axes | None = None) -> Figure | SubFigure:
     fig = canvas(ax, (width, sum(heights)))
     upper, lower = fig.subfigures(2, 1, squeeze=False, height_ratios=heights)[:, 0]
     _singular_values(upper.add_subplot(), shown, labels, report.threshold)
-    _matrix(lower.add_subplot(), shown, marks, names)
+    _matrix(lower.add_subplot(), shown, marks, names, report.open_in_fit)
     fitted_to(fig, sum(heights), heading(fig, report.target, bad=report.doubt) + key(fig, 3), width)
     return fig
 
@@ -77,8 +77,11 @@ def _singular_values(ax: Axes, shown: list[Any], labels: list[str], threshold: f
     ax.spines["left"].set_visible(False)
 
 
-def _matrix(ax: Axes, shown: list[Any], marks: list[str], names: list[str]) -> None:
-    """Colour: share of the prior's standard deviation that is left. Number: standard error; bold: determined."""
+def _matrix(ax: Axes, shown: list[Any], marks: list[str], names: list[str], doubted: tuple[str, ...]) -> None:
+    """Colour: share of the prior's standard deviation that is left. Number: standard error; bold: determined.
+
+    In the first column, the present data, that is as the fit has it: what it doubts is not bold.
+    """
     left = np.array([[o.quantities[name].left for o in shown] for name in names])
     mesh = ax.imshow(np.minimum(left, 1.0), cmap="Blues_r", vmin=PALE, vmax=1.0, aspect="auto")
     labels = []
@@ -87,7 +90,8 @@ def _matrix(ax: Axes, shown: list[Any], marks: list[str], names: list[str]) -> N
         for j, outlook in enumerate(shown):
             known = outlook.quantities[name]
             number, _, unit = known.percent.partition(" ")
-            ax.text(j, i, number, ha="center", va="center", color="black", weight="bold" if known.determined else "normal")
+            sure = known.determined and (j > 0 or name not in doubted)
+            ax.text(j, i, number, ha="center", va="center", color="black", weight="bold" if sure else "normal")
         labels.append(_wrapped(name) + (f" ({unit})" if unit != "%" else ""))
     ax.set_yticks(range(len(names)), labels, linespacing=0.9)
     ax.set_xticks(range(len(shown)), [mark.replace(" + ", "\n+") for mark in marks], weight="bold", linespacing=0.95)

@@ -295,8 +295,8 @@ def _table(report: IdentifiabilityReport) -> list[str]:
         lines.append(f"  {'':<{wide}}{'value':>9} {'unit':<5}" + "".join(f"{head:>6}" for head in heads))
         for name in names:
             now = report.present.quantities[name]
-            cells = [f"({_cell(now, now.prior_sd)})", *(_shown(o.quantities[name]) for o in
-                                                        (report.present, *(d for _, d in block)))]  # fmt: skip
+            here = f"({_cell(now, now.stderr)})" if name in report.open_in_fit else _shown(now)
+            cells = [f"({_cell(now, now.prior_sd)})", here, *(_shown(d.quantities[name]) for _, d in block)]
             value, unit = _stated(now, None if name == "mean" else report.mean_force)
             lines.append(f"  {name:<{wide}}{value:>9.3g} {unit:<5}" + "".join(f"{cell:>6}" for cell in cells))
     return lines
