@@ -37,6 +37,8 @@ OPEN = (
     "a third of its prior's"
 )
 ASSUMED = (
+    "  assumed: two parts in series answer, as in the model. If the limb answers as one spring, the record tells its "
+    "stiffness (tangent_stiffness), but not that of two parts",
     "  assumed: no reflex. A reflex can change K_w0 by 10 to 55 %, and the fit does not notice: call it muscle plus reflex",
     "  assumed: no fatigue. Split a long or strong hold into trials with rests between, and give all trials to one fit",
 )
