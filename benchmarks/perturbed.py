@@ -308,9 +308,11 @@ def linear(count: int) -> None:
             right = jm.Recording.from_array(20.0 + own, rate).steady(record.force.window).target(settings=seen.settings)
             apart.append(np.log(seen.proportional_power / right.proportional_power))
         print(f"{words}; fluctuations off by {np.sqrt(np.mean(np.square(apart))):.3f} (rms of the log)")
-        known = [fit["tangent_stiffness"] for fit in fits if fit["tangent_stiffness"].stderr is not None]
-        spread(f"tangent stiffness (known {len(known)}/{count})", [p.value for p in known],
-               [float(p.stderr or 0) for p in known], true)  # fmt: skip
+        alone = [jm.fit(TASK, fit.target.stiffness) for fit in fits]
+        for which, some in (("", fits), (", response alone", alone)):
+            known = [fit["tangent_stiffness"] for fit in some if fit["tangent_stiffness"].stderr is not None]
+            spread(f"tangent stiffness{which} ({len(known)}/{count})", [p.value for p in known],
+                   [float(p.stderr or 0) for p in known], true)  # fmt: skip
         print(f"  described: {sum(bool(fit.adequate) for fit in fits)}/{count}", flush=True)
 
 

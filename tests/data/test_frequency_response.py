@@ -126,8 +126,21 @@ def test_decibel_and_errors_in_the_unit_of_the_gain(tmp_path):
     np.testing.assert_allclose(jm.load_frequency_response(path).stderr, [100, 200])
 
 
+def test_a_table_that_a_fit_wrote_is_read_without_what_was_fitted(tmp_path):
+    path = tmp_path / "stiffness.csv"
+    path.write_text("frequency_hz,real,imaginary,stderr,fitted_real,fitted_imaginary\n1,100,-20,3,90,1\n2,80,5,inf,90,1\n")
+    found = jm.load_frequency_response(path, name="own")
+    np.testing.assert_array_equal(found.value, [100 - 20j, 80 + 5j])
+    np.testing.assert_array_equal(found.stderr, [3, np.inf])
+    assert (found.name, found.source) == ("own", "stiffness.csv")
+
+
 HEAD = "frequency_hz,gain,phase_deg,coherence\n"
+FITTED = "frequency_hz,real,imaginary,stderr,fitted_real,fitted_imaginary\n1,100,-20,3,90,1\n"
 DAMAGED = {
+    "fitted, unsorted": (FITTED + "0.5,80,5,2,90,1\n", "line 3: frequency 0.5 Hz does not rise"),
+    "fitted, no error": (FITTED + "2,80,5,0,90,1\n", "stderr, line 3: 0"),
+    "fitted, empty": (FITTED + "2,80,,2,90,1\n", "line 3: imaginary is missing or not finite"),
     "word": (HEAD + "1,2,3,0.9\n2,many,3,0.9\n", "line 3: gain 'many' is not a number"),
     "empty cell": (HEAD + "1,2,3,0.9\n2,,3,0.9\n", "line 3: gain is missing or not finite"),
     "short line": (HEAD + "1,2,3,0.9\n2,2,3\n3,2,3,0.9\n", "line 3: 3 of 4 columns found"),

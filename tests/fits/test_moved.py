@@ -13,6 +13,7 @@ from typer.testing import CliRunner
 import jaxmuscle as jm
 from jaxmuscle.commands.console import write_fit
 from jaxmuscle.commands.main import app
+from jaxmuscle.data._frequency_response_files import is_frequency_response
 from jaxmuscle.data._perturbed_target import LINEAR
 from jaxmuscle.fits import _perturbed
 from jaxmuscle.fits._checks import reach_notices
@@ -85,6 +86,10 @@ def test_a_response_alone_is_fitted_from_the_command_line(fitted):
     with jax.enable_x64(True):
         own = np.asarray(jm.response.dynamic_stiffness(result.task, F))
     np.testing.assert_allclose(table["fitted_real"] + 1j * table["fitted_imaginary"], own, rtol=1e-6)
+    again = jm.load_frequency_response(folder / "stiffness.csv")  # which can be fitted alone
+    np.testing.assert_allclose(again.value, given.value, rtol=1e-7)
+    np.testing.assert_allclose(again.stderr, given.stderr, rtol=1e-7)
+    assert again.name == "stiffness" and is_frequency_response(folder / "stiffness.csv")
     off = (given.value - own) / given.stderr
     np.testing.assert_allclose(result.only.stiffness_residual, off, rtol=1e-5, atol=1e-5)
     assert result.only.chi2_per_point == pytest.approx(np.sum(np.abs(off) ** 2) / (2 * F.size), rel=1e-5)

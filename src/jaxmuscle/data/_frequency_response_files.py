@@ -23,6 +23,7 @@ UNITS: dict[str, tuple[str, ...]] = {  # of each column, the first being that of
     "frequency": ("hz",), "gain": (*STIFFNESS, *ROTATION, "db"), "phase": ("deg", "rad"), "coherence": ("",),
     "stderr": (*STIFFNESS, *ROTATION),
 }  # fmt: skip
+FITTED = ("frequency_hz", "real", "imaginary", "stderr")  # of stiffness.csv
 _HEADER = re.compile(r"(frequency|freq|f|gain|phase|coherence|stderr)(?:[ _/]*[\[(]?([^\[\]()]*?)[\])]?)")
 
 
@@ -45,7 +46,8 @@ def load_frequency_response(
     The columns are found by their names, in any order: `frequency`, `gain`, `phase`, and `coherence` or `stderr` or both. A
     unit may follow: `gain` in N/m (without unit), N/cm, N/mm, kN/m, in Nm/rad or Nm/deg with a lever arm, or in dB above 1
     N/m; `phase` in deg (without unit) or rad; `stderr`, of the gain, in the gain's unit. Phase and gain are those of force
-    over *lengthening*: the phase is near 0 at low frequency. `FrequencyResponse.save` writes such a file.
+    over *lengthening*: the phase is near 0 at low frequency. `FrequencyResponse.save` writes such a file. `stiffness.csv`,
+    which `jaxmuscle fit` writes, is read as well: its columns `real`, `imaginary` and `stderr` [N/m], not what was fitted.
 
     **Arguments:**
 
@@ -58,6 +60,16 @@ def load_frequency_response(
     **Raises:** `ValueError` naming file, line and column, and the remedy.
     """
     table = read_table(path, 0)
+    file = Path(table.file)
+    called = {"name": printable(file.stem) if name is None else name,
+              "source": printable(file.name) if source is None else source}  # fmt: skip
+    if {*FITTED} <= {*table.columns}:
+        frequency, real, imaginary, stderr = (_numbers(table, column, column) for column in FITTED)
+        _rising(table, frequency)
+        try:
+            return FrequencyResponse(frequency, real + 1j * imaginary, stderr, **called)
+        except ValueError as error:
+            raise ValueError(f"{table.file}: {_at_its_line(str(error), table)}") from None
     found = _columns(table)
     column = {role: _numbers(table, name, role) for role, (name, _) in found.items()}
     scales = {role: _scale(table, *found[role], lever_arm) for role in ("gain", "stderr") if role in found}
@@ -65,18 +77,15 @@ def load_frequency_response(
     phase = np.degrees(column["phase"]) if found["phase"][1] == "rad" else column["phase"]
     _rising(table, column["frequency"])
     stderr = None if "stderr" not in column else column["stderr"] * scales["stderr"]
-    file = Path(table.file)
     try:
-        return FrequencyResponse.from_gain(
-            column["frequency"], gain, phase, coherence=column.get("coherence"), segments=segments, stderr=stderr,
-            name=printable(file.stem) if name is None else name, source=printable(file.name) if source is None else source,
-        )  # fmt: skip
+        return FrequencyResponse.from_gain(column["frequency"], gain, phase, coherence=column.get("coherence"),
+                                           segments=segments, stderr=stderr, **called)  # fmt: skip
     except ValueError as error:
         raise ValueError(f"{table.file}: {_at_its_line(str(error), table)}") from None
 
 
 def is_frequency_response(path: str | os.PathLike[str]) -> bool:
-    """Whether the text at `path` has columns called frequency, gain and phase, as `load_frequency_response` reads them.
+    """Whether the text at `path` has the columns that `load_frequency_response` reads: frequency, gain and phase, say.
 
         jm.data.is_frequency_response("response.csv")
 
@@ -88,7 +97,10 @@ def is_frequency_response(path: str | os.PathLike[str]) -> bool:
 
 def is_response(names: Iterable[str]) -> bool:
     """Whether columns of these names are those of a frequency response."""
+    names = {*names}
     found = {match[1] for name in names if (match := _HEADER.fullmatch(name))}
+    if {*FITTED} <= names:
+        return True
     return {"gain", "phase"} <= found and bool(found & {"frequency", "freq", "f"})
 
 

@@ -38,7 +38,8 @@ SURE, NONE, MUCH = 4.0, 2.0, 0.2  # standard errors of a share of the nonlinear 
 UNLIKE = ("the force answers the movement {} nonlinearly than the muscle of the model. The nonlinear part of the model's "
           "answer is {:.2g} N rms; the recording shows {:.0f} ± {:.0f} % of it. The fit subtracted {} from the force, so "
           "the fluctuations are right. But do not report K_w0: it rests on the model's nonlinearity. Report "
-          "tangent_stiffness, and K_w_tangent if it is determined")  # fmt: skip
+          "tangent_stiffness, and K_w_tangent if it is determined. Compare them with a fit of the response alone "
+          "(jaxmuscle fit stiffness.csv)")  # fmt: skip
 
 Stiffness = Callable[[Float[np.ndarray, " frequencies"]], Complex[np.ndarray, " frequencies"]]
 Motion = Float[np.ndarray, "3 times"]

@@ -30,9 +30,8 @@ from ._refit import STRENGTHS, Refit, refit_of
 ADEQUATE = 0.01
 ALONE = 2.5  # standard deviations: a single bin beyond the run that is named
 REPLICATES = 999
-ELSEWHERE = (
-    "The misfit is in the other data. What comes from what it describes may still be right: fit that alone, and compare"
-)
+ELSEWHERE = ("The misfit is in the other data. What comes from these may still be right: fit them alone, and compare (a "
+             "dynamic stiffness with jaxmuscle fit stiffness.csv)")  # fmt: skip
 Rows = Float[np.ndarray, "replicates residuals"]
 
 
