@@ -105,7 +105,7 @@ def _fitted(problem: FitProblem, result: FitResult, made: Made, tell: Callable[[
             tell(text, 0.1 + 0.9 * (before + share * size) / len(numbers))
 
         plans = [Plan(with_data(problem, made[n]), STARTS, settings["max_steps"], 0, settings, None) for n in part]
-        for number, fit in zip(part, search_together(plans, show), strict=True):
+        for number, fit in zip(part, search_together(plans, show, replicates=True), strict=True):
             if fit.success:
                 fits.append(fit)
             else:

@@ -149,14 +149,17 @@ def _unchecked(
     return report_fit(plan, stages, ladder, ended=ended, interrupted=interrupted, preliminary=True)
 
 
-def search_together(plans: list[Plan], tell: Callable[[str, float], None], number: int = 0) -> list[FitResult]:
+def search_together(
+    plans: list[Plan], tell: Callable[[str, float], None], number: int = 0, *, replicates: bool = False
+) -> list[FitResult]:
     """Fits of one model to several data on the same bins, all starts of all fits in one minimisation.
 
     Linear response alone: no nonlinear correction, no check on simulated seeds, no profile over the frequency. The AIC of
-    the model, whose `number` on the ladder this is, stands in every result.
+    the model, whose `number` on the ladder this is, stands in every result. Of `replicates` the muscle that their response
+    alone asks for is not sought: what made them fluctuate is what the model says.
     """
     problems = [plan.problem for plan in plans]
-    points = [starting_points(plan.problem, plan.starts) for plan in plans]
+    points = [starting_points(plan.problem, plan.starts, alone=not replicates) for plan in plans]
     objectives = [problem.linear() for problem in problems]
     first = _together(objectives, points, plans[0].max_steps, "trying starts", tell, (0.0, 0.7))
     best = [stage.minima.s[contenders(p, stage.minima, RIVAL_MARGIN)[:BATCH]]

@@ -24,11 +24,12 @@ SEARCHES, AGREEING, SAME, BEHIND = (10, 22), 4, 0.1, 10.0  # by the response alo
 UNKNOWN = 1e6  # standard deviation of a log power that is not to count
 
 
-def starting_points(problem: FitProblem, count: int) -> Float[np.ndarray, "starts free"]:
+def starting_points(problem: FitProblem, count: int, *, alone: bool = True) -> Float[np.ndarray, "starts free"]:
     """Starts: harmonic frequencies at the targets' local maxima and spread over their band, the rest space-filling.
 
     The first start has all other parameters at their default, the others at half a prior standard deviation about it. With
-    several frequencies which of their candidates meet is left to chance; `recombined` tries the rest.
+    several frequencies which of their candidates meet is left to chance; `recombined` tries the rest. Of a moved record some
+    begin at the muscle that its response alone asks for, unless `alone` is False, which saves the time of that search.
     """
     coordinates = problem.coordinates
     theta = space_filling(len(coordinates.names), count)
@@ -40,7 +41,8 @@ def starting_points(problem: FitProblem, count: int) -> Float[np.ndarray, "start
     _spread_resonances(problem, theta)
     if any(part.points is not None for part in problem.parts):
         _spread_coefficients(problem, theta)
-        return _on_response(problem, coordinates.from_theta(theta))
+        points = coordinates.from_theta(theta)
+        return _on_response(problem, points) if alone else points
     return coordinates.from_theta(theta)
 
 
