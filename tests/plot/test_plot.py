@@ -729,6 +729,7 @@ def identified():
     designs = [outlook(name, 10.0**i) for i, name in enumerate(names)]
     return types.SimpleNamespace(
         target="vastus-lateralis-26mvc", designs=designs, present=outlook("now", 1.0), together=" and ", told=told,
+        open_in_fit=(),
         telling_pairs=[outlook(f"{names[0]} and {names[1]}", 1e9)], letter=lambda i: "ABC"[i], threshold=3.0,
         doubt="The fit does not describe its data",
     )  # fmt: skip
