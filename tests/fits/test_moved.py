@@ -314,8 +314,8 @@ PARTS = 2000 + 60 * TURN + 0.5 * TURN**2, 4000 + 15 * TURN  # [N/m] the model's 
 IN_SERIES = PARTS[0] * PARTS[1] / (PARTS[0] + PARTS[1]) + 0.5 * TURN**2
 
 
-def specimen(seed, bend=None):
-    """A linear specimen that is moved by 1 mm rms, its force with fluctuations of its own; these alone; and `bend` added."""
+def specimen(seed, answer=None):
+    """A specimen that is moved by 1 mm rms, linear unless its `answer` is given; and the fluctuations of its force alone."""
     rng = np.random.default_rng(seed)
 
     def shaped(gain):
@@ -324,8 +324,7 @@ def specimen(seed, bend=None):
 
     x = 1e-3 * shaped(((AT >= 0.5) & (AT <= 10)).astype(float))
     own = 20 + 0.2 * shaped(1 / (1 + AT**2)) + 0.03 * rng.standard_normal(LENGTH)
-    linear = np.fft.irfft(np.fft.rfft(x) * IN_SERIES, LENGTH)
-    force = own + linear + (0.0 if bend is None else bend(x) - linear)
+    force = own + (np.fft.irfft(np.fft.rfft(x) * IN_SERIES, LENGTH) if answer is None else answer(x))
     return jm.PerturbedRecording.from_array(force, x, RATE, positive="lengthening").steady((3.0, 63.0)), own
 
 
@@ -350,8 +349,8 @@ def test_what_is_taken_off_is_as_nonlinear_as_the_recording(share):
     """A specimen with none, all and twice of the model's nonlinear answer: each leaves the fluctuations that were put in."""
     muscle = near_specimen()
 
-    def bend(x):
-        """The specimen's answer, so much nonlinear: one of steps is right, with the derivatives of all lines."""
+    def answer(x):
+        """The linear answer, and the share of what the nonlinear muscle does beside it."""
         fine = 4 * LENGTH
         motion = np.array([4 * np.fft.irfft(TURN**order * np.fft.rfft(x), fine) for order in (0, 1, 2)])
         whole = np.asarray(driven(muscle, -np.append(motion, motion[:, :1], axis=1), 1 / (4 * RATE)))[::2][:LENGTH]
@@ -359,7 +358,7 @@ def test_what_is_taken_off_is_as_nonlinear_as_the_recording(share):
         return linear + share * (whole - linear)
 
     with jax.enable_x64(True):
-        recording, own = specimen(3, bend)
+        recording, own = specimen(3, answer)
         seen = seen_with(muscle, [recording])
     alone = jm.Recording.from_array(own, RATE).steady(recording.force.window).target(settings=seen.settings)
     apart = np.log(seen.proportional_power / alone.proportional_power)

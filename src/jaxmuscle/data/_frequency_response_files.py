@@ -61,25 +61,23 @@ def load_frequency_response(
     """
     table = read_table(path, 0)
     file = Path(table.file)
-    called = {"name": printable(file.stem) if name is None else name,
-              "source": printable(file.name) if source is None else source}  # fmt: skip
     if {*FITTED} <= {*table.columns}:
-        frequency, real, imaginary, stderr = (_numbers(table, column, column) for column in FITTED)
-        _rising(table, frequency)
-        try:
-            return FrequencyResponse(frequency, real + 1j * imaginary, stderr, **called)
-        except ValueError as error:
-            raise ValueError(f"{table.file}: {_at_its_line(str(error), table)}") from None
-    found = _columns(table)
-    column = {role: _numbers(table, name, role) for role, (name, _) in found.items()}
-    scales = {role: _scale(table, *found[role], lever_arm) for role in ("gain", "stderr") if role in found}
-    gain = 10 ** (column["gain"] / 20) if found["gain"][1] == "db" else column["gain"] * scales["gain"]
-    phase = np.degrees(column["phase"]) if found["phase"][1] == "rad" else column["phase"]
+        frequency, real, imaginary, error = (_numbers(table, name, name) for name in FITTED)
+        gain, phase = np.hypot(real, imaginary), np.degrees(np.arctan2(imaginary, real))
+        column, scales = {"frequency": frequency, "stderr": error}, {"stderr": 1.0}
+    else:
+        found = _columns(table)
+        column = {role: _numbers(table, name, role) for role, (name, _) in found.items()}
+        scales = {role: _scale(table, *found[role], lever_arm) for role in ("gain", "stderr") if role in found}
+        gain = 10 ** (column["gain"] / 20) if found["gain"][1] == "db" else column["gain"] * scales["gain"]
+        phase = np.degrees(column["phase"]) if found["phase"][1] == "rad" else column["phase"]
     _rising(table, column["frequency"])
     stderr = None if "stderr" not in column else column["stderr"] * scales["stderr"]
     try:
         return FrequencyResponse.from_gain(column["frequency"], gain, phase, coherence=column.get("coherence"),
-                                           segments=segments, stderr=stderr, **called)  # fmt: skip
+                                           segments=segments, stderr=stderr,
+                                           name=printable(file.stem) if name is None else name,
+                                           source=printable(file.name) if source is None else source)  # fmt: skip
     except ValueError as error:
         raise ValueError(f"{table.file}: {_at_its_line(str(error), table)}") from None
 
@@ -99,9 +97,7 @@ def is_response(names: Iterable[str]) -> bool:
     """Whether columns of these names are those of a frequency response."""
     names = {*names}
     found = {match[1] for name in names if (match := _HEADER.fullmatch(name))}
-    if {*FITTED} <= names:
-        return True
-    return {"gain", "phase"} <= found and bool(found & {"frequency", "freq", "f"})
+    return {*FITTED} <= names or ({"gain", "phase"} <= found and bool(found & {"frequency", "freq", "f"}))
 
 
 def _columns(table: Table) -> dict[str, tuple[str, str]]:

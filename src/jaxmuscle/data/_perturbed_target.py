@@ -36,10 +36,10 @@ LINEAR = ("the response to the movement was taken off as a linear one, since tha
           "computed. If the motion was large, a part of it is left in the fluctuations")  # fmt: skip
 SURE, NONE, MUCH = 4.0, 2.0, 0.2  # standard errors of a share of the nonlinear response from 1, and from 0; for a notice
 UNLIKE = ("the force answers the movement {} nonlinearly than the muscle of the model. The nonlinear part of the model's "
-          "answer is {:.2g} N rms; the recording shows {:.0f} ± {:.0f} % of it. The fit subtracted {} from the force, so "
-          "the fluctuations are right. But do not report K_w0: it rests on the model's nonlinearity. Report "
-          "tangent_stiffness, and K_w_tangent if it is determined. Compare them with a fit of the response alone "
-          "(jaxmuscle fit stiffness.csv)")  # fmt: skip
+          "answer is {:.2g} N rms; the recording shows {:.0f} ± {:.0f} % of it. The fit subtracted {} from the force. "
+          "What to do: do not report K_w0, which rests on the model's nonlinearity. Report tangent_stiffness, and "
+          "K_w_tangent if it is determined. Compare them with a fit of the response alone (jaxmuscle fit "
+          "stiffness.csv)")  # fmt: skip
 
 Stiffness = Callable[[Float[np.ndarray, " frequencies"]], Complex[np.ndarray, " frequencies"]]
 Motion = Float[np.ndarray, "3 times"]
