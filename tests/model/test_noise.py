@@ -10,6 +10,7 @@ import pytest
 import references
 import scipy.integrate
 import scipy.linalg
+from jax.scipy.special import gammainc
 
 import jaxmuscle as jm
 from jaxmuscle._common.types import Scalar
@@ -288,7 +289,8 @@ class Smooth(jm.model.AbstractNoise):
     def recursion(self, dt):
         x = 2 * jnp.pi * self.corner * dt
         A = jnp.exp(-x) * jnp.array([[1 + x, x], [-x, 1 - x]])
-        return self.made(A, jnp.linalg.cholesky(jnp.eye(2) - A @ A.T))
+        a, b = gammainc(3.0, 2 * x), 2 * x**2 * jnp.exp(-2 * x)
+        return self.made(A, jnp.linalg.cholesky(jnp.array([[a, b], [b, a + 4 * x * jnp.exp(-2 * x)]])))
 
     def made(self, A, L):
         H, S = (1.0, 0.0), (0.0, 2 * jnp.pi * self.corner)
@@ -304,6 +306,7 @@ WRONG_NOISES = {
     "correlation": ("made", lambda self, A, L: Smooth.made(self, *faster(A)), r"correlation after .* s is .* by recursion"),
     "no slope": ("made", lambda self, A, L: without_slope(Smooth.made(self, A, L)), r"smoothness = 2, so rec.* must give S"),
     "slope": ("made", lambda self, A, L: with_slope(Smooth.made(self, A, L)), "variance of the slope is 1 by recursion"),
+    "digits": ("made", lambda self, A, L: Smooth.made(self, A, rest(A)), r"0 has the variance 3\.276e-07 in double.*single"),
     "kind": ("shaping_filter", lambda self: jnp.zeros(2), "returns a ArrayImpl; it must return a ShapingFilter"),
     "error": ("recursion", lambda self, dt: self.nothing, r"recursion\(0\.001\) cannot be computed: Attr.*nothing"),
 }  # fmt: skip
@@ -312,7 +315,12 @@ WRONG_NOISES = {
 def faster(A):
     """A step that keeps the covariance, and forgets faster."""
     A = 0.999 * A
-    return A, jnp.linalg.cholesky(jnp.eye(2) - A @ A.T)
+    return A, rest(A)
+
+
+def rest(A):
+    """What a step adds so that the covariance stays 1, as the difference that it is."""
+    return jnp.linalg.cholesky(jnp.eye(2) - A @ A.T)
 
 
 def without_slope(made):

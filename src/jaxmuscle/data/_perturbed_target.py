@@ -81,9 +81,10 @@ def perturbed_target(
     With the lengthening l, its response `h * l` by the `stiffness` H and the transform X_j = Σ_m w_m x_m e^(-2πi f_j m Δ) of
     a whole window (w a cosine taper over its first and last 5 %), the rest e = F - h * l gives
 
-        Ĥ_g = H(f_g) + Σ_j L_j* E_j / Σ_j |L_j|²,     sd² = S_E(f_g) / (2 Σ_j |L_j|²)   (real and imaginary part each)
+        Ĥ_g = H(f_g) + Σ_j w_j L_j* E_j / Σ_j w_j |L_j|²,     sd² = 1 / (2 Σ_j w_j |L_j|²)   (of each part)
 
-    over the ordinates j of a group g, about 0.12 f wide. The response is computed through the whole recording, so neither
+    over the ordinates j of a group g, about 0.12 f wide, with w_j = 1 / S_E(f_j) and f_g their mean frequency, so
+    weighted; real and imaginary part of Ĥ have the same sd. The response is computed through the whole recording, so neither
     window nor leakage of the input biases Ĥ; where H is the muscle's own, e is its fluctuation alone. Its spectrum, mean and
     coefficient of variation are the target's. S_E is the measured density of e. q is what the response of the nonlinear
     muscle (`predicted`) differs by from h * l, and β = 1, unless the recordings show another share of q (`_share_shown`).

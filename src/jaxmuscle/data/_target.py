@@ -50,8 +50,9 @@ class Target(Shown, eqx.Module):
       in a fit.
     - `trial_power`: spectrum of each trial [unit²/Hz], shape `(trials, bins)`; `proportional_power` is their mean, weighted
       with `segments`.
-    - `dispersion`: how many times more the mean of the trials scatters than their segments explain, and the standard error
-      of this number. Above 1 it widens every error. If `trial_power` is given, it follows from that (`dispersion_of`).
+    - `dispersion`: how many times more the trials' average spectrum scatters than their segments explain, and the
+      standard error of this number. Above 1 it widens every error. If `trial_power` is given, it follows from that
+      (`dispersion_of`).
     - `stiffness`: the dynamic stiffness measured beside it, by a perturbation. Then `proportional_power` may be `None`: the
       target has no spectrum.
     - `settings`: how the spectrum was estimated. The model's spectrum is made in the same way.
@@ -328,8 +329,8 @@ def _own_notices(target: Target, total: float) -> list[str]:
     if target.bins.size and abs(total - 1) > SUM_TOLERANCE:
         notices.append(f"proportional power summed to {total:.4g} over the bins covered: rescaled to 1")
     if target.overdispersion > UNUSUAL and target.dispersion is not None:
-        notices.append(f"the mean of the trials {_dispersion_in_words(target.dispersion)} (1 if all are alike), and all "
-                       "errors are widened by this factor. Did the person tire, drift or change the grip?")  # fmt: skip
+        notices.append(f"the average spectrum of the trials {_dispersion_in_words(target.dispersion)} (1 if all are alike). "
+                       "So all errors are widened by it. Did the person tire, drift or change the grip?")  # fmt: skip
     if target.provenance == "reconstructed":
         if target.reason is None:
             raise TargetError("a reconstructed target needs a reason: a sentence that says what was assumed")

@@ -105,7 +105,8 @@ def check_noise(noise: AbstractNoise) -> None:
 
     In the stationary state of `shaping_filter`, of covariance P with `F P + P Fᵀ + G Gᵀ = 0`, N has the variance H P Hᵀ,
     after a time t the covariance `H exp(F t) P Hᵀ`, and a slope of variance H F P Fᵀ Hᵀ. `recursion` must give the same
-    of its states, whose covariance is 1. `density` is that of the filter's response.
+    of its states, whose covariance is 1. `density` is that of the filter's response. What a step adds to a state must
+    keep its variance in single precision.
 
     **Raises:** `ValueError` that names the methods and both numbers.
     """
@@ -117,7 +118,20 @@ def check_noise(noise: AbstractNoise) -> None:
             if not np.isclose(ours, theirs, rtol=1e-3, atol=1e-3 if what.startswith("the correlation") else 0.0):
                 raise ValueError(f"{kind.__name__}: {what} is {ours:.5g} by {where[0]}, but {theirs:.5g} by {where[1]}. "
                                  "They describe one noise: see docs/how-to/own-noise.md")  # fmt: skip
+        exact = _added(noise, 1e-3)
+    with jax.enable_x64(False):
+        single = _added(noise, 1e-3)
+    for i, (found, right) in enumerate(zip(single, exact, strict=True)):
+        if not np.isclose(found, right, rtol=0.05, atol=0.0):
+            raise ValueError(f"{kind.__name__}.recursion(0.001): what a step adds to state {i} has the variance {right:.4g} "
+                             f"in double precision, but {found:.4g} in single precision, as most simulations compute. "
+                             "Compute L without subtracting nearly equal numbers: docs/how-to/own-noise.md")  # fmt: skip
     _SEEN.add(kind)
+
+
+def _added(noise: AbstractNoise, dt: float) -> np.ndarray:
+    """The variance of what a step adds to each state."""
+    return np.array([sum(float(x) ** 2 for x in row if x is not None) for row in noise.recursion(dt).L])
 
 
 def _called(noise: AbstractNoise, method: str, kind: type, *arguments: float) -> Any:
