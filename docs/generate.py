@@ -47,7 +47,9 @@ A parameter has the name of this table wherever you write it:
 ## Values
 
 *Bounds* say which values are physically possible. A name with a dot (●) is free in a default fit: the fit looks for its
-value. Where a motor moved the insertion, `m_w` and `m_z` are free, too.
+value. Where a motor moved the insertion, `m_w` and `m_z` are free, too. A default task has no activation, no tremor, no
+second resonance and no noise on the drive. For these the column *default* says with which value they begin when you add them
+(`jm.on_rung`, `jm.Activation()`, `jm.ResonantNoise()`). In `PrescribedMotion` `F_ext` is 10 N by default.
 
 | name | symbol | unit | default | bounds | meaning |
 |---|---|---|---|---|---|
@@ -81,7 +83,8 @@ FILES = Path(__file__).parent / "reference" / "files.md"
 FILES_HEAD = """# Files, key by key
 
 Look here if you write one of these files by hand, or read one with your own program. For each kind of file there is
-a table of all its keys. *Since* is the first version of the format that has the key. A later version of jaxmuscle
+a table of its keys. Not listed are the fields of a task (`task_table`: let `save_preset` write it) and those of
+[`SpectrumSettings`](spectra.md). *Since* is the first version of the format that has the key. A later version of jaxmuscle
 reads earlier formats.
 
 Files are checked when they are read. If a key is unknown, missing, there twice, of a wrong type or out of range,

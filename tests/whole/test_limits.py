@@ -64,10 +64,9 @@ def test_noise_against_the_papers(x64):
     assert [variation(task) for task in (knee, finger)] == pytest.approx([0.013, 0.018], rel=STATED + 0.02)
     alone = [variation(task.replace(**QUIET, noise_K_w=PAPER)) for task in (knee, finger)]
     assert alone == pytest.approx([8e-5, 7e-5], rel=0.1)  # one digit
-    assert 0.013 / np.array(alone) == pytest.approx([170, 200], rel=STATED)
     everything = QUIET | {"noise_K_w": PAPER, "noise_K_z": PAPER, "noise_C_w": 1e-4, "noise_C_z": 1e-4}
     assert [variation(task.replace(**everything)) for task in (knee, finger)] == pytest.approx([0.0013] * 2, rel=STATED)
-    says("noise of 27 %", "and 46 %", "170 and 290 times", "0.008 and 0.007 %", "takes 170 and 200 times that", "0.13 %")
+    says("noise of 27 %", "and 46 %", "170 and 290 times", "0.008 and 0.007 %", "0.13 %")
 
 
 @pytest.mark.slow

@@ -101,8 +101,8 @@ class PerturbedRecording(Printed, eqx.Module):
 
         **Arguments:**
 
-        - `force`, `displacement`, shape `(times,)`, in `units` (N, mN, kN; N m, N cm, N mm) and `displacement_units` (m, cm,
-          mm, um; deg, rad); `rate` [Hz].
+        - `force`, `displacement`, shape `(times,)`, in `units` (N, mN, kN, kgf, gf, lbf; N m, N cm, N mm) and
+          `displacement_units` (m, cm, mm, um; deg, rad); `rate` [Hz].
         - `lever_arm` [m]: from the axis to the insertion; needed for a torque and for an angle.
         - `positive`: what the displacement counts as positive, `"lengthening"` or `"shortening"`. `None`: found from the
           data. If a spring, a damper and a mass describe the response better with the other sign, that of the displacement

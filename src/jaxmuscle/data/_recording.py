@@ -40,8 +40,8 @@ class Recording(Shown, eqx.Module):
 
     - `samples`: the signal [`unit`], shape `(times,)`.
     - `rate`: samples per second [Hz], at least 24, so that bin 30 lies below half of it.
-    - `unit`: N, mN, kN, % MVC (force); N m, N cm, N mm (torque); m, cm, mm, um (displacement); m/s^2, mm/s^2,
-      g, mg (acceleration; g is 9.81 m/s^2); V, mV, a.u.
+    - `unit`: N, mN, kN, kgf, gf, lbf, % MVC (force); N m, N cm, N mm (torque); m, cm, mm, um (displacement); m/s^2,
+      mm/s^2, g, mg (acceleration; g is 9.81 m/s^2); V, mV, a.u.
     - `name`, `source`: how reports call it and where it comes from.
     - `start`: time of the first sample [s]; other than 0 if the file begins with a gap.
     - `window`: (start, stop) [s] of the part that is analysed, or all of it.

@@ -193,8 +193,8 @@ class TargetFile(Table, kw_only=True):
     settings: Annotated[
         Any,
         Meta(
-            description="How the spectrum was estimated; each has a default",
-            extra={"type": "table, see below"},
+            description="How the spectrum was estimated: the fields of `SpectrumSettings`; each has a default",
+            extra={"type": "table"},
         ),
     ] = None
 

@@ -43,8 +43,8 @@ class EstimateTable(Table, kw_only=True):
 class AdequacyTable(Table, kw_only=True):
     """Whether the model describes the data: `adequacy`."""
 
-    chi2: Annotated[float, _told("Chi² of the verdict: of the model as it was fitted, over all residuals")]
-    expected: Annotated[float, _told("Chi² to expect if the model is right")]
+    chi2: Annotated[float, _told("Chi² of the verdict: the sum of the squared residuals of all data")]
+    expected: Annotated[float, _told("Mean of that sum if the model is right")]
     p: Annotated[Share, _told("p-value: share of the model's own data with a larger chi²")]
     misfit: Annotated[str, _told("Where the data lie furthest from the model, if it does not describe them; else empty")]
 
@@ -56,7 +56,7 @@ class RungTable(Table, kw_only=True):
     model: Annotated[str, _told("The model in words")]
     aic: Annotated[float, _told("-2 ln L + 2 parameters")]
     parameters: Annotated[float, _told("Effective number of parameters")]
-    chi2_per_bin: Annotated[float, _told("Chi² of the verdict on this model over bins less one")]
+    chi2_per_bin: Annotated[float, _told("Chi² of the verdict on this model, divided by bins less one")]
     p: Annotated[Share, _told("p-value of the verdict on this model")]
     chosen: Annotated[bool, _told("Whether this model was chosen")]
 
@@ -140,7 +140,7 @@ class PartTable(Table, kw_only=True):
     provenance: Annotated[str, _told("Where its numbers are from")]
     task: Annotated[str, _told("Name of the task")]
     chi2_per_bin: Annotated[
-        float | None, _told("Chi² of spectrum.residual over bins less one; the verdict has adequacy.chi2")
+        float | None, _told("Chi² of spectrum.residual, divided by bins less one; the verdict has adequacy.chi2")
     ]
     rms_log_error: Annotated[float | None, _told("Standard deviation of the log of target over fit")]
     spectrum: Annotated[SpectrumTable, _told("Spectra")]

@@ -148,7 +148,7 @@ def _held(result: "FitResult") -> list[str]:
         lengths = " or ".join(f"{1e3 * times * float(task['x_ref_w']):.3g}" for times in OTHER_LENGTHS)
         said += [f"held fixed: {told['x_ref_w']}. No record determines it, and K_w0 depends on it: with {lengths} mm K_w0 "
                  f"would be {' or '.join(other)} N/m, and the fit as good. So report K_w_tangent (stiffness of the active "
-                 "tissue as stretched in the hold) and tangent_stiffness (that of both tissues) instead: these hardly "
+                 "tissue as displaced in the hold) and tangent_stiffness (that of both tissues) instead: these hardly "
                  "change"]  # fmt: skip
     return said
 

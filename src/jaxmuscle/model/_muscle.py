@@ -121,7 +121,7 @@ class Muscle(AbstractMuscle):
     with q_w = x_w and, literally as printed, q_z = x_z; `argument="elongation"` uses q_z = x_z - x_w.
 
     **Arguments:** masses `m_w`, `m_z` [kg] > 0; the material laws `stiffness_w`, `stiffness_z` [N/m], `damping_w`,
-    `damping_z` [N s/m]; `argument`, "position" or "elongation".
+    `damping_z` [N s/m]; `argument`, "literal" or "elongation".
 
     **Raises:** `ValueError` for a mass that is not positive or an unknown `argument`.
 

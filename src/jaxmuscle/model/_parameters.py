@@ -119,7 +119,7 @@ PARAMETERS: dict[str, Parameter] = {
              fit_lower=0.5, fit_upper=30.0),
         _row("resonance_2_width", "b_2", "Hz", 1.0, "full width of the second resonance at half power", _SLOW, sd=0.7,
              fit_lower=0.02, fit_upper=15.0),
-        _free_sign("harmonic_phase", "φ", "rad", 0.0, "harmonic phase", "unknown and without influence", math.pi),
+        _free_sign("harmonic_phase", "φ", "rad", 0.0, "harmonic phase", "unknown; hardly any influence above 1 Hz", math.pi),
         _row("P_w", "P_w", "N", 5.0, "active force level", "light pressing, displacement near 0.01 m", -math.inf),
         _free_sign("F_ext", "F_ext", "N", 0.0, "external force level", "the paper's Task 2", 5.0),
         _free_sign("x_z", "x_z", "m", 0.0, "displacement of the insertion", "the paper: held", 0.01),

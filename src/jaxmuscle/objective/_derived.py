@@ -50,7 +50,7 @@ MEANINGS = {
     "K_z0": "passive stiffness without stretch",
     "C_w0": "active damping when nothing moves",
     "C_z0": "passive damping when nothing moves",
-    "K_w_tangent": "active stiffness as stretched in the hold",
+    "K_w_tangent": "active stiffness as displaced in the hold",
     "tangent_stiffness": "stiffness of both tissues in series, H(0)",
     "coefficient_of_variation": "standard deviation over mean of the output",
     "mean": "mean of the output",

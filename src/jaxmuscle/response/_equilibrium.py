@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxmuscle._common.arrays import as_arrays
+from jaxmuscle._common.arrays import as_arrays, is_concrete
 from jaxmuscle._common.errors import OperatingPointError
 from jaxmuscle._common.programs import kept
 from jaxmuscle._common.types import Scalar
@@ -24,6 +24,17 @@ def equilibrium(task: AbstractTask, time: Scalar | float = HOLD) -> Float[Array,
 
     Not finite where there is none: `operating_point` turns that into an error.
     """
+    if all(is_concrete(leaf) for leaf in jax.tree.leaves((task, time))):
+        return _kept_equilibrium(mechanics(task), np.asarray(time, jnp.result_type(float)))
+    return _equilibrium(task, time)
+
+
+@kept
+def _kept_equilibrium(task: AbstractTask, time: Scalar) -> Float[Array, " states"]:
+    return _equilibrium(task, time)
+
+
+def _equilibrium(task: AbstractTask, time: Scalar | float) -> Float[Array, " states"]:
     import optimistix as optx  # only here, since a program that is loaded does without
 
     task = as_arrays(task)

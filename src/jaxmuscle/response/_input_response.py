@@ -88,9 +88,9 @@ def dynamic_stiffness(task: AbstractTask, frequency: Frequencies) -> Complex[Arr
 
         H(f) = -F_ext(f) / x_z(f) = -[C (s - A)⁻¹ (b₀ + s b₁) + d₀ + s d₁ + s² d₂],    s = 2πif
 
-    with y' = A y + b₀ x_z + b₁ x_z', F_ext = C y + d₀ x_z + d₁ x_z' + d₂ x_z'', d₂ = -m_z. At low frequency it is the static
-    stiffness K_w K_z / (K_w + K_z) of the two tissues in series, at high frequency that of the passive tissue and the
-    inertia of its mass, `K_z + s C_z + s² m_z`.
+    with y' = A y + b₀ x_z + b₁ x_z', F_ext = C y + d₀ x_z + d₁ x_z' + d₂ x_z'', d₂ = -m_z. At low frequency it is the
+    tangent stiffness of the two tissues in series (for the paper's muscle held at x_z = 0: `K K_z0 / (K + K_z0)`, K =
+    K_w_tangent), at high frequency that of the passive tissue and the inertia of its mass, `K_z + s C_z + s² m_z`.
 
     **Arguments:** `task`, a `PrescribedLength` (or `Isometric`) whose inputs are held; `frequency` [Hz].
 

@@ -303,7 +303,7 @@ class DesignedInput(Printed, Result, eqx.Module):
         lines[0] += ". If the person is ten times softer, all errors are about ten times as large in percent"
         if "K_w0" in {name.partition("@")[0] for name in self.quantity}:
             lines += ["  assumed: the reference displacement x_ref_w. No record determines it, and the value of K_w0 "
-                      "depends on it. K_w_tangent, the stiffness as stretched in the hold, hardly depends on it "
+                      "depends on it. K_w_tangent, the stiffness as displaced in the hold, hardly depends on it "
                       "(docs/perturbed.md, limits)"]  # fmt: skip
         values = " and ".join(f"{name} = {value:.3g} kg" for name, value in self.masses.items())
         if "m_w" in self.held:
