@@ -143,12 +143,15 @@ def unit(row: Parameter) -> str:
     return text.replace(" ", "&nbsp;")
 
 
+MASSES = ("m_w", "m_z")  # 0 is no mass
+
+
 def page() -> str:
     """The text of the page."""
     values, fits = [], []
     for row in PARAMETERS.values():
         name = f"`{row.name}`" + (" ●" if row.name in DEFAULT_FREE else "")
-        bounds = interval(row.lower, row.upper)
+        bounds = "(0, ∞)" if row.name in MASSES else interval(row.lower, row.upper)
         values.append(f"| {name} | {row.symbol} | {unit(row)} | {number(row.default)} | {bounds} | {row.meaning} |\n")
         reached = interval(row.fit_lower, row.fit_upper)
         log = "yes" if row.positive else "no"

@@ -24,7 +24,10 @@ class AbstractLaw(Spelled, eqx.Module):
 
     @abc.abstractmethod
     def __call__(self, q: Scalar) -> Scalar:
-        """The coefficient (stiffness [N/m] or damping [N s/m]) at displacement [m] or velocity [m/s] `q`."""
+        """The coefficient (stiffness [N/m] or damping [N s/m]) at displacement [m] or velocity [m/s] `q`.
+
+        The force is `law(q) q`: a stiffness is force over displacement (the secant), not the slope of the force.
+        """
 
 
 class QuadraticStiffness(AbstractLaw):

@@ -16,7 +16,7 @@ from jaxmuscle._common.text import choices
 _HAND = "about the mass of a hand, 0.6 % of body mass (Winter 2009, Biomechanics, table 4.1); allows large time steps"
 _STIFF = "K_0 = k x_ref^2 = 200 N/m, about the postural stiffness of a hand (Mussa-Ivaldi et al. 1985)"
 _DAMP = (
-    "no measured damping: C_0 = c v_ref^2 of both tissues was chosen so that the slow eigenvalue of isometric force, -10/s "
+    "no measured damping: C_0 = c v_ref^2 of both tissues was chosen so that the slow eigenvalue of isometric force, -9.6/s "
     "(1.5 Hz), is near the corner of force spectra (fits of the measured ones: 0.4 and 0.9 Hz)"
 )
 _REF = "sets the range over which the muscle is linear: displacements here are about 0.01 m"

@@ -35,6 +35,7 @@ TIRING = (
 NO_NOISE = ("no further measurement is tried: the fit has no spectrum, so the noise that limits a measurement is not known. "
             "Fit the recording of both channels, or a spectrum beside the response (fit_joint)")  # fmt: skip
 FITTED_TOO = "fitted in this measurement"
+DOUBTED = "; in the column now also what the fit does not call determined"
 OPENED = "; but fitted in the measurements that say so above"
 BASE = {"k_w": "K_w0", "k_z": "K_z0", "c_w": "C_w0", "c_z": "C_z0"}
 
@@ -279,9 +280,10 @@ def _table(report: IdentifiabilityReport) -> list[str]:
     names = told(report.present.quantities)
     possible = [(letter(i), d) for i, d in enumerate(report.designs) if d.failed is None]
     wide = max(24, *(1 + len(name) for name in names))
+    doubted, added = DOUBTED * bool(report.open_in_fit), ". A, B, ...: with that measurement added" * bool(possible)
     lines = _wrapped("standard errors in percent of the value. In brackets: not determined, since about a third or more of "
-                     f"the error without data is left. >>: {FAR} % or more. prior: without data. now: with the data of the "
-                     "fit" + ". A, B, ...: with that measurement added" * bool(possible), 4, "  ")  # fmt: skip
+                     f"the error without data is left{doubted}. >>: {FAR} % or more. prior: without data. now: with the "
+                     f"data of the fit{added}", 4, "  ")  # fmt: skip
     if report.mean_force is not None:
         lines += _wrapped("no mean force in newtons was given: forces, stiffness and damping are stated per newton of mean "
                           f"force (that of the fitted muscle is {report.mean_force:.3g} N)", 4, "  ")  # fmt: skip
