@@ -300,7 +300,7 @@ class DesignedInput(Printed, Result, eqx.Module):
         lines = ["  assumed: the muscle is the one given here" + f", with a mean force of {mean[0]:.3g} N" * bool(mean)]
         if mean:
             lines[0] += ". If you measured another mean force, fit with it first (mean and unit of the target)"
-        lines[0] += ". If the person is ten times softer, all errors are about ten times as large in percent"
+        lines[0] += ". If the person is softer and the force fluctuates as much, errors in percent are larger in proportion"
         if "K_w0" in {name.partition("@")[0] for name in self.quantity}:
             lines += ["  assumed: the reference displacement x_ref_w. No record determines it, and the value of K_w0 "
                       "depends on it. K_w_tangent, the stiffness as displaced in the hold, hardly depends on it "
