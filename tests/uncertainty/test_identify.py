@@ -332,6 +332,9 @@ def test_the_report_agrees_with_itself():
             assert known.left <= min(part.quantities[name].left for part in parts) * (1 + 1e-9)
     gains = [len(pair.gained) for pair in found.pairs]
     assert gains == sorted(gains, reverse=True)
+    alone, together = (max((d.determined, len(d.gained)) for d in each) for each in (found.designs, found.pairs))
+    single = f"If you make only one: {'ABCDEFG'[np.argmax([d.determined for d in found.designs])]}"
+    assert (single in " ".join(str(found).split())) is (together > alone)
 
 
 @pytest.mark.slow

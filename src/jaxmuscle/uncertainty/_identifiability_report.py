@@ -1,6 +1,7 @@
 """The identifiability report: what is known now, what it would be with further measurements, in words and tables."""
 
 import textwrap
+from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -245,10 +246,12 @@ def _next(report: IdentifiabilityReport) -> list[str]:
         return []
     free = len(report.free)
     lines = ["  what to measure next:"]
-    if (best := _most(report)) is not None:
+    if (best := _most(report, (*report.designs, *report.pairs))) is not None:
         count = free - best.determined
         rest = f"{count} of {free} combinations would stay open" if count else "nothing would stay open"
         label = " and ".join(_letters(report, best))
+        if best.name not in {d.name for d in report.designs} and (single := _most(report, report.designs)) is not None:
+            rest += f". If you make only one: {_letters(report, single)[0]} ({free - single.determined} would stay open)"
         lines += _wrapped(f"most would be learnt from {label}, {best.name}: {rest}", 4)
     for number, design in enumerate(report.designs):
         count = "" if design.failed else f" ({design.determined} of {free} combinations determined)"
@@ -322,9 +325,8 @@ def _cell(known: Known, error: float) -> str:
     return f"{share:.2g}" if share < 99.5 else f"{share:.0f}" if share < FAR else ">>"
 
 
-def _most(report: IdentifiabilityReport) -> Outlook | None:
+def _most(report: IdentifiabilityReport, outlooks: Iterable[Outlook]) -> Outlook | None:
     """What determines most; among equals one measurement before two, then that with the smaller errors."""
-    possible = [(outlook, alone) for outlooks, alone in ((report.designs, True), (report.pairs, False))
-                for outlook in outlooks if outlook.failed is None]  # fmt: skip
-    ranks = {o.name: (o.determined, len(o.gained), alone, -o.log_left) for o, alone in possible}
-    return max((o for o, _ in possible), key=lambda o: ranks[o.name], default=None)
+    alone = {design.name for design in report.designs}
+    possible = [outlook for outlook in outlooks if outlook.failed is None]
+    return max(possible, key=lambda o: (o.determined, len(o.gained), o.name in alone, -o.log_left), default=None)
