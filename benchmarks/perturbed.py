@@ -40,6 +40,13 @@ def truth(task: jm.PrescribedLength = TASK) -> dict[str, float]:
             for c in "kc" for j in "wz"}  # fmt: skip
 
 
+def tangents() -> dict[str, float]:
+    """Stiffness of the active tissue, and of both in series, as they are in the hold."""
+    x_w = float(jm.response.equilibrium(TASK)[0])
+    return {"K_w_tangent": float(TASK["k_w"]) * (float(TASK["x_ref_w"]) ** 2 + 3 * x_w**2),
+            "tangent_stiffness": stiffness(TASK, 1e-4).real}  # fmt: skip
+
+
 def spread(name: str, values: list[float], stated: list[float], true: float) -> None:
     """A row: what was found on the average, how far the repeats scatter, what error was stated."""
     found, sd = np.mean(values), np.std(values, ddof=1)
@@ -158,6 +165,9 @@ def reflex(count: int) -> None:
             print(f"reflex {strength:g} of the stiffness at rest, late by {1e3 * late:g} ms")
             fits = [jm.fit(TASK, run, **QUICK) for run in runs]
             told(fits)
+            for name, true in tangents().items():
+                off = [100 * (fit[name].value / true - 1) for fit in fits if fit[name].stderr is not None]
+                print(f"muscle {name}: known {len(off)}/{count}, off by {np.mean(off) if off else np.nan:+.0f} % (mean)")
             masses = [fit["m_z"] for fit in fits]
             spread("muscle m_z", [m.value for m in masses], [float(m.stderr or np.nan) for m in masses], float(TASK["m_z"]))
             if strength == 1.0:
@@ -193,11 +203,7 @@ def active(count: int) -> None:
 def reference(count: int) -> None:
     """Reference displacements in the fit that are not those of the muscle, which has 20 mm."""
     runs = recorded(TASK, np.random.default_rng(11), count)
-    muscle = jm.response.equilibrium(TASK)
-    true = truth() | {
-        "K_w_tangent": float(TASK["k_w"]) * (float(TASK["x_ref_w"]) ** 2 + 3 * float(muscle[0]) ** 2),
-        "tangent_stiffness": stiffness(TASK, 1e-4).real,
-    }
+    true = truth() | tangents()
     for length in (0.010, 0.015, 0.020, 0.030, 0.040):
         scale = (0.02 / length) ** 2
         task = TASK.replace(x_ref_w=length, x_ref_z=length, **{k: scale * float(TASK[k]) for k in ("k_w", "k_z")})
