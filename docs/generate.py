@@ -46,10 +46,13 @@ A parameter has the name of this table wherever you write it:
 
 ## Values
 
-*Bounds* say which values are physically possible. A name with a dot (●) is free in a default fit: the fit looks for its
-value. Where a motor moved the insertion, `m_w` and `m_z` are free, too. A default task has no activation, no tremor, no
-second resonance and no noise on the drive. For these the column *default* says with which value they begin when you add them
-(`jm.on_rung`, `jm.Activation()`, `jm.ResonantNoise()`). In `PrescribedMotion` `F_ext` is 10 N by default.
+*Bounds* say which values are physically possible. (For a mass, a cut-off, a correlation time and the frequency of the
+harmonic 0 itself is refused.) A name with a dot (●) is free in a default fit: the fit looks for its value. Where a
+motor moved the insertion, `m_w` and `m_z` are free, too.
+
+A default task has no activation, no tremor, no second resonance and no noise on the drive. For these the column
+*default* says with which value they begin when you add them (`jm.on_rung`, `jm.Activation()`, `jm.ResonantNoise()`). In
+`PrescribedMotion` `F_ext` is 10 N by default.
 
 | name | symbol | unit | default | bounds | meaning |
 |---|---|---|---|---|---|
@@ -143,15 +146,12 @@ def unit(row: Parameter) -> str:
     return text.replace(" ", "&nbsp;")
 
 
-MASSES = ("m_w", "m_z")  # 0 is no mass
-
-
 def page() -> str:
     """The text of the page."""
     values, fits = [], []
     for row in PARAMETERS.values():
         name = f"`{row.name}`" + (" ●" if row.name in DEFAULT_FREE else "")
-        bounds = "(0, ∞)" if row.name in MASSES else interval(row.lower, row.upper)
+        bounds = interval(row.lower, row.upper)
         values.append(f"| {name} | {row.symbol} | {unit(row)} | {number(row.default)} | {bounds} | {row.meaning} |\n")
         reached = interval(row.fit_lower, row.fit_upper)
         log = "yes" if row.positive else "no"

@@ -54,8 +54,8 @@ QUICK_COMPILER = (
 def _compile_quickly(known: Path) -> None:
     """XLA's older emitters, LLVM at its first level, loops as they are, no rounds of simplification before it: compiled in
     less than half the time, run as fast, the same numbers to rounding; and each program in one piece, since a worker has
-    one core. Without optimisation a whole
-    run compiles 0.8 of 1.7 ks less and computes 0.6 ks longer: compiled.py does so where a program runs a few times.
+    one core. Without optimisation a whole run compiles 0.8 of 1.7 ks less and computes 0.6 ks longer: compiled.py does so
+    where a program runs a few times.
 
     An XLA that no longer has them ends the process at the flag: tried once for every version, in a process of its own.
     """

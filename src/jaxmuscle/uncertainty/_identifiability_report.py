@@ -249,10 +249,10 @@ def _next(report: IdentifiabilityReport) -> list[str]:
     if (best := _most(report, (*report.designs, *report.pairs))) is not None:
         count = free - best.determined
         rest = f"{count} of {free} combinations would stay open" if count else "nothing would stay open"
-        label = " and ".join(_letters(report, best))
-        if best.name not in {d.name for d in report.designs} and (single := _most(report, report.designs)) is not None:
+        letters = _letters(report, best)
+        if len(letters) > 1 and (single := _most(report, report.designs)) is not None:
             rest += f". If you make only one: {_letters(report, single)[0]} ({free - single.determined} would stay open)"
-        lines += _wrapped(f"most would be learnt from {label}, {best.name}: {rest}", 4)
+        lines += _wrapped(f"most would be learnt from {' and '.join(letters)}, {best.name}: {rest}", 4)
     for number, design in enumerate(report.designs):
         count = "" if design.failed else f" ({design.determined} of {free} combinations determined)"
         lines += _wrapped(f"{design}{count}", 8, f"    {letter(number):<2}  ")
