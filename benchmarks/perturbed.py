@@ -78,6 +78,9 @@ def classical(count: int) -> None:
         for part, words in ((np.real, "Re"), (np.imag, "Im")):
             spread(f"muscle {words} H({f:.2f} Hz)", [float(part(stiffness(task, f))) for task in muscles], [],
                    float(part(stiffness(TASK, f))))  # fmt: skip
+    spread("muscle C(0)", [stiffness(task, 1e-4).imag / (2e-4 * np.pi) for task in muscles], [], damping)
+    spread("muscle m_z", [fit["m_z"].value for fit in fits], [float(fit["m_z"].stderr or 0) for fit in fits],
+           float(TASK["m_z"]))  # fmt: skip
     told(fits)
 
 
