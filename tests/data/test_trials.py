@@ -140,6 +140,18 @@ def test_mean_force_and_its_error():
     assert several.mean_force[1] >= np.std(several.mean, ddof=1) / 2 * 0.999
 
 
+def test_the_error_of_one_mean_is_that_of_noise_with_its_lowest_bin():
+    """The mean of n samples of white noise of variance σ² scatters as σ / √n. Its one-sided density is 2 σ² / rate."""
+    one = jm.Target("x", np.ones(30), segments=(6,), coefficient_of_variation=(0.3,), mean=(20.0,), unit="N")
+    # Six segments of 256, half overlapping, take 896 samples; with up to 127 more there is no seventh. In the middle:
+    rate, samples = one.settings.rate, 256 + 5 * 128 + 64
+    density = (0.3 * 20.0) ** 2 / 30 / one.settings.resolution  # the variance, spread evenly over thirty bins
+    force, error = one.mean_force
+    assert force == 20.0 and error == pytest.approx(np.sqrt(density * rate / 2 / samples), rel=1e-12)
+    two = jm.Target("x", np.ones(30), segments=(6, 6), coefficient_of_variation=(0.3, 0.3), mean=(20.0, 20.0), unit="N")
+    assert two.mean_force[1] == pytest.approx(error / np.sqrt(2), rel=1e-12)  # twice the time
+
+
 @pytest.mark.parametrize("count", [3, 5, 10])
 def test_the_error_by_the_scatter_of_trials_has_students_t(count):
     """± 1.96 of it hold the mean in 95 %. It counts where it is larger than what is expected."""

@@ -262,6 +262,7 @@ def test_what_does_not_stay_finite_is_named(x64):
         ({"dt": 0.0}, "dt = 0.0: give a finite number above 0"),
         ({"duration": -1.0}, "duration = -1.0: give a finite number above 0"),
         ({"duration": 1.005}, "duration = 1.005 s is not a whole number of sampling intervals"),
+        ({"duration": 2.2e6}, "makes 2200000000 steps, at most 2147483647 are possible"),  # 32 bits count them
         ({"sampling": "mean"}, "sampling = 'mean' must be one of instant, average, filtered"),
     ],
 )
