@@ -32,6 +32,9 @@ A parameter has the name of this table wherever you write it:
 | say how it is fitted | `free=("k_w",)`, `fix={"k_w": 4e5}`, `priors={"k_w": 0.5}`, `bounds={"k_w": (1e5, 1e6)}` |
 | do the same on the command line | `--free k_w`, `--fix k_w=4e5` |
 
+(In `priors` the number is the standard deviation of the prior, of a positive parameter that of its logarithm: 0.5 means a
+factor of 1.6 either way.)
+
 - The letter at the end says which tissue is meant: `_w` the active one, `_z` the passive one. A small letter is a factor
   (`k_w`, `c_w`), a capital the stiffness or damping itself (`K_w0`). `noise_K_w` is the noise on the stiffness K_w.
 - Three parameters have a second name, the one that motor control uses. Both names work everywhere: `tremor_frequency` is

@@ -76,11 +76,11 @@ SUBJECTS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
             "fits/_checks",
             "fits/_harmonic_evidence",
         ),
-        ("uncertainty", "fit", "identify", "joint", "fitting", "goodness"),
+        ("uncertainty", "checks", "fit", "identify", "joint", "fitting", "goodness"),
     ),
     "targets": (
         ("data/_target", "data/_target_files", "data/_target_fields", "data/_target_csv", "data/_digitised"),
-        ("target", "digitised", "cli"),
+        ("target", "digitised", "trials", "cli", "moved"),
     ),
     "recordings": (
         (
@@ -100,7 +100,7 @@ SUBJECTS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
             "data/_recording_time",
             "data/_units",
         ),
-        ("recording", "recording_file", "recording_formats", "hostile", "reproduce"),
+        ("recording", "recording_file", "recording_formats", "hostile", "trials", "perturbed", "reproduce"),
     ),
     "ensemble store": (
         (

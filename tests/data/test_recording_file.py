@@ -51,6 +51,8 @@ DIALECTS = {
     "no header": text(TIME, X),
     "windows": "\ufeff" + text(TIME, X, header='"time","force"').replace("\n", "\r\n"),
     "trailing comma": text(TIME, X, [""] * X.size, header="time,force,"),
+    "trailing comma here and there": "time,force\n"
+    + "".join(f"{t:.6f},{x:.9f}{',' * (i % 2)}\n" for i, (t, x) in enumerate(zip(TIME, X, strict=True))),
     "more columns": text(TIME, X, X + 1, ["a"] * X.size, header="time,force,torque,note"),
 }
 

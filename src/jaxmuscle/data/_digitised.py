@@ -110,7 +110,7 @@ def columns_of(points: Points, axis: str, file: str) -> tuple[Columns, bool]:
 
 def _power_of_ten(points: Points, name: str, file: str) -> Float[np.ndarray, " points"]:
     exponents = getattr(points, name)
-    wrong = np.flatnonzero(~(np.abs(exponents) < 100))
+    wrong = np.flatnonzero(~(np.abs(exponents) <= 100))
     if wrong.size:
         what, value = "frequency" if name == "x" else "power", exponents[wrong[0]]
         raise TargetError(f"{file}, {points.places[wrong[0]]}: log10 of the {what} is {value:g}; expected -100 to 100")
