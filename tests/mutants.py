@@ -205,11 +205,15 @@ def of_file(subject: str, path: Path) -> list[Mutant]:
     return found
 
 
+def of_subject(subject: str) -> list[Mutant]:
+    return [m for file in SUBJECTS[subject][0] for m in of_file(subject, SOURCE / f"{file}.py")]
+
+
 def sampled(count: int, seed: int) -> list[Mutant]:
     """So many of every subject, each on a line of its own."""
     chosen = []
-    for subject, (files, _) in SUBJECTS.items():
-        sites = [m for file in files for m in of_file(subject, SOURCE / f"{file}.py")]
+    for subject in SUBJECTS:
+        sites = of_subject(subject)
         random.Random(f"{seed} {subject}").shuffle(sites)
         one_a_line = {(m.file, m.line): m for m in reversed(sites)}
         chosen += [m for m in sites if one_a_line[m.file, m.line] is m][:count]
@@ -284,10 +288,11 @@ def main() -> None:
     parser.add_argument("--only", default="", help="mutants whose name contains this")
     parser.add_argument("--list", action="store_true", help="show the mutants, run none")
     given = parser.parse_args()
-    mutants = [m for m in sampled(given.count, given.seed) if given.only in m.name]
-    if given.names is not None:
+    if given.names is None:
+        mutants = [m for m in sampled(given.count, given.seed) if given.only in m.name]
+    else:
         asked = given.names.read_text(encoding="utf-8").splitlines()
-        mutants = [m for m in mutants if m.name in asked]
+        mutants = [m for subject in SUBJECTS for m in of_subject(subject) if m.name in asked]
     if given.list:
         print("\n".join(f"{m.subject:16} {m.name}" for m in mutants))
         return
