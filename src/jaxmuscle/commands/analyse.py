@@ -128,8 +128,9 @@ def _write(
         table.add_row(row[0][0], *(plain(value) for _, value in row))
     out.print(table)
     if any(summary.peaks.local_maxima for summary in summaries):
-        out.print("A maximum stands between two bins: it is interpolated. Local maxima may be chance. Whether a peak is "
-                  "real says jaxmuscle steadiness.", highlight=False)  # fmt: skip
+        out.print("Maxima are interpolated between bins. Local maxima are listed if they rise by at least 1 % of the "
+                  "highest power; they may be chance. A tremor is mostly smaller: jaxmuscle steadiness looks for its peak.",
+                  highlight=False)  # fmt: skip
     if whole:
         out.print(plain(target), highlight=False)
     written = [f"{folder}/analysis.json, spectrum.csv", *figures]

@@ -337,7 +337,7 @@ def _fit_one(fit: Callable[[Any, Any], Any], called: str, folder: Path, formats:
     for sentence in new:
         out.print(plain(sentence), highlight=False)
     if new and _numbers(printed[0]) != _numbers(result):
-        out.print("The checks moved the last digits a little: the final numbers are in the files.", highlight=False)
+        out.print("The checks moved the last digits a little: cite the numbers in the files.", highlight=False)
     out.print(f"Written: {folder}/{', '.join(files)}", highlight=False, soft_wrap=True)
     return result.success
 

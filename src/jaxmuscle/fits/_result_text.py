@@ -99,7 +99,7 @@ def text_of(result: "FitResult") -> str:
     lines += [f"  {sentence}" for sentence in _counted(loose, every)]
     if factor := result.settings.get("carried"):
         moved = any(part.stiffness is not None for part in result.parts.values())
-        what = "P_w, stiffness" if moved else "P_w, masses (those that are not fixed), stiffness"
+        what = "P_w, stiffness" if moved else "P_w, masses (those that you did not fix), stiffness"
         lines += [f"  before the fit {what} and damping were multiplied by {factor:.3g}, so that the muscle has the "
                   "measured mean force" + " (mean_force=False leaves the mean out)" * (not moved)]  # fmt: skip
     lines += [f"  {sentence}" for sentence in _held(result)]
