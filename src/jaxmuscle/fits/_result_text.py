@@ -133,7 +133,10 @@ def _held(result: "FitResult") -> list[str]:
     told = {name: f"{name} = {1e3 * float(task[name]):.3g} mm" if name in LENGTHS else f"{name} = {float(task[name]):.3g} kg"
             for name in held}  # fmt: skip
     if not moved:
-        means = ("They are no measurements: a held force tells no length and no mass. Half of both x_ref, with twice the "
+        factor, usual = result.settings.get("carried") or 1.0, float(PARAMETERS["m_w"].default)
+        times = abs(factor - 1) > 0.005 and all(np.isclose(float(task[m]), factor * usual) for m in ("m_w", "m_z"))
+        means = f"The masses are the usual {usual:g} kg times {factor:.3g}. " * times
+        means += ("They are no measurements: a held force tells no length and no mass. Half of both x_ref, with twice the "
                  "stiffness, damping and masses, would fit as well")  # fmt: skip
         return [f"held fixed: {', '.join(told.values())}. {means}"] if {"m_w", *LENGTHS} <= set(held) else []
     said = []

@@ -37,7 +37,7 @@ NO_NOISE = ("no further measurement is tried: the fit has no spectrum, so the no
             "Fit the recording of both channels, or a spectrum beside the response (fit_joint)")  # fmt: skip
 FITTED_TOO = "fitted in this measurement"
 DOUBTED = "; in the column now also what the fit does not call determined"
-OPENED = "; but fitted in the measurements that say so above"
+OPENED = "; but fitted in those measurements whose details say so"
 BASE = {"k_w": "K_w0", "k_z": "K_z0", "c_w": "C_w0", "c_z": "C_z0"}
 
 
@@ -252,7 +252,9 @@ def _next(report: IdentifiabilityReport) -> list[str]:
         letters = _letters(report, best)
         if len(letters) > 1 and (single := _most(report, report.designs)) is not None:
             rest += f". If you make only one: {_letters(report, single)[0]} ({free - single.determined} would stay open)"
-        lines += _wrapped(f"most would be learnt from {' and '.join(letters)}, {best.name}: {rest}", 4)
+        both = zip(letters, best.name.split(TOGETHER), strict=False)
+        what = f"{letters[0]}, {best.name}" if len(letters) == 1 else TOGETHER.join(f"{at} ({name})" for at, name in both)
+        lines += _wrapped(f"most would be learnt from {what}: {rest}", 4)
     for number, design in enumerate(report.designs):
         count = "" if design.failed else f" ({design.determined} of {free} combinations determined)"
         lines += _wrapped(f"{design}{count}", 8, f"    {letter(number):<2}  ")
