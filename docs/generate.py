@@ -41,6 +41,7 @@ factor of 1.6 either way.)
   `resonance_frequency`, `tremor_width` is `resonance_width`, `contraction_time` is `activation_time`.
 - `K_w0`, `K_z0`, `C_w0` and `C_z0` are stiffness and damping at rest. They follow from the parameters. You can read them
   (`task["K_w0"]`, `result["K_w0"]`), but not set or fit them.
+- `harmonic_amplitude` is a fraction of K_w0 and of K_z0: the harmonic acts on both.
 - `P_w`, `F_ext` and `x_z` are inputs over time. `task["P_w"]` is the level that is held, and
   `task.P_w` is the whole signal. `P_w` is larger than the force that one measures: the spring of the active tissue (K_w)
   takes its share. At the defaults P_w = 5 N gives F_ext = 2.2 N.

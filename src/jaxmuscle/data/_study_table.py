@@ -42,16 +42,18 @@ Above0 = Annotated[float, Meta(gt=0)]
 class ReadingTable(Table, kw_only=True):
     """How a recording is read: columns of a study's table, and options for all of them in a study.toml."""
 
-    column: Annotated[str | int | None, _told("Column or point of the force")] = None
+    column: Annotated[str | int | None, _told("Column of the force, or point (three columns NAME_x, NAME_y, NAME_z)")] = None
     rate: Annotated[Above0 | None, _told("Sampling rate [Hz]")] = None
     units: Annotated[str | None, _told("Unit of the column")] = None
-    axis: Annotated[str | None, _told("Of a point: x, y, z or principal")] = None
-    reference: Annotated[str | int | None, _told("Column or point that is subtracted")] = None
+    axis: Annotated[str | None, _told("Of a point: x, y, z, or principal, along which it moves most")] = None
+    reference: Annotated[str | int | None, _told("Column or point that is subtracted from it")] = None
     time: Annotated[str | int | None, _told("Column of the time")] = None
     max_gap: Annotated[Annotated[float, Meta(ge=0)] | None, _told("Longest gap that is closed [s]")] = None
     lever_arm: Annotated[Above0 | None, _told("From the axis to where the force acts [m]: turns a torque into N")] = None
     skip_rows: Annotated[Annotated[int, Meta(ge=0)] | None, _told("Lines to leave out at the top")] = None
-    spectrum: Annotated[str | None, _told("standard, slow, multitaper or pwelch; the same for all")] = None
+    spectrum: Annotated[
+        str | None, _told("standard, slow (resolves what is below 1 Hz), multitaper or pwelch; the same for all")
+    ] = None
     mvc: Annotated[Above0 | None, _told("Maximal voluntary contraction, in the recording's unit")] = None
 
 

@@ -90,16 +90,19 @@ class SettingsTable(Table, kw_only=True):
     """How it was fitted: `settings`. Posterior, profile and bootstrap need it to go on from the fit."""
 
     free: Annotated[list[str], _told("Names of the fitted parameters")]
-    residual: Annotated[Literal[RESIDUALS], _told("How powers were compared")]  # pyright: ignore[reportInvalidTypeForm]
+    residual: Annotated[Literal[RESIDUALS], _told("How powers were compared, see docs/fitting.md")]  # pyright: ignore[reportInvalidTypeForm]
     prior_centre: Annotated[dict[str, float], _told("Centre of the prior of every free parameter, in its unit")]
     prior_sd: Annotated[dict[str, float | None], _told("Standard deviation of the prior, null where it is flat")]
     bounds: Annotated[dict[str, tuple[Number, Number]], _told("Bounds that were asked for, null where there is none")]
     starts: Annotated[Count, _told("Starts of the search")]
-    seeds: Annotated[Count, _told("Seeds of the nonlinear correction")]
+    seeds: Annotated[Count, _told("How many seeds correct the formula by simulation; 0: not corrected")]
     check_seeds: Annotated[Count, _told("New seeds with which the fit was checked")]
     max_steps: Annotated[Count, _told("Largest number of steps of each descent")]
     dt: Annotated[Annotated[float, Meta(gt=0)], _told("Step of the noise [s]")]
-    increments: Annotated[Literal["gaussian", "weak"], _told("Random numbers of what was simulated")] = "gaussian"
+    increments: Annotated[
+        Literal["gaussian", "weak"],
+        _told("Random numbers of the simulations: normal ones, or cheaper ones of docs/engine.md"),
+    ] = "gaussian"
     coefficient_of_variation: Annotated[bool | dict[str, bool], _told("Whether it was data; of several targets by name")]
     mean_force: Annotated[
         tuple[float, float] | dict[str, tuple[float, float] | None] | None, _told("Mean and its error [N] as data, or null")
@@ -109,7 +112,9 @@ class SettingsTable(Table, kw_only=True):
     steps_per_sample: Annotated[Count, _told("Steps of dt between samples")]
     optimiser: Annotated[str | None, _told("Solver, where another than Levenberg-Marquardt was asked for")] = None
     separate: Annotated[tuple[str, ...], _told("Of several targets only: parameters with a value for each")] = ()
-    proportional: Annotated[tuple[str, ...], _told("Of several targets only: parameters whose ratio was kept")] = ()
+    proportional: Annotated[
+        tuple[str, ...], _told("Of several targets only: parameters that differ between them by a fixed ratio")
+    ] = ()
 
 
 class SpectrumTable(Table, kw_only=True):
