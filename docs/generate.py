@@ -95,7 +95,8 @@ a table of its keys. Not listed are the fields of a task (`task_table`: let `sav
 reads earlier formats.
 
 Files are checked when they are read. If a key is unknown, missing, there twice, of a wrong type or out of range,
-an error names the file and the key. A required key that is missing is never replaced by a default. Numbers must
+an error names the file and the key. A required key that is missing is never replaced by a default. (*No* under
+*required* means that a file may lack the key, if only one of an earlier format.) Numbers must
 be finite. `true` is not 1, and `1.0` is not a whole number. `docs/generate.py` writes this page from the code that
 checks the files.
 
@@ -109,8 +110,9 @@ value of a parameter with the `task_table`, the spectrum with the `target_table`
 `values`, which say where each ended. Format 2 may also leave out keys of `task_table` and `target_table` that do not
 apply."""
 PRESET = """TOML, format 2. `save_preset` writes it and `load_preset` reads it. The `task_table` has every field of
-the task and of its parts. `type` is the class of a part. What a task does not have (`activation`, `initial`, a
-low-pass) is written as `"none"`. Format 1 has no key `format`, and may leave out what a task does not have."""
+the task and of its parts. `type` is the class of a part. What a task does not have (`activation`; `initial`, the state
+from which a simulation begins; a low-pass) is written as `"none"`. Format 1 has no key
+`format`, and may leave out what a task does not have."""
 TARGET = """TOML, format 1. `Target.save` writes it and `load_target` reads it. The `target_table` of a fit.json has
 the same keys without `format`, and `null` for what is not stated."""
 STUDY = """TOML. `run_study` reads it. The second table has the columns of a study.csv."""

@@ -167,10 +167,17 @@ class TargetFile(Table, kw_only=True):
     ]
     sigma: Annotated[Any, Meta(description="Standard deviation of each power", extra={"type": POSITIVES})] = None
     segments: Annotated[
-        Any, Meta(description="Welch segments that were averaged, of each trial", extra={"type": "whole numbers from 1"})
+        Any,
+        Meta(
+            description="Welch segments that were averaged, of each trial",
+            extra={"type": "whole number from 1, or a list of them"},
+        ),
     ] = None
     coefficient_of_variation: Annotated[
-        Any, Meta(description="Standard deviation over mean, of each trial", extra={"type": "numbers above 0, at most 1"})
+        Any,
+        Meta(
+            description="Standard deviation over mean, of each trial", extra={"type": "number above 0, at most 1, or a list"}
+        ),
     ] = None
     mvc_fraction: Annotated[
         Any, Meta(description="Mean level as a share of the maximum", extra={"type": "number above 0, at most 1"})

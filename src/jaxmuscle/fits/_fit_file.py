@@ -67,7 +67,9 @@ class StartTable(Table, kw_only=True):
     cost: Annotated[Number, _told("½ Σ r² where it ended")]
     success: Annotated[bool, _told("Whether it settled")]
     steps: Annotated[Count, _told("Steps taken")]
-    values: Annotated[tuple[float, ...], _told("Where it ended, in the order of settings.free; empty if not finite")] = ()
+    values: Annotated[
+        tuple[float, ...], _told("Free parameters where it ended, in their units, in the order of settings.free")
+    ] = ()
 
 
 class CorrelationTable(Table, kw_only=True):
@@ -92,7 +94,9 @@ class SettingsTable(Table, kw_only=True):
     free: Annotated[list[str], _told("Names of the fitted parameters")]
     residual: Annotated[Literal[RESIDUALS], _told("How powers were compared, see docs/fitting.md")]  # pyright: ignore[reportInvalidTypeForm]
     prior_centre: Annotated[dict[str, float], _told("Centre of the prior of every free parameter, in its unit")]
-    prior_sd: Annotated[dict[str, float | None], _told("Standard deviation of the prior, null where it is flat")]
+    prior_sd: Annotated[
+        dict[str, float | None], _told("Its standard deviation (of positive ones: of the logarithm), or null: flat")
+    ]
     bounds: Annotated[dict[str, tuple[Number, Number]], _told("Bounds that were asked for, null where there is none")]
     starts: Annotated[Count, _told("Starts of the search")]
     seeds: Annotated[Count, _told("How many seeds correct the formula by simulation; 0: not corrected")]
@@ -107,7 +111,7 @@ class SettingsTable(Table, kw_only=True):
     mean_force: Annotated[
         tuple[float, float] | dict[str, tuple[float, float] | None] | None, _told("Mean and its error [N] as data, or null")
     ]
-    carried: Annotated[float | None, _told("Factor by which the task was scaled to the mean force")]
+    carried: Annotated[float | None, _told("What multiplied forces, masses, stiffness and damping before the fit, or null")]
     spectrum: Annotated[dict[str, Any], _told("Spectrum settings; of several targets by name")]
     steps_per_sample: Annotated[Count, _told("Steps of dt between samples")]
     optimiser: Annotated[str | None, _told("Solver, where another than Levenberg-Marquardt was asked for")] = None
@@ -150,7 +154,9 @@ class PartTable(Table, kw_only=True):
     rms_log_error: Annotated[float | None, _told("Standard deviation of the log of target over fit")]
     spectrum: Annotated[SpectrumTable, _told("Spectra")]
     stretch: Annotated[StretchTable, _told("A few simulated seconds")]
-    check: Annotated[dict[str, float | int], _told("How far linear response and simulation differ")]
+    check: Annotated[
+        dict[str, float | int], _told("How far linear response and simulation differ, see docs/fitting.md, how")
+    ]
     further: Annotated[dict[str, float], _told("Residuals besides those of bins [standard deviations]")]
     stiffness: Annotated[
         tuple[list[float], list[float]] | None, _told("Fitted dynamic stiffness, real and imaginary [N/m], or null")
@@ -182,7 +188,7 @@ class FitTable(Table, kw_only=True):
     profile: Annotated[ProfileTable | None, _told("Profile of the frequency of the harmonic")]
     harmonic_p_value: Annotated[Share | None, _told("p-value of the harmonic: how often chance makes one as strong")]
     notices: Annotated[list[str], _told("Notes on the fit")]
-    seed: Annotated[Annotated[int, Meta(ge=0, lt=SEEDS)] | None, _told("Seed, null where a key was given")]
+    seed: Annotated[Annotated[int, Meta(ge=0, lt=SEEDS)] | None, _told("The key, if it was a whole number; else null")]
     settings: Annotated[SettingsTable, _told("How it was fitted")]
     versions: Annotated[dict[str, str], _told("Versions of the libraries")]
 
