@@ -96,15 +96,16 @@ reads earlier formats.
 
 Files are checked when they are read. If a key is unknown, missing, there twice, of a wrong type or out of range,
 an error names the file and the key. A required key that is missing is never replaced by a default. (*No* under
-*required* means that a file may lack the key, if only one of an earlier format.) Numbers must
-be finite. `true` is not 1, and `1.0` is not a whole number. `docs/generate.py` writes this page from the code that
-checks the files.
+*required* means that some files may lack the key: in some cases every file, in others only files of an earlier format.)
+Numbers must be finite. `true` is not 1, and `1.0` is not a whole number. `docs/generate.py` writes this page from the
+code that checks the files.
 
 In the column *type and range*, *table* is what Python calls a dict: an object in JSON, a `[table]` in TOML. The keys
 of a *table by name* are not fixed: they are, for example, the names of parameters. *2 times* is a list of two.
 """
 FIT_FILE = """JSON, format 4. `FitResult.save` writes it and `load_result` reads it. `load_preset` reads its
-`task_table` alone. A fit of one target has the keys of the first two tables side by side. In a fit of several targets
+`task_table` alone. A fit of one target has the keys of the first two tables side by side. In a
+[joint fit](../identifiability.md#a-joint-fit) (*several targets* below)
 the keys of the second table stand under `parts`, by the name of the target. What the file says twice must agree: the
 value of a parameter with the `task_table`, the spectrum with the `target_table`. In format 3 the starts do not have
 `values`, which say where each ended. Format 2 may also leave out keys of `task_table` and `target_table` that do not
@@ -115,7 +116,8 @@ from which a simulation begins; a low-pass) is written as `"none"`. Format 1 has
 `format`, and may leave out what a task does not have."""
 TARGET = """TOML, format 1. `Target.save` writes it and `load_target` reads it. The `target_table` of a fit.json has
 the same keys without `format`, and `null` for what is not stated."""
-STUDY = """TOML. `run_study` reads it. The second table has the columns of a study.csv."""
+STUDY = """TOML. `run_study` reads it. The second table has the columns of a study.csv.
+For null leave the key out of a TOML file, and the cell of a table empty ([a study](../study.md))."""
 F = _fit_file
 SECTIONS = (
     ("fit.json", FIT_FILE, 2, (F.FitTable, F.PartTable, F.EstimateTable, F.AdequacyTable, F.RungTable, F.StartTable,

@@ -64,7 +64,7 @@ class RungTable(Table, kw_only=True):
 class StartTable(Table, kw_only=True):
     """A start of the search: an entry of `starts`."""
 
-    cost: Annotated[Number, _told("½ Σ r² where it ended")]
+    cost: Annotated[Number, _told("Cost where it ended: half the sum of squares, that of the prior included")]
     success: Annotated[bool, _told("Whether it settled")]
     steps: Annotated[Count, _told("Steps taken")]
     values: Annotated[
@@ -111,7 +111,7 @@ class SettingsTable(Table, kw_only=True):
     mean_force: Annotated[
         tuple[float, float] | dict[str, tuple[float, float] | None] | None, _told("Mean and its error [N] as data, or null")
     ]
-    carried: Annotated[float | None, _told("What multiplied forces, masses, stiffness and damping before the fit, or null")]
+    carried: Annotated[float | None, _told("Number that gave the task the measured mean force before the fit, or null")]
     spectrum: Annotated[dict[str, Any], _told("Spectrum settings; of several targets by name")]
     steps_per_sample: Annotated[Count, _told("Steps of dt between samples")]
     optimiser: Annotated[str | None, _told("Solver, where another than Levenberg-Marquardt was asked for")] = None
@@ -188,7 +188,10 @@ class FitTable(Table, kw_only=True):
     profile: Annotated[ProfileTable | None, _told("Profile of the frequency of the harmonic")]
     harmonic_p_value: Annotated[Share | None, _told("p-value of the harmonic: how often chance makes one as strong")]
     notices: Annotated[list[str], _told("Notes on the fit")]
-    seed: Annotated[Annotated[int, Meta(ge=0, lt=SEEDS)] | None, _told("The key, if it was a whole number; else null")]
+    seed: Annotated[
+        Annotated[int, Meta(ge=0, lt=SEEDS)] | None,
+        _told("The random key (`key=`, `--seed`), if it was a whole number; else null"),
+    ]
     settings: Annotated[SettingsTable, _told("How it was fitted")]
     versions: Annotated[dict[str, str], _told("Versions of the libraries")]
 

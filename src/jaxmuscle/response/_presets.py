@@ -59,7 +59,9 @@ class PresetFile(Table, kw_only=True):
 
     format: Annotated[Literal[1, 2], Meta(description="Version of the format; a file without it is of format 1")] = 1
     description: Annotated[str, Meta(description="What the task is")] = ""
-    mean: Annotated[Any, Meta(description="Mean force to which the task is scaled", extra={"type": "number, not 0"})] = None
+    mean: Annotated[
+        Any, Meta(description="Mean force to which the task is scaled when it is loaded", extra={"type": "number, not 0"})
+    ] = None
     unit: Annotated[Any, Meta(description="N, mN, kN, kgf, gf or lbf; with `mean` only", extra={"type": "text"})] = None
     fit: Annotated[Any, Meta(description="The fit that made it, a table for people")] = None
     task_table: Annotated[dict[str, Any], Meta(description="The task, every number of it")]
