@@ -112,7 +112,7 @@ value of a parameter with the `task_table`, the spectrum with the `target_table`
 apply."""
 PRESET = """TOML, format 2. `save_preset` writes it and `load_preset` reads it. The `task_table` has every field of
 the task and of its parts. `type` is the class of a part. What a task does not have (`activation`; `initial`, the state
-from which a simulation begins; a low-pass) is written as `"none"`. Format 1 has no key
+from which a simulation begins; `filter_cutoff`) is written as `"none"`. Format 1 has no key
 `format`, and may leave out what a task does not have."""
 TARGET = """TOML, format 1. `Target.save` writes it and `load_target` reads it. The `target_table` of a fit.json has
 the same keys without `format`, and `null` for what is not stated."""

@@ -185,7 +185,7 @@ class TargetFile(Table, kw_only=True):
     mean: Annotated[Any, Meta(description="Mean force or torque of each trial, in `unit`", extra={"type": POSITIVES})] = None
     unit: Annotated[Any, Meta(description="Unit of `mean`", extra={"type": "text"})] = None
     dispersion: Annotated[
-        Any, Meta(description="By how much trials differ beyond their segments, and its error", extra={"type": POSITIVES})
+        Any, Meta(description="Dispersion of the trials (1 if they are alike), and its error", extra={"type": POSITIVES})
     ] = None
     reason: Annotated[
         Any, Meta(description="What was assumed; needed where it is reconstructed", extra={"type": "text"})
