@@ -111,7 +111,7 @@ class SettingsTable(Table, kw_only=True):
     mean_force: Annotated[
         tuple[float, float] | dict[str, tuple[float, float] | None] | None, _told("Mean and its error [N] as data, or null")
     ]
-    carried: Annotated[float | None, _told("Factor of forces, masses, stiffness and damping before the fit, or null")]
+    carried: Annotated[float | None, _told("The task was multiplied by it before the fit, to have the mean force; or null")]
     spectrum: Annotated[dict[str, Any], _told("Spectrum settings; of several targets by name")]
     steps_per_sample: Annotated[Count, _told("Steps of dt between samples")]
     optimiser: Annotated[str | None, _told("Solver, where another than Levenberg-Marquardt was asked for")] = None

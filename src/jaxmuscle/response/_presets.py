@@ -63,7 +63,7 @@ class PresetFile(Table, kw_only=True):
         Any, Meta(description="Mean force to which the task is scaled when it is loaded", extra={"type": "number, not 0"})
     ] = None
     unit: Annotated[Any, Meta(description="N, mN, kN, kgf, gf or lbf; with `mean` only", extra={"type": "text"})] = None
-    fit: Annotated[Any, Meta(description="The fit that made it, a table for people")] = None
+    fit: Annotated[Any, Meta(description="How it was fitted: a note for the reader, not used")] = None
     task_table: Annotated[dict[str, Any], Meta(description="The task, every number of it")]
 
 
