@@ -112,8 +112,8 @@ value of a parameter with the `task_table`, the spectrum with the `target_table`
 apply."""
 PRESET = """TOML, format 2. `save_preset` writes it and `load_preset` reads it. The `task_table` has every field of
 the task and of its parts. `type` is the class of a part. What a task does not have (`activation`; `initial`, the state
-from which a simulation begins; `filter_cutoff`) is written as `"none"`. Format 1 has no key
-`format`, and may leave out what a task does not have."""
+from which a simulation begins; in its spectrum settings `filter_cutoff`, the low-pass) is written as `"none"`. Format 1
+has no key `format`, and may leave out what a task does not have."""
 TARGET = """TOML, format 1. `Target.save` writes it and `load_target` reads it. The `target_table` of a fit.json has
 the same keys without `format`, and `null` for what is not stated."""
 STUDY = """TOML. `run_study` reads it. The second table has the columns of a study.csv.
@@ -177,7 +177,7 @@ def kind(given: typing.Any) -> str:
         said = [f"{word} {limit}" for limit, word in limits if limit is not None]
         return " ".join([kind(inside[0]), ", ".join(said)]).strip()
     if origin in (types.UnionType, typing.Union):
-        return " or ".join(dict.fromkeys(kind(each) for each in inside))
+        return " or ".join(dict.fromkeys(kind(each) for each in inside if not (each is int and float in inside)))
     if origin is typing.Literal:
         return ", ".join(f"`{each}`" for each in inside)
     if origin in (list, tuple):

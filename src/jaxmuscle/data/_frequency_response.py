@@ -35,7 +35,7 @@ class ResponseTable(Table, kw_only=True):
     frequency_hz: Annotated[Numbers, Meta(description="Frequencies [Hz], rising, above 0")]
     real: Annotated[Numbers, Meta(description="Real part [N/m]")]
     imaginary: Annotated[Numbers, Meta(description="Imaginary part [N/m]")]
-    stderr: Annotated[list[float | Literal["inf"]], Meta(description="Standard error of both [N/m], inf where of no use")]
+    stderr: Annotated[list[float | Literal["inf"]], Meta(description='Standard error of both [N/m], or "inf" (a text)')]
     coherence: Annotated[Numbers | None, Meta(description="Squared coherence, 0 to 1")] = None
 
 

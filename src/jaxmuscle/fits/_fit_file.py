@@ -155,7 +155,7 @@ class PartTable(Table, kw_only=True):
     spectrum: Annotated[SpectrumTable, _told("Spectra")]
     stretch: Annotated[StretchTable, _told("A few simulated seconds")]
     check: Annotated[
-        dict[str, float | int], _told("How far linear response and simulation differ, see docs/fitting.md, how")
+        dict[str, float | int], _told("How far linear response and simulation differ: docs/fitting.md, section How")
     ]
     further: Annotated[dict[str, float], _told("Residuals besides those of bins [standard deviations]")]
     stiffness: Annotated[
