@@ -339,7 +339,7 @@ def fitted(tmp_path_factory):
 def test_a_fit_writes_result_table_and_figure(fitted):
     outcome, folder = fitted
     assert outcome.exit_code == 0
-    assert "the final numbers are in the files" in " ".join(outcome.stdout.split())
+    assert "cite the numbers in the files" in " ".join(outcome.stdout.split())
     assert sorted(p.name for p in folder.iterdir()) == ["fit.json", "fit.png", "report.html", "spectrum.csv"]
     result = jm.load_result(folder / "fit.json")
     assert result.success and result.seed == 5 and result.free == ("c_w", "noise_K_w")

@@ -42,7 +42,9 @@ Above0 = Annotated[float, Meta(gt=0)]
 class ReadingTable(Table, kw_only=True):
     """How a recording is read: columns of a study's table, and options for all of them in a study.toml."""
 
-    column: Annotated[str | int | None, _told("Column of the force, or point (three columns NAME_x, NAME_y, NAME_z)")] = None
+    column: Annotated[
+        str | int | None, _told("Column of the force (name, or number from 0), or point (columns NAME_x, NAME_y, NAME_z)")
+    ] = None
     rate: Annotated[Above0 | None, _told("Sampling rate [Hz]")] = None
     units: Annotated[str | None, _told("Unit of the column")] = None
     axis: Annotated[str | None, _told("Of a point: x, y, z, or principal, along which it moves most")] = None

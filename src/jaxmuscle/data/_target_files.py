@@ -165,11 +165,13 @@ class TargetFile(Table, kw_only=True):
     proportional_power: Annotated[
         Any, Meta(description="Power at each, of any scale; empty with a stiffness alone", extra={"type": POSITIVES})
     ]
-    sigma: Annotated[Any, Meta(description="Standard deviation of each power", extra={"type": POSITIVES})] = None
+    sigma: Annotated[
+        Any, Meta(description="Standard error of each averaged power, in the unit of the power", extra={"type": POSITIVES})
+    ] = None
     segments: Annotated[
         Any,
         Meta(
-            description="Welch segments that were averaged, of each trial",
+            description="Welch segments that were averaged: a number for each trial; one number: of one recording",
             extra={"type": "whole number from 1, or a list of them"},
         ),
     ] = None

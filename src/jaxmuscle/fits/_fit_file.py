@@ -111,7 +111,13 @@ class SettingsTable(Table, kw_only=True):
     mean_force: Annotated[
         tuple[float, float] | dict[str, tuple[float, float] | None] | None, _told("Mean and its error [N] as data, or null")
     ]
-    carried: Annotated[float | None, _told("The task was multiplied by it before the fit, to have the mean force; or null")]
+    carried: Annotated[
+        float | None,
+        _told(
+            "Forces, stiffness, damping (and masses, if all are of holds) were multiplied by it before the fit, "
+            "so that the task has the mean force; or null"
+        ),
+    ]
     spectrum: Annotated[dict[str, Any], _told("Spectrum settings; of several targets by name")]
     steps_per_sample: Annotated[Count, _told("Steps of dt between samples")]
     optimiser: Annotated[str | None, _told("Solver, where another than Levenberg-Marquardt was asked for")] = None
@@ -155,7 +161,12 @@ class PartTable(Table, kw_only=True):
     spectrum: Annotated[SpectrumTable, _told("Spectra")]
     stretch: Annotated[StretchTable, _told("A few simulated seconds")]
     check: Annotated[
-        dict[str, float | int], _told("How far linear response and simulation differ: docs/fitting.md, section How")
+        dict[str, float | int],
+        _told(
+            "How far formula and simulation differ (docs/fitting.md, section How): `seeds`; the largest difference of a "
+            "bin, relative (`largest_deviation`), in standard errors (`_se`), in standard deviations of the bin (`_sd`); "
+            "how many errors the polish moved a quantity at most (`polish_moved_se`), and its rounds (`polish_turns`)"
+        ),
     ]
     further: Annotated[dict[str, float], _told("Residuals besides those of bins [standard deviations]")]
     stiffness: Annotated[
