@@ -102,7 +102,8 @@ code that checks the files.
 
 In the column *type and range*, *table* is what Python calls a dict: an object in JSON, a `[table]` in TOML. The keys
 of a *table by name* are not fixed: they are, for example, the names of parameters. *2 times* is a list of two.
-Without brackets *or null* means that null stands in place of the whole list; with brackets each entry may be null.
+If brackets enclose only the entry, as in *list of: (number or null)*, each entry may be null. Otherwise null stands in
+place of the outer list, in *table by name: (2 times: number or null)* of the pair under a name.
 """
 FIT_FILE = """JSON, format 4. `FitResult.save` writes it and `load_result` reads it. `load_preset` reads its
 `task_table` alone. A fit of one target has the keys of the first two tables side by side. In a

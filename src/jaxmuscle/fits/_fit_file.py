@@ -138,14 +138,16 @@ class SpectrumTable(Table, kw_only=True):
     harmonic_share: Annotated[Numbers, _told("Share of the harmonic in each bin")]
     residual: Annotated[Numbers, _told("Target against fit, in standard deviations")]
     deviation: Annotated[Numbers | None, _told("Standard deviation of the log power, null where it is unknown")]
-    components: Annotated[dict[str, Numbers], _told("Share of each part of the model in each bin")]
+    components: Annotated[
+        dict[str, Numbers], _told("Share of each bin: relaxation, floor, harmonic, and tremor, resonance_2 if any")
+    ]
 
 
 class StretchTable(Table, kw_only=True):
     """A few simulated seconds: `stretch`."""
 
     time: Annotated[Numbers, _told("Time [s]")]
-    output: Annotated[Numbers, _told("Output, in its unit")]
+    output: Annotated[Numbers, _told("Simulated force [N], displacement [m] or acceleration [m/s²]")]
 
 
 class PartTable(Table, kw_only=True):
@@ -163,12 +165,15 @@ class PartTable(Table, kw_only=True):
     check: Annotated[
         dict[str, float | int],
         _told(
-            "How far formula and simulation differ (docs/fitting.md, section How): `seeds`; the largest difference of a "
-            "bin, relative (`largest_deviation`), in standard errors (`_se`), in standard deviations of the bin (`_sd`); "
-            "how many errors the polish moved a quantity at most (`polish_moved_se`), and its rounds (`polish_turns`)"
+            "How far formula and simulation differ (docs/fitting.md, section How): `seeds`, how many were simulated; the "
+            "largest difference of a bin, relative (`largest_deviation`), in its standard errors (`largest_deviation_se`), "
+            "in standard deviations of the bin (`largest_deviation_sd`); by how many of its errors the polish moved a "
+            "quantity at most (`polish_moved_se`), and its rounds (`polish_turns`)"
         ),
     ]
-    further: Annotated[dict[str, float], _told("Residuals besides those of bins [standard deviations]")]
+    further: Annotated[
+        dict[str, float], _told("Residuals of coefficient of variation and mean, if data [standard deviations]")
+    ]
     stiffness: Annotated[
         tuple[list[float], list[float]] | None, _told("Fitted dynamic stiffness, real and imaginary [N/m], or null")
     ]
