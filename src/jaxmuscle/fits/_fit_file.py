@@ -105,7 +105,7 @@ class SettingsTable(Table, kw_only=True):
     dt: Annotated[Annotated[float, Meta(gt=0)], _told("Step of the noise [s]")]
     increments: Annotated[
         Literal["gaussian", "weak"],
-        _told("Random numbers of the simulations: normal ones, or cheaper ones of docs/engine.md"),
+        _told("Random numbers of the simulations: normal ones (also if missing), or cheaper ones of docs/engine.md"),
     ] = "gaussian"
     coefficient_of_variation: Annotated[bool | dict[str, bool], _told("Whether it was data; of several targets by name")]
     mean_force: Annotated[
@@ -114,8 +114,8 @@ class SettingsTable(Table, kw_only=True):
     carried: Annotated[
         float | None,
         _told(
-            "Forces, stiffness, damping (and masses, if all are of holds) were multiplied by it before the fit, "
-            "so that the task has the mean force; or null"
+            "Number by which forces, stiffness and damping (masses, too, if no target has a `stiffness`) were multiplied "
+            "before the fit, so that the task has the mean force; null if nothing was multiplied"
         ),
     ]
     spectrum: Annotated[dict[str, Any], _told("Spectrum settings; of several targets by name")]
@@ -175,7 +175,11 @@ class PartTable(Table, kw_only=True):
         dict[str, float], _told("Residuals of coefficient of variation and mean, if data [standard deviations]")
     ]
     stiffness: Annotated[
-        tuple[list[float], list[float]] | None, _told("Fitted dynamic stiffness, real and imaginary [N/m], or null")
+        tuple[list[float], list[float]] | None,
+        _told(
+            "Fitted dynamic stiffness, real and imaginary part [N/m], at the frequencies of `target_table.stiffness` whose "
+            "`stderr` is finite; null without one"
+        ),
     ]
     target_table: Annotated[dict[str, Any], _told("The target, as in a target file; null for what it does not state")]
     task_table: Annotated[dict[str, Any], _told("The fitted task, as in a preset")]
