@@ -76,7 +76,9 @@ class StudyFile(ReadingTable, kw_only=True):
 
     table: Annotated[str | None, _told("Path of a study.csv")] = None
     recordings: Annotated[list[RecordingTable] | None, _told("The recordings themselves")] = None
-    window: Annotated[tuple[float, float] | Literal["all"] | None, _told("Part to analyse [s], or all")] = None
+    window: Annotated[
+        tuple[float, float] | Literal["all"] | None, _told("Part to analyse: begin and end [s]; or 'all' in place of both")
+    ] = None
     rung: Annotated[int | str | None, _told("Model of all people: 0 to 3, or auto")] = None
     noise: Annotated[str | None, _told("Colour of the noise: white, band-limited, ornstein-uhlenbeck or pink")] = None
     quantities: Annotated[list[str] | None, _told("Quantities that are compared")] = None

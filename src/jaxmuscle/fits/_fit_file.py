@@ -55,7 +55,7 @@ class RungTable(Table, kw_only=True):
     number: Annotated[Annotated[int, Meta(ge=-1)], _told("-1 noise alone, 0 base, 1 activation, 2 tremor, 3 resonance")]
     model: Annotated[str, _told("The model in words")]
     aic: Annotated[float, _told("-2 ln L + 2 parameters")]
-    parameters: Annotated[float, _told("Effective number of parameters")]
+    parameters: Annotated[float, _told("Effective number of parameters: less for one that the prior determines")]
     chi2_per_bin: Annotated[float, _told("Chi² of the verdict on this model, divided by bins less one")]
     p: Annotated[Share, _told("p-value of the verdict on this model")]
     chosen: Annotated[bool, _told("Whether this model was chosen")]
