@@ -366,7 +366,9 @@ def test_a_fit_has_the_measured_mean(strong):
     assert result.task["m_w"] > 5 * jm.Isometric()["m_w"]
     target = jm.Trials(found).target()
     assert result.settings["carried"] == pytest.approx(result.task["m_w"] / jm.Isometric()["m_w"])
-    assert "the muscle has the measured mean force" in " ".join(str(result).split())
+    said = " ".join(str(result).split())
+    assert "the muscle has the measured mean force" in said
+    assert f"The masses are the usual 0.5 kg times {result.settings['carried']:.3g}. They are no measurements" in said
     without = jm.fit(jm.Isometric(), target, rungs=0, seeds=0, check_seeds=0, starts=16, mean_force=False)
     assert without.per_newton and "P_w" not in without.free
     # Another scale of force is the same spectrum: P_w is one more freedom, which a mean takes away again.

@@ -248,7 +248,7 @@ class Target(Shown, eqx.Module):
         if self.mean is not None:
             known.append(("mean", f"{np.mean(self.mean):.4g} {self.unit or '(unit unknown)'}"))
         if self.dispersion:
-            known.append(("trials", f"their spectra differ {_plus_minus(self.dispersion)} times as much as by chance"))
+            known.append(("trials", f"their spectra {_dispersion_in_words(self.dispersion)}"))
         known += [("notice", notice) for notice in self.notices]
         what = "proportional power" if f.size else "dynamic stiffness"
         return facts(f"{self.name}: {what} of {self.quantity}, {self.provenance}", known)
@@ -299,8 +299,9 @@ def load_target(
         raise TargetError(f"{file}: {error}") from None
 
 
-def _plus_minus(dispersion: Sequence[float]) -> str:
-    return " ± ".join(f"{number:.2f}" for number in dispersion[:2])
+def _dispersion_in_words(dispersion: Sequence[float]) -> str:
+    value = " ± ".join(f"{number:.2f}" for number in dispersion[:2])
+    return f"differ {value} times as much as by chance"
 
 
 def _words(value: str | tuple[int, ...]) -> str:
@@ -328,8 +329,8 @@ def _own_notices(target: Target, total: float) -> list[str]:
     if target.bins.size and abs(total - 1) > SUM_TOLERANCE:
         notices.append(f"proportional power summed to {total:.4g} over the bins covered: rescaled to 1")
     if target.overdispersion > UNUSUAL and target.dispersion is not None:
-        notices.append(f"the spectra of the trials differ {_plus_minus(target.dispersion)} times as much as by chance. So "
-                       "all errors are widened by it. Did the person tire, drift or change the grip?")  # fmt: skip
+        notices.append(f"the spectra of the trials {_dispersion_in_words(target.dispersion)}. So all errors are widened by "
+                       "it. Did the person tire, drift or change the grip?")  # fmt: skip
     if target.provenance == "reconstructed":
         if target.reason is None:
             raise TargetError("a reconstructed target needs a reason: a sentence that says what was assumed")

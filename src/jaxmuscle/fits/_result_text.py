@@ -134,8 +134,8 @@ def _held(result: "FitResult") -> list[str]:
             for name in held}  # fmt: skip
     if not moved:
         factor, usual = result.settings.get("carried") or 1.0, float(PARAMETERS["m_w"].default)
-        times = abs(factor - 1) > 0.005 and all(np.isclose(float(task[m]), factor * usual) for m in ("m_w", "m_z"))
-        means = f"The masses are the usual {usual:g} kg times {factor:.3g}. " * times
+        carried = abs(factor - 1) > 0.005 and all(np.isclose(float(task[m]), factor * usual) for m in ("m_w", "m_z"))
+        means = f"The masses are the usual {usual:g} kg times {factor:.3g}. " * carried
         means += ("They are no measurements: a held force tells no length and no mass. Half of both x_ref, with twice the "
                  "stiffness, damping and masses, would fit as well")  # fmt: skip
         return [f"held fixed: {', '.join(told.values())}. {means}"] if {"m_w", *LENGTHS} <= set(held) else []
