@@ -1,6 +1,7 @@
 """Writes docs/reference/parameters.md and files.md from the tables in the code: `python docs/generate.py`."""
 
 import math
+import re
 import types
 import typing
 from pathlib import Path
@@ -8,7 +9,7 @@ from pathlib import Path
 import msgspec
 
 from jaxmuscle.data._frequency_response import ResponseTable
-from jaxmuscle.data._study_table import RecordingTable, StudyFile
+from jaxmuscle.data._study_table import ReadingTable, RecordingTable, StudyFile
 from jaxmuscle.data._target_files import TargetFile
 from jaxmuscle.fits import _fit_file
 from jaxmuscle.model._parameters import DEFAULT_FREE, PARAMETERS, Parameter
@@ -90,43 +91,50 @@ FILES = Path(__file__).parent / "reference" / "files.md"
 FILES_HEAD = """# Files, key by key
 
 Look here if you write one of these files by hand, or read one with your own program. For each kind of file there is
-a table of its keys. Not listed are the fields of a task (`task_table`: let `save_preset` write it) and those of
-[`SpectrumSettings`](spectra.md). *Since* is the first version of the format that has the key. A later version of jaxmuscle
-reads earlier formats.
+a table of its keys. The fields of [`SpectrumSettings`](spectra.md) and of a task have pages of their own and are not
+repeated here. Let `save_preset` write the table of a task.
 
-Files are checked when they are read. If a key is unknown, missing, there twice, of a wrong type or out of range,
-an error names the file and the key. A required key that is missing is never replaced by a default. (*No* under
-*required* means that some files may lack the key: in some cases every file, in others only files of an earlier format.)
-Numbers must be finite. `true` is not 1, and `1.0` is not a whole number. `docs/generate.py` writes this page from the
-code that checks the files.
+**Columns.** *If missing* says what a file means that lacks the key; *error* means that such a file is refused. *Since* is
+the first version of the format that has the key. A later version of jaxmuscle reads earlier formats.
 
-In the column *type and range*, *table* is what Python calls a dict: an object in JSON, a `[table]` in TOML. The keys
-of a *table by name* are not fixed: they are, for example, the names of parameters. *2 times* is a list of two.
-If brackets enclose only the entry, as in *list of: (number or null)*, each entry may be null. Otherwise null stands in
-place of the outer list, in *table by name: (2 times: number or null)* of the pair under a name.
+**Types.** A *table* is what Python calls a dict: an object in JSON, a `[table]` in TOML. The keys of a *table by name* are
+not fixed: they are, for example, the names of parameters. Brackets hold the type of one entry: in a *list of (number or
+null)* each entry may be null, and a *(list of number) or null* is a list of numbers, or null in its place. In a fit.json
+null stands for a number that is not finite or could not be computed, where the row says nothing else.
+
+**Mistakes.** Files are checked when they are read. If a key is unknown, there twice, of a wrong type or out of range,
+an error names the file and the key. Numbers must be finite. `true` is not 1, and `1.0` is not a whole number.
+
+`docs/generate.py` writes this page from the code that checks the files.
 """
 FIT_FILE = """JSON, format 4. `FitResult.save` writes it and `load_result` reads it. `load_preset` reads its
 `task_table` alone. A fit of one target has the keys of the first two tables side by side. In a
 [joint fit](../identifiability.md#a-joint-fit) (*several targets* below)
 the keys of the second table stand under `parts`, by the name of the target. What the file says twice must agree: the
-value of a parameter with the `task_table`, the spectrum with the `target_table`. In format 3 the starts do not have
-`values`, which say where each ended. Format 2 may also leave out keys of `task_table` and `target_table` that do not
-apply."""
+value of a parameter with the `task_table`, the spectrum with the `target_table`. A file of format 2 may
+lack keys of `task_table` and `target_table`: then the fit has no such thing."""
 PRESET = """TOML, format 2. `save_preset` writes it and `load_preset` reads it. The `task_table` has every field of
 the task and of its parts. `type` is the class of a part. What a task does not have (`activation`; `initial`, the state
 from which a simulation begins; in its spectrum settings `filter_cutoff`, the low-pass) is written as `"none"`. Format 1
 has no key `format`, and may leave out what a task does not have."""
 TARGET = """TOML, format 1. `Target.save` writes it and `load_target` reads it. The `target_table` of a fit.json has
 the same keys without `format`, and `null` for what is not stated."""
-STUDY = """TOML. `run_study` reads it. The second table has the columns of a study.csv.
-For null leave the key out of a TOML file, and the cell of a table empty ([a study](../study.md))."""
+STUDY = """A study is a table of recordings with options ([a study](../study.md)). `run_study` reads it. You can write it in
+two ways:
+
+- a study.csv that has the keys of the first two tables as its columns. An empty cell counts as missing. If you like, write
+  a study.toml, too, which names it as its `table`;
+- or a study.toml alone. It has an entry `[[recordings]]`, with the keys of the first two tables, for each recording.
+
+At its top a study.toml may have the keys of the second and the third table. What it says there about reading holds for every
+recording that does not say it itself."""
 F = _fit_file
 SECTIONS = (
     ("fit.json", FIT_FILE, 2, (F.FitTable, F.PartTable, F.EstimateTable, F.AdequacyTable, F.RungTable, F.StartTable,
                           F.CorrelationTable, F.ProfileTable, F.SettingsTable, F.SpectrumTable, F.StretchTable)),
     ("Preset", PRESET, 1, (PresetFile,)),
     ("Target", TARGET, 1, (TargetFile, ResponseTable)),
-    ("Study", STUDY, 1, (StudyFile, RecordingTable)),
+    ("Study", STUDY, 1, (RecordingTable, ReadingTable, StudyFile)),
 )  # fmt: skip
 NAMES = {float: "number", int: "whole number", str: "text", bool: "true or false", dict: "table", type(None): "null"}
 LATER = {
@@ -179,20 +187,22 @@ def kind(given: typing.Any) -> str:
         said = [f"{word} {limit}" for limit, word in limits if limit is not None]
         return " ".join([kind(inside[0]), ", ".join(said)]).strip()
     if origin in (types.UnionType, typing.Union):
-        return " or ".join(dict.fromkeys(kind(each) for each in inside if not (each is int and float in inside)))
+        kinds = dict.fromkeys(kind(each) for each in inside if not (each is int and float in inside))
+        return " or ".join(bracketed(each, " of ") if len(kinds) > 1 else each for each in kinds)
     if origin is typing.Literal:
         return ", ".join(f"`{each}`" for each in inside)
     if origin in (list, tuple):
-        each = bracketed(kind(inside[0]))
-        return f"list of: {each}" if origin is list or ... in inside else f"{len(inside)} times: {each}"
+        each = bracketed(kind(inside[0]), " of ", " or ")
+        return f"list of {each}" if origin is list or ... in inside else f"list of {len(inside)}: {each}"
     if origin is dict:
-        return f"table by name: {bracketed(kind(inside[1]))}" if inside[1] is not typing.Any else "table"
+        each = bracketed(kind(inside[1]), " of ", " or ")
+        return f"table by name, each: {each}" if inside[1] is not typing.Any else "table"
     return NAMES.get(given, "table" if isinstance(given, type) and issubclass(given, msgspec.Struct) else "any")
 
 
-def bracketed(text: str) -> str:
-    """A type of several possibilities in brackets."""
-    return f"({text})" if " or " in text else text
+def bracketed(text: str, *marks: str) -> str:
+    """A type of several words in brackets."""
+    return f"({text})" if any(mark in text for mark in marks) else text
 
 
 def files_page() -> str:
@@ -203,14 +213,19 @@ def files_page() -> str:
         for table in tables:
             hints = typing.get_type_hints(table, include_extras=True)
             text += f"\n### {(table.__doc__ or '').strip().rstrip('.')}\n\n"
-            text += "| key | type and range | required | since | meaning |\n|---|---|---|---|---|\n"
-            for field in msgspec.structs.fields(table):
+            text += "| key | meaning | type and range | if missing | since |\n|---|---|---|---|---|\n"
+            inherited = [name for base in table.__bases__ for name in base.__annotations__]
+            for field in (field for field in msgspec.structs.fields(table) if field.name not in inherited):
                 given, *limits, about = typing.get_args(hints[field.name])
                 given = typing.Annotated[given, *limits] if limits else given  # an Annotated within one is flattened
-                told = about.extra["type"] if about.extra else kind(given)
-                needed = "yes" if field.required else "no"
+                missing = about.extra["missing"] or "error"
+                if field.required != (missing == "error"):
+                    raise ValueError(f"{table.__name__}.{field.name}: say what it means that the key is missing")
                 first = LATER.get((table.__name__, field.name), since)
-                text += f"| `{field.name}` | {told} | {needed} | {first} | {about.description} |\n"
+                told = about.extra["kind"] or kind(given)
+                if said == STUDY:
+                    told = re.sub(r"^\((.*)\)$", r"\1", told.removesuffix(" or null"))  # which neither TOML nor CSV has
+                text += f"| `{field.name}` | {about.description} | {told} | {missing} | {first} |\n"
     return text
 
 

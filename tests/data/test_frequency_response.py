@@ -135,6 +135,29 @@ def test_a_table_that_a_fit_wrote_is_read_without_what_was_fitted(tmp_path):
     assert (found.name, found.source) == ("own", "stiffness.csv")
 
 
+@pytest.mark.parametrize("spectrum", [False, True])
+def test_a_target_with_a_stiffness_is_saved_and_read_back_equal(spectrum, tmp_path):
+    """Also one that has a stiffness and no spectrum, whose frequencies and powers are empty lists."""
+    measured = jm.FrequencyResponse(F, GAIN * np.exp(1j * np.radians(PHASE)), [3.0, 4.0, np.inf, 5.0], coherence=COHERENCE,
+                                    **FIELDS)  # fmt: skip
+    power = np.arange(1.0, 31) if spectrum else None
+    target = jm.Target("anna", power, segments=12 if spectrum else None, stiffness=measured)
+    target.save(tmp_path / "anna.toml")
+    found = jm.load_target(tmp_path / "anna.toml")
+    np.testing.assert_array_equal(found.bins, target.bins)
+    np.testing.assert_array_equal(found.proportional_power, target.proportional_power)
+    equal(found.stiffness, measured)
+    assert (found.name, found.segments, found.settings) == (target.name, target.segments, target.settings)
+
+
+def test_a_target_without_spectrum_needs_a_stiffness(tmp_path):
+    table = {"name": "a", "quantity": "force", "provenance": "user", "source": "b", "frequency_hz": [],
+             "proportional_power": []}  # fmt: skip
+    (tmp_path / "a.toml").write_text(tomli_w.dumps(table))
+    with pytest.raises(ValueError, match="frequency_hz must be a list of numbers"):
+        jm.load_target(tmp_path / "a.toml")
+
+
 HEAD = "frequency_hz,gain,phase_deg,coherence\n"
 FITTED = "frequency_hz,real,imaginary,stderr,fitted_real,fitted_imaginary\n1,100,-20,3,90,1\n"
 DAMAGED = {

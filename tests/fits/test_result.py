@@ -20,7 +20,7 @@ from jaxmuscle.fits._fit_file import FORMAT
 from jaxmuscle.fits._ladder import Rung
 from jaxmuscle.fits._part import Start
 from jaxmuscle.fits._report import may_be_elsewhere
-from jaxmuscle.fits._result_text import card_of
+from jaxmuscle.fits._result_text import _table, card_of
 from jaxmuscle.model._task_tables import task_from_table, task_to_table
 
 POWER = 1 / (1 + np.arange(1, 31) ** 2)
@@ -305,6 +305,11 @@ def test_numbers_that_are_read_in_two_ways_are_said_in_both():
     assert rows["tremor_frequency"].endswith(" Hz")
     alone = {"tremor_share": Estimate(0.0133, "1", 0.0033)}  # the frequency is not determined
     assert not any(word in str(made_result(derived=alone)) for word in ("above", "counted from"))
+
+
+def test_a_long_interval_is_set_apart_from_its_unit():
+    rows = {"k_z": Estimate(3.27e6, "N/m^3", 3.8e5, interval=(2.85e6, 4.16e6))}
+    assert _table("determined by the data", rows, "95 % interval")[1].endswith(" 2.85e+06 to 4.16e+06 N/m^3")
 
 
 def test_an_interval_that_is_wider_than_its_error_says_is_to_be_stated():

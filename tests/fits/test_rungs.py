@@ -135,8 +135,8 @@ def test_the_progress_says_which_model_it_is_at_and_never_falls_back():
     shares = [share for _, share in told]
     assert shares == sorted(shares) and shares[-1] == 1
     models = [text.partition(":")[0] for text, _ in told if text.startswith("model ")]
-    assert list(dict.fromkeys(models)) == [f"model {k} of 0 to 3" for k in (0, 1, 2)]
-    assert "model 1 of 0 to 3: with activation" in dict(told)
+    assert list(dict.fromkeys(models)) == [f"model {k} (of models 0 to 3)" for k in (0, 1, 2)]
+    assert "model 1 (of models 0 to 3): with activation" in dict(told)
     assert max(share for text, share in told if text.startswith("model 2")) <= 3 / 4 * 0.6  # the descents' share of a fit
 
 

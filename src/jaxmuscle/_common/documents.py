@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from typing import Any, Literal, TypeVar, get_args, get_origin
 
 import msgspec
+from msgspec import Meta
 
 from .text import choices, listed
 
@@ -23,6 +24,11 @@ T = TypeVar("T")
 
 class Table(msgspec.Struct, forbid_unknown_fields=True):
     """The schema of a table in a file: a field for each key, its type annotated with what it means."""
+
+
+def told(meaning: str, *, missing: str | None = None, kind: str | None = None) -> Meta:
+    """What a key of a table means; what its absence says, of one that may be `missing`; its type where code checks that."""
+    return Meta(description=meaning, extra={"missing": missing, "kind": kind})
 
 
 def parsed(text: str, file: str, kind: str, error: type[ValueError] = ValueError) -> dict[str, Any]:

@@ -9,11 +9,10 @@ import equinox as eqx
 import numpy as np
 import scipy
 from jaxtyping import Complex, Float
-from msgspec import Meta
 
 from jaxmuscle import plot
 from jaxmuscle._common.cards import Printed
-from jaxmuscle._common.documents import Table, checked
+from jaxmuscle._common.documents import Table, checked, told
 from jaxmuscle._common.files import write_text
 from jaxmuscle._common.text import folded, probability
 from jaxmuscle.spectra._settings import require
@@ -29,14 +28,17 @@ COLUMNS = ("frequency_hz", "gain_N/m", "phase_deg", "stderr_N/m", "coherence")
 class ResponseTable(Table, kw_only=True):
     """A dynamic stiffness as a table: `stiffness` of a target."""
 
-    name: Annotated[str, Meta(description="How reports call it")]
-    source: Annotated[str, Meta(description="Where it comes from")]
-    notices: Annotated[list[str], Meta(description="What was done to it")]
-    frequency_hz: Annotated[Numbers, Meta(description="Frequencies [Hz], rising, above 0")]
-    real: Annotated[Numbers, Meta(description="Real part [N/m]")]
-    imaginary: Annotated[Numbers, Meta(description="Imaginary part [N/m]")]
-    stderr: Annotated[list[float | Literal["inf"]], Meta(description='Standard error of both [N/m], or "inf" (a text)')]
-    coherence: Annotated[Numbers | None, Meta(description="Squared coherence, 0 to 1")] = None
+    name: Annotated[str, told("How reports call it")]
+    source: Annotated[str, told("Where it comes from")]
+    notices: Annotated[list[str], told("What was done to it")]
+    frequency_hz: Annotated[Numbers, told("Frequencies [Hz], rising, above 0")]
+    real: Annotated[Numbers, told("Real part [N/m]")]
+    imaginary: Annotated[Numbers, told("Imaginary part [N/m]")]
+    stderr: Annotated[
+        list[float | Literal["inf"]],
+        told('Standard error of both [N/m]; "inf" (a text) where a fit is to leave the frequency out'),
+    ]
+    coherence: Annotated[Numbers | None, told("Squared coherence, 0 to 1", missing="unknown")] = None
 
 
 class FrequencyResponse(Printed, eqx.Module):

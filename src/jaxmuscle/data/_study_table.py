@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal, NamedTuple
 from msgspec import Meta
 
 from jaxmuscle._common.arguments import is_real
-from jaxmuscle._common.documents import Table, checked, parsed
+from jaxmuscle._common.documents import Table, checked, parsed, told
 from jaxmuscle._common.files import expanded
 from jaxmuscle._common.inputs import looked_at, read_text
 from jaxmuscle._common.text import choices
@@ -32,58 +32,87 @@ READING = (*FILES, *SPECTRA, "window")
 OPTIONS = (*READING, "rung", "noise", "quantities", "alpha", "correction")
 
 
-def _told(text: str) -> Meta:
-    return Meta(description=text)
-
-
 Above0 = Annotated[float, Meta(gt=0)]
 
 
 class ReadingTable(Table, kw_only=True):
-    """How a recording is read: columns of a study's table, and options for all of them in a study.toml."""
+    """How a recording is read."""
 
     column: Annotated[
-        str | int | None, _told("Column of the force (name, or number from 0), or point (columns NAME_x, NAME_y, NAME_z)")
+        str | int | None,
+        told("Column of the force: its name, or its number from 0. Or NAME of a [point](../recordings.md#what-is-read), "
+             "if its coordinates are the columns NAME_x, NAME_y, NAME_z",
+             missing="the only one; an error if there are several"),
+    ] = None  # fmt: skip
+    rate: Annotated[Above0 | None, told("Sampling rate [Hz]", missing="as the file says; an error if it does not")] = None
+    units: Annotated[str | None, told("Unit of the column", missing="as the file says, else N")] = None
+    axis: Annotated[
+        str | None,
+        told("Of a point: x, y, z, or principal, along which it moves most", missing="the column is not a point"),
     ] = None
-    rate: Annotated[Above0 | None, _told("Sampling rate [Hz]")] = None
-    units: Annotated[str | None, _told("Unit of the column")] = None
-    axis: Annotated[str | None, _told("Of a point: x, y, z, or principal, along which it moves most")] = None
-    reference: Annotated[str | int | None, _told("Column or point that is subtracted from it")] = None
-    time: Annotated[str | int | None, _told("Column of the time")] = None
-    max_gap: Annotated[Annotated[float, Meta(ge=0)] | None, _told("Longest gap that is closed [s]")] = None
-    lever_arm: Annotated[Above0 | None, _told("From the axis to where the force acts [m]: turns a torque into N")] = None
-    skip_rows: Annotated[Annotated[int, Meta(ge=0)] | None, _told("Lines to leave out at the top")] = None
+    reference: Annotated[
+        str | int | None, told("Column or point that is subtracted from it", missing="nothing is subtracted")
+    ] = None
+    time: Annotated[str | int | None, told("Column of the time", missing="found by its name or unit, if there is one")] = (
+        None
+    )
+    max_gap: Annotated[Annotated[float, Meta(ge=0)] | None, told("Longest gap that is closed [s]", missing="0.2")] = None
+    lever_arm: Annotated[
+        Above0 | None,
+        told("From the axis to where the force acts [m]: turns a torque into N", missing="a torque stays a torque"),
+    ] = None
+    skip_rows: Annotated[Annotated[int, Meta(ge=0)] | None, told("Lines to leave out at the top", missing="0")] = None
     spectrum: Annotated[
-        str | None, _told("standard, slow (resolves what is below 1 Hz), multitaper or pwelch; the same for all")
+        str | None,
+        told("standard, slow (resolves what is below 1 Hz), multitaper or pwelch; the same for all", missing="standard"),
     ] = None
-    mvc: Annotated[Above0 | None, _told("Maximal voluntary contraction, in the recording's unit")] = None
+    mvc: Annotated[
+        Above0 | None, told("Maximal voluntary contraction, in the recording's unit", missing="level in % MVC unknown")
+    ] = None
 
 
 class RecordingTable(ReadingTable, kw_only=True):
-    """A recording: a row of a study's table, or an entry of `[[recordings]]`."""
+    """Which recording: a row of a study.csv, or an entry of `[[recordings]]`."""
 
-    file: Annotated[str, _told("Path, from the folder of the table")]
-    person: Annotated[str | int, _told("Name of the person")]
-    group: Annotated[str | int | None, _told("Group of the person; all recordings have one, or none")] = None
-    condition: Annotated[str | int | None, _told("Condition of the recording; all have one, or none")] = None
-    trial: Annotated[str | int | None, _told("Which of several trials in a condition")] = None
-    window_start: Annotated[float | None, _told("Where the part to analyse begins [s]")] = None
-    window_stop: Annotated[float | None, _told("Where it ends [s]")] = None
+    file: Annotated[
+        str, told("Path, from the folder of the study.csv, or of the study.toml where the recordings stand in it")
+    ]
+    person: Annotated[str | int, told("Name of the person")]
+    group: Annotated[
+        str | int | None, told("Group of the person; all recordings have one, or none", missing="no groups")
+    ] = None
+    condition: Annotated[
+        str | int | None, told("Condition of the recording; all have one, or none", missing="no conditions")
+    ] = None
+    trial: Annotated[
+        str | int | None,
+        told("Which of several trials in a condition", missing="no name; a person may have several trials without one"),
+    ] = None
+    window_start: Annotated[
+        float | None, told("Where the part to analyse begins [s]", missing="its steady part is looked for")
+    ] = None
+    window_stop: Annotated[float | None, told("Where it ends [s]", missing="its steady part is looked for")] = None
 
 
 class StudyFile(ReadingTable, kw_only=True):
-    """A study.toml: `table` or `recordings`, and options for all recordings."""
+    """What else a study.toml may say."""
 
-    table: Annotated[str | None, _told("Path of a study.csv")] = None
-    recordings: Annotated[list[RecordingTable] | None, _told("The recordings themselves")] = None
-    window: Annotated[
-        tuple[float, float] | Literal["all"] | None, _told("Part to analyse: begin and end [s]; or 'all' in place of both")
+    table: Annotated[
+        str | None, told("Path of a study.csv, from the folder of the study.toml", missing="needs `recordings`")
     ] = None
-    rung: Annotated[int | str | None, _told("Model of all people: 0 to 3, or auto")] = None
-    noise: Annotated[str | None, _told("Colour of the noise: white, band-limited, ornstein-uhlenbeck or pink")] = None
-    quantities: Annotated[list[str] | None, _told("Quantities that are compared")] = None
-    alpha: Annotated[float | None, _told("Level of the tests, between 0 and 1")] = None
-    correction: Annotated[str | None, _told("Correction for many comparisons: holm, fdr or none")] = None
+    recordings: Annotated[list[RecordingTable] | None, told("The recordings themselves", missing="needs a `table`")] = None
+    window: Annotated[
+        tuple[float, float] | Literal["all"] | None,
+        told("Part to analyse: begin and end [s]; or 'all' in place of both", missing="the steady parts are looked for"),
+    ] = None
+    rung: Annotated[int | str | None, told("Model of all people: 0 to 3, or auto", missing="2")] = None
+    noise: Annotated[
+        str | None,
+        told("Colour of the noise: white, band-limited, ornstein-uhlenbeck or pink", missing="band-limited"),
+    ] = None
+    quantities: Annotated[list[str] | None, told("Quantities that are compared", missing="all derived quantities")] = None
+    alpha: Annotated[float | None, told("Level of the tests, between 0 and 1", missing="0.05")] = None
+    correction: Annotated[str | None, told("Correction for many comparisons: holm, fdr or none", missing="holm")] = None
 
 
 class Row(NamedTuple):

@@ -211,10 +211,7 @@ class Target(Shown, eqx.Module):
         fields = fields_of(table, "target_table", needed=KEYS if whole else (*REQUIRED, "settings"))
         fields = {key: value for key, value in fields.items() if value is not None}
         settings = settings_of(fields.pop("settings"), "target_table.settings", SpectrumSettings.names(whole=whole))
-        given = fields.pop("frequency_hz")
-        frequency = (
-            numbers_of("frequency_hz", given, "target_table") if given or not fields.get("stiffness") else np.zeros(0)
-        )
+        frequency = numbers_of("frequency_hz", fields.pop("frequency_hz"), "target_table", empty="stiffness" in fields)
         with np.errstate(over="ignore"):
             bins = np.rint(np.clip(frequency / settings.resolution, -1e9, 1e9)).astype(int)
         return cls(**fields, bins=bins, settings=settings)

@@ -74,9 +74,9 @@ def is_number(value: Any) -> bool:
     return True
 
 
-def numbers_of(key: str, values: Any, file: str) -> Float[np.ndarray, " rows"]:
-    """A list of numbers as an array. Raises `TargetError` naming the entry that is none."""
-    if not isinstance(values, list | tuple | np.ndarray) or not len(values):
+def numbers_of(key: str, values: Any, file: str, *, empty: bool = False) -> Float[np.ndarray, " rows"]:
+    """A list of numbers as an array, which may be `empty` or not. Raises `TargetError` naming the entry that is none."""
+    if not isinstance(values, list | tuple | np.ndarray) or not (empty or len(values)):
         raise TargetError(f"{file}: {key} must be a list of numbers")
     for i, value in enumerate(values, 1):
         if not is_number(value):

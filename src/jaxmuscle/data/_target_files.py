@@ -8,10 +8,9 @@ from typing import Annotated, Any, NamedTuple, get_args
 
 import msgspec
 import numpy as np
-from msgspec import Meta
 
 from jaxmuscle._common.bundled import bundled_text, list_targets
-from jaxmuscle._common.documents import Table, checked, parsed
+from jaxmuscle._common.documents import Table, checked, parsed, told
 from jaxmuscle._common.errors import TargetError
 from jaxmuscle._common.files import text_of
 from jaxmuscle._common.inputs import read_bytes
@@ -39,7 +38,7 @@ REQUIRED = ("name", "quantity", "provenance", "source", "frequency_hz", "proport
 METADATA = ("segments", "coefficient_of_variation", "mvc_fraction", "mean", "unit", "dispersion", "reason", "notices")
 KEYS = (*REQUIRED, "sigma", *METADATA, "trial_power", "stiffness", "settings")
 QUANTITIES, PROVENANCES = ("one of " + ", ".join(get_args(kind)) for kind in (Quantity, Provenance))
-POSITIVES = "list of numbers above 0"
+POSITIVES = "numbers above 0"
 
 
 class Raw(NamedTuple):
@@ -138,7 +137,7 @@ def _parse_toml(text: str, file: str, axis: str) -> Raw:
     _linear(axis, file)
     fields = fields_of(parsed(text, file, "TOML", TargetError), file)
     keys = [key for key in ("frequency_hz", "proportional_power", "sigma") if key in fields]
-    lists = [numbers_of(key, fields.pop(key), file) for key in keys]
+    lists = [numbers_of(key, fields.pop(key), file, empty="stiffness" in fields) for key in keys]
     for key, values in zip(keys, lists, strict=True):
         if values.size != lists[0].size:
             raise TargetError(f"{file}: {key} has {values.size} entries, frequency_hz {lists[0].size}; make them equal")
@@ -156,55 +155,59 @@ def _parse_toml(text: str, file: str, axis: str) -> Raw:
 class TargetFile(Table, kw_only=True):
     """A target: in a .toml, and as `target_table` in a fit.json."""
 
-    format: Annotated[Any, Meta(description="Version of the format, 1", extra={"type": "1"})] = 1
-    name: Annotated[Any, Meta(description="How reports call it", extra={"type": "text"})]
-    quantity: Annotated[Any, Meta(description="What was recorded", extra={"type": QUANTITIES})]
-    provenance: Annotated[Any, Meta(description="From where the numbers are", extra={"type": PROVENANCES})]
-    source: Annotated[Any, Meta(description="Article, figure, recording", extra={"type": "text"})]
-    frequency_hz: Annotated[Any, Meta(description="Frequencies [Hz], rising", extra={"type": "list of numbers, 0 or more"})]
+    format: Annotated[Any, told("Version of the format", missing="1", kind="1")] = 1
+    name: Annotated[Any, told("How reports call it", kind="text")]
+    quantity: Annotated[Any, told("What was recorded", kind=QUANTITIES)]
+    provenance: Annotated[Any, told("From where the numbers are", kind=PROVENANCES)]
+    source: Annotated[Any, told("Article, figure, recording", kind="text")]
+    frequency_hz: Annotated[
+        Any,
+        told("Frequencies [Hz], rising; empty if there is a stiffness, but no spectrum", kind="list of numbers, 0 or more"),
+    ]
     proportional_power: Annotated[
-        Any, Meta(description="Power at each, of any scale; empty with a stiffness alone", extra={"type": POSITIVES})
+        Any, told("Power at each frequency, of any scale; empty if there is no spectrum", kind=f"list of {POSITIVES}")
     ]
     sigma: Annotated[
-        Any, Meta(description="Standard error of each averaged power, in the unit of the power", extra={"type": POSITIVES})
-    ] = None
+        Any,
+        told("Standard error of each averaged power, in the unit of the power", missing="errors follow from `segments`",
+             kind=f"list of {POSITIVES}"),
+    ] = None  # fmt: skip
     segments: Annotated[
         Any,
-        Meta(
-            description="Welch segments that were averaged: a number for each trial; one number: of one recording",
-            extra={"type": "whole number from 1, or a list of them"},
-        ),
-    ] = None
+        told("Welch segments that were averaged, of each trial; one number means one recording",
+             missing="errors follow from `sigma`; without it they are unknown, and so is chi²",
+             kind="whole number from 1, or a list of them"),
+    ] = None  # fmt: skip
     coefficient_of_variation: Annotated[
         Any,
-        Meta(
-            description="Standard deviation over mean, of each trial", extra={"type": "number above 0, at most 1, or a list"}
-        ),
-    ] = None
+        told("Standard deviation over mean, of each trial", missing="unknown",
+             kind="number above 0, at most 1, or a list of them"),
+    ] = None  # fmt: skip
     mvc_fraction: Annotated[
-        Any, Meta(description="Mean level as a share of the maximum", extra={"type": "number above 0, at most 1"})
+        Any, told("Mean level as a share of the maximum", missing="unknown", kind="number above 0, at most 1")
     ] = None
-    mean: Annotated[Any, Meta(description="Mean force or torque of each trial, in `unit`", extra={"type": POSITIVES})] = None
-    unit: Annotated[Any, Meta(description="Unit of `mean`", extra={"type": "text"})] = None
+    mean: Annotated[
+        Any,
+        told("Mean force or torque of each trial, in `unit`", missing="unknown", kind="number above 0, or a list of them"),
+    ] = None
+    unit: Annotated[Any, told("Unit of `mean`", missing="unknown: `mean` fixes no scale of force", kind="text")] = None
     dispersion: Annotated[
-        Any, Meta(description="Dispersion of the trials (1 if they are alike), and its error", extra={"type": POSITIVES})
-    ] = None
+        Any,
+        told("Dispersion of the trials (1 if they are alike), and its error",
+             missing="follows from `trial_power`; else unknown", kind=f"list of two {POSITIVES}"),
+    ] = None  # fmt: skip
     reason: Annotated[
-        Any, Meta(description="What was assumed; needed where it is reconstructed", extra={"type": "text"})
+        Any, told("What was assumed", missing="nothing; an error if `provenance` is reconstructed", kind="text")
     ] = None
-    notices: Annotated[Any, Meta(description="What was done to the numbers", extra={"type": "list of texts"})] = None
+    notices: Annotated[Any, told("What was done to the numbers", missing="no notices", kind="list of texts")] = None
     trial_power: Annotated[
-        Any, Meta(description="Spectrum of each trial [unit²/Hz]", extra={"type": "a list of numbers for each trial"})
+        Any, told("Spectrum of each trial [unit²/Hz]", missing="unknown", kind="a list of numbers for each trial")
     ] = None
     stiffness: Annotated[
-        Any, Meta(description="Dynamic stiffness measured beside it", extra={"type": "table, see below"})
+        Any, told("Dynamic stiffness measured beside it", missing="not measured", kind="table, see below")
     ] = None
     settings: Annotated[
-        Any,
-        Meta(
-            description="How the spectrum was estimated: the fields of `SpectrumSettings`; each has a default",
-            extra={"type": "table"},
-        ),
+        Any, told("How the spectrum was estimated: the fields of `SpectrumSettings`", missing="their defaults", kind="table")
     ] = None
 
 
@@ -286,7 +289,8 @@ def on_grid(raw: Raw) -> tuple[OnBins, list[str]]:
         gap, scale = f"{np.max(np.diff(columns.frequency), initial=0):.3g}", " over log frequency" * raw.log_frequency
         notices.append(f"the frequencies are not those of the bins, so the log power was interpolated{scale} (widest gap "
                        f"{gap} Hz)")  # fmt: skip
-    if points.bins.size < 2:
+    alone = "stiffness" in raw.fields and not columns.frequency.size
+    if points.bins.size < 2 and not alone:
         raise TargetError(
             f"covers {points.bins.size} of the bins {first} to {last} ({settings.frequency[0]:.4g} to "
             f"{settings.frequency[-1]:.4g} Hz), at least 2 are needed; frequencies are in Hz"

@@ -158,7 +158,7 @@ def climb(first: Plan, models: Models, descend: Descend, keep: Callable[[Climbed
         plan = plan._replace(settings=plan.settings | {"starts": len(points)})
         stages: list[Stage] = []
         begin, share = place * DESCENDED / len(numbers), DESCENDED / len(numbers)
-        telling = _telling(plan, f"model {number} of 0 to {models.top}", begin, begin + share)
+        telling = _telling(plan, f"model {number} (of models 0 to {models.top})", begin, begin + share)
         telling.problem.tell(rung_name(number), 0.0)
         known = descend(telling, points, stages)
         if known is None:

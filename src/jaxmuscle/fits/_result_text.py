@@ -177,11 +177,13 @@ def _over(p: Estimate, mean: float) -> Estimate:
 
 def _table(title: str, table: dict[str, Estimate], column: str = "") -> list[str]:
     """Rows of name, value ± error, interval and unit."""
-    indent, wide, value, beside = 4, max([26, *(2 + len(name) for name in table)]), 20, 20
+    indent, wide = 4, max([26, *(2 + len(name) for name in table)])
+    value, beside = (1 + max([0, *map(len, each)]) for each in
+                     ([p.in_words() for p in table.values()], [p.interval_in_words() for p in table.values()]))  # fmt: skip
     if wide > 26:  # names of one of several targets: no wider than it must be
         indent, wide = 2, wide - 1
-        value, beside = (1 + max(len(words) for words in each) for each in
-                         zip(*((p.in_words(), p.interval_in_words()) for p in table.values()), strict=True))  # fmt: skip
+    else:
+        value, beside = max(20, value), max(20, beside)
     lines = [f"  {title}:"] if not column else [f"  {title + ': ':<{wide + value + indent}}{column.strip()}"]
     for name, p in table.items():
         interval, unit = f"{p.interval_in_words():<{beside}}" if column else "", _beside(name, p)

@@ -326,7 +326,7 @@ def _fitted(cells: list[Cell], options: dict[str, Any], tell: Tell) -> tuple[Coh
     tried: dict[int, CohortResult] = {}
     aic: dict[int, float] = {}
     for number in numbers:
-        first, which = len(tried), f"model {number} of 0 to {numbers[-1]}: " * (len(numbers) > 1)
+        first, which = len(tried), f"model {number} (of models 0 to {numbers[-1]}): " * (len(numbers) > 1)
         tried[number] = fit_cohort(
             [cell.target for cell in cells], groups=labels, noise=options["noise"], rung=number, starts=options["starts"],
             key=options["key"], progress=lambda text, share, which=which, i=first: tell(which + text,

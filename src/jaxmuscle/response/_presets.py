@@ -6,10 +6,9 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
 
 import tomli_w
-from msgspec import Meta
 
 from jaxmuscle._common.bundled import bundled_text, list_presets
-from jaxmuscle._common.documents import Table, checked, parsed
+from jaxmuscle._common.documents import Table, checked, parsed, told
 from jaxmuscle._common.errors import PresetError
 from jaxmuscle._common.files import expanded, write_text
 from jaxmuscle._common.inputs import read_text
@@ -57,14 +56,17 @@ def load_preset(name_or_path: str | Path) -> AbstractTask:
 class PresetFile(Table, kw_only=True):
     """A saved task."""
 
-    format: Annotated[Literal[1, 2], Meta(description="Version of the format; a file without it is of format 1")] = 1
-    description: Annotated[str, Meta(description="What the task is")] = ""
+    format: Annotated[Literal[1, 2], told("Version of the format", missing="format 1")] = 1
+    description: Annotated[str, told("What the task is", missing="not described")] = ""
     mean: Annotated[
-        Any, Meta(description="Mean force to which the task is scaled when it is loaded", extra={"type": "number, not 0"})
+        Any,
+        told("Mean force to which the task is scaled when it is loaded", missing="not scaled", kind="number, not 0"),
     ] = None
-    unit: Annotated[Any, Meta(description="N, mN, kN, kgf, gf or lbf; with `mean` only", extra={"type": "text"})] = None
-    fit: Annotated[Any, Meta(description="How it was fitted: a note for the reader, not used")] = None
-    task_table: Annotated[dict[str, Any], Meta(description="The task, every number of it")]
+    unit: Annotated[
+        Any, told("Unit of `mean`: N, mN, kN, kgf, gf or lbf", missing="not scaled; an error beside `mean`", kind="text")
+    ] = None
+    fit: Annotated[Any, told("How it was fitted: a note for the reader, not used", missing="no note")] = None
+    task_table: Annotated[dict[str, Any], told("The task, every number of it")]
 
 
 class _InFit(NamedTuple):
