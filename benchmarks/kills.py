@@ -26,6 +26,7 @@ import jaxmuscle as jm
 from jaxmuscle.ensembles import _run
 
 PARTS, REFUSED = 4, 3
+PRELOADED = ["diffrax", "zarr", "xarray", "jaxmuscle.ensembles._run"]  # so a process is a fork, without a device
 OPTIONS: dict[str, Any] = {"seeds": 4000, "duration": 1.0, "chunk": 64}
 ROUNDING = 1e-6  # of the largest value: tallies of parts are added in another order
 
@@ -50,7 +51,7 @@ def whole(reduce: bool, key: int = 5) -> Any:
 def begun(store: Path, reduce: bool, key: int = 5, **given: Any) -> Any:
     """The process that makes a store, or adds to it."""
     context: Any = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(["diffrax", "jaxmuscle.ensembles._ensemble"])  # so a process is a fork, without a device
+    context.set_forkserver_preload(PRELOADED)
     process = context.Process(target=run, args=(str(store), reduce, key, OPTIONS | given))
     process.start()
     return process

@@ -20,6 +20,8 @@ class Signatures(griffe.Extension):
             classes = [cls for cls in module.classes.values() if not cls.is_alias]
             for cls in filter(makes_constructor, classes):
                 cls.set_member("__init__", constructor(cls))
+            for cls in classes:  # what prints and saves results is nothing that a reader could look up
+                cls.bases = [b for b in cls.bases if str(b) not in ("Shown", "Printed", "Spelled", "Result")]
             functions = [f for place in (module, *classes) for f in place.functions.values() if not f.is_alias]
             for parameter in (p for function in functions for p in function.parameters):
                 parameter.default = constant(parameter.default, module)

@@ -18,7 +18,7 @@ try:
 except ImportError:  # no public part of it
     _decorator = _sentinel = jaxtyped = None
 
-FIRST, EVERY = 32, 32  # calls of a function that are checked in a test: so many, then one of so many
+FIRST, EVERY = 4, 128  # calls of a function that are checked in a test: so many, then one of so many
 _calls: dict[int, int] = {}
 
 

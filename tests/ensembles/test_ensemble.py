@@ -649,7 +649,7 @@ def test_processes_fail_together(tmp_path):
 
 
 RUNS = """
-import os, sys, jax
+import os, sys, diffrax, jax, xarray, zarr
 import jaxmuscle as jm, jaxmuscle.ensembles._run as run
 run.KEEP_EVERY = run.KEEP_SHARE = 0
 Task, ensemble = jm.Isometric, jm.ensemble  # imported once; without a device so far, so that each run can be a fork

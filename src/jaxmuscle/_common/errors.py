@@ -18,7 +18,10 @@ class OperatingPointError(ValueError):
 
 
 class FirstOrderWarning(UserWarning):
-    """Numbers of the linear response that the model itself does not have: its perturbations are too large there."""
+    """The perturbations of a task are so large that its simulation may give other numbers than the linear response.
+
+    See docs/model.md, *Where first order ends*.
+    """
 
 
 class StoreError(ValueError):

@@ -111,9 +111,10 @@ class Recovery(eqx.Module):
 class Bootstrap(Printed, Result, eqx.Module):
     """What refits of data made from a fit found.
 
-    `quantities` {name: `Recovery`}, those that the fit determines; `replicates` asked for; `failed` {replicate: why it
-    was not simulated or fitted}; `source`, how the data were made; `tasks`, made from; `target`, name of what was fitted;
-    `seed`; `versions`.
+    `quantities` {name: `Recovery`}, those that the fit determines: of each the value `true` simulated from, the standard
+    error `stated` by the fit, the `values` that refits found and the errors `stderrs` that these state; `replicates` asked
+    for; `failed` {replicate: why it was not simulated or fitted}; `source`, how the data were made; `tasks`, made from;
+    `target`, name of what was fitted; `seed`; `versions`.
     """
 
     target: str

@@ -142,7 +142,10 @@ class ComparedModel(eqx.Module):
 
     @property
     def evidence(self) -> "Evidence":
-        """What a decision looks at."""
+        """What decides between models:
+
+        the AIC, the score of every bin (None if there is none), whether the search converged.
+        """
         return Evidence(self.aic, self.scores, self.success)
 
     @property
@@ -241,7 +244,7 @@ class Comparison(Printed, Result, eqx.Module):
         return "every model describes the data" if every else f"these describe the data (p >= 0.01): {'; '.join(fine)}"
 
     def table(self) -> list[dict[str, Any]]:
-        """Tidy rows with the keys of `COLUMNS`."""
+        """A row for each model, with the keys that the page Results lists for `to_dataframe`."""
         return [{name: getattr(row, name) for name in COLUMNS} for row in self.rows]
 
     def to_dataframe(self) -> "pandas.DataFrame":

@@ -262,7 +262,7 @@ class PerturbedRecording(Printed, eqx.Module):
         **Arguments:** `stiffness`, the dynamic stiffness H [N/m] as a function of frequencies [Hz]: with a muscle's own,
         `lambda f: jaxmuscle.response.dynamic_stiffness(task, f)`; others as in `Recording.target`.
 
-        **Raises:** `ValueError` for a window of less than 8 s besides 2 s of recording before and after it.
+        **Raises:** `ValueError` if the window, without the first and the last 2 s of the recording, is shorter than 8 s.
         """
         return perturbed_target((self,), stiffness, name, settings=settings, provenance=provenance)
 

@@ -23,7 +23,7 @@ class RecordingSummary(Printed, eqx.Module):
 
     Its `duration` [s] and Welch `segments`; `mean` and `standard_deviation` in `unit`; without unit
     `coefficient_of_variation`, its inverse `signal_to_noise`, `approximate_entropy` and `sample_entropy` (m = 2,
-    r = 0.2 σ); `peaks` of the spectrum [Hz].
+    r = 0.2 σ); `peaks` of the spectrum: its `maximum`, and its `local_maxima` by rising frequency.
     """
 
     unit: str
@@ -59,7 +59,10 @@ class RecordingSummary(Printed, eqx.Module):
         return "\n".join(f"{name:<32}{value}" for name, value in self.rows())
 
     def to_dataframe(self) -> "pandas.DataFrame":
-        """A row for each number: `quantity`, `value`, `unit`; the maximum of the spectrum is called `maximum`."""
+        """A row for each number:
+
+        `quantity`, `value`, `unit`; of the peaks the frequency of the maximum, called `maximum`.
+        """
         units = {"duration": "s", "mean": self.unit, "standard_deviation": self.unit, "maximum": "Hz"}
         numbers = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)[1:-1]}
         numbers["maximum"] = self.peaks.maximum.interpolated

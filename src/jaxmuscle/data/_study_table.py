@@ -42,7 +42,7 @@ class ReadingTable(Table, kw_only=True):
         str | int | None,
         told("Column of the force: its name, or its number from 0. Or NAME of a [point](../recordings.md#what-is-read), "
              "if its coordinates are the columns NAME_x, NAME_y, NAME_z",
-             missing="the only one; an error if there are several"),
+             missing="the only one besides the time, or the only force or torque by its name or unit; else an error"),
     ] = None  # fmt: skip
     rate: Annotated[Above0 | None, told("Sampling rate [Hz]", missing="as the file says; an error if it does not")] = None
     units: Annotated[str | None, told("Unit of the column", missing="as the file says, else N")] = None
@@ -110,7 +110,9 @@ class StudyFile(ReadingTable, kw_only=True):
         str | None,
         told("Colour of the noise: white, band-limited, ornstein-uhlenbeck or pink", missing="band-limited"),
     ] = None
-    quantities: Annotated[list[str] | None, told("Quantities that are compared", missing="all derived quantities")] = None
+    quantities: Annotated[
+        list[str] | None, told("Quantities that are compared", missing="all derived quantities but `high_frequency_floor`")
+    ] = None
     alpha: Annotated[float | None, told("Level of the tests, between 0 and 1", missing="0.05")] = None
     correction: Annotated[str | None, told("Correction for many comparisons: holm, fdr or none", missing="holm")] = None
 

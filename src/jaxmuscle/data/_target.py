@@ -52,7 +52,7 @@ class Target(Shown, eqx.Module):
       with `segments`.
     - `dispersion`: how many times more the trials' average spectrum scatters than their segments explain, and the
       standard error of this number. Above 1 it widens every error. If `trial_power` is given, it follows from that
-      (`dispersion_of`).
+      (docs/recordings.md, *Several trials of one person*).
     - `stiffness`: the dynamic stiffness measured beside it, by a perturbation. Then `proportional_power` may be `None`: the
       target has no spectrum.
     - `settings`: how the spectrum was estimated. The model's spectrum is made in the same way.
@@ -152,9 +152,9 @@ class Target(Shown, eqx.Module):
         """Mean force and its standard error [N]; `None` without a mean in newtons.
 
         The error: that of the trials' scatter or that of a recording of this length, whichever is larger. If it is the
-        former, with Student's t, so that ± 1.96 of it hold 95 % (of three trials or more). The latter from the density S₁ in
-        the lowest bin, `√(S₁ / 2T)`, T the time recorded; 2 % of the mean where the target does not state segments and
-        coefficient of variation, and at least 0.2 %.
+        former, with Student's t, so that ± 1.96 of it hold 95 % (of three trials or more). The latter follows from the
+        density S₁ in the lowest bin: `√(S₁ / 2T)`, T the time recorded, but at least 0.2 % of the mean. If the target lacks
+        segments or coefficient of variation, it is taken as 2 % of the mean.
         """
         if self.mean is None or self.unit not in NEWTONS or self.quantity != "force":
             return None
@@ -186,6 +186,7 @@ class Target(Shown, eqx.Module):
     def sampling_band(self) -> tuple[Float[np.ndarray, " bins"], Float[np.ndarray, " bins"]] | None:
         """Lower and upper edge of p_k exp(-bias ± sd), where the expected spectrum lies within one standard deviation.
 
+        `bias` and `sd` are mean offset and standard deviation of a bin's log power (docs/fitting.md, *What is minimised*).
         `None` if nothing is known about the sampling error.
         """
         statistics = bin_statistics(self)
@@ -207,7 +208,7 @@ class Target(Shown, eqx.Module):
 
     @classmethod
     def from_table(cls, table: Mapping[str, Any], *, whole: bool = False) -> "Target":
-        """The reverse of `to_table`; its frequencies lie on the bins. Raises `TargetError`."""
+        """The reverse of `to_table`: each frequency counts as the nearest bin. Raises `TargetError`."""
         fields = fields_of(table, "target_table", needed=KEYS if whole else (*REQUIRED, "settings"))
         fields = {key: value for key, value in fields.items() if value is not None}
         settings = settings_of(fields.pop("settings"), "target_table.settings", SpectrumSettings.names(whole=whole))

@@ -38,7 +38,7 @@ REQUIRED = ("name", "quantity", "provenance", "source", "frequency_hz", "proport
 METADATA = ("segments", "coefficient_of_variation", "mvc_fraction", "mean", "unit", "dispersion", "reason", "notices")
 KEYS = (*REQUIRED, "sigma", *METADATA, "trial_power", "stiffness", "settings")
 QUANTITIES, PROVENANCES = ("one of " + ", ".join(get_args(kind)) for kind in (Quantity, Provenance))
-POSITIVES = "numbers above 0"
+POSITIVES = "numbers, each above 0"
 
 
 class Raw(NamedTuple):
@@ -162,7 +162,10 @@ class TargetFile(Table, kw_only=True):
     source: Annotated[Any, told("Article, figure, recording", kind="text")]
     frequency_hz: Annotated[
         Any,
-        told("Frequencies [Hz], rising; empty if there is a stiffness, but no spectrum", kind="list of numbers, 0 or more"),
+        told(
+            "Frequencies [Hz], rising; empty if there is a stiffness, but no spectrum",
+            kind="list of numbers, each at least 0",
+        ),
     ]
     proportional_power: Annotated[
         Any, told("Power at each frequency, of any scale; empty if there is no spectrum", kind=f"list of {POSITIVES}")
@@ -201,7 +204,13 @@ class TargetFile(Table, kw_only=True):
     ] = None
     notices: Annotated[Any, told("What was done to the numbers", missing="no notices", kind="list of texts")] = None
     trial_power: Annotated[
-        Any, told("Spectrum of each trial [unit²/Hz]", missing="unknown", kind="a list of numbers for each trial")
+        Any,
+        told(
+            "Spectrum of each trial: a row for each of `segments`, with a power for each of `frequency_hz`, in one unit. "
+            "Weighted with `segments`, their mean has the shape of `proportional_power`",
+            missing="unknown",
+            kind=f"list of rows, each a list of {POSITIVES}",
+        ),
     ] = None
     stiffness: Annotated[
         Any, told("Dynamic stiffness measured beside it", missing="not measured", kind="table, see below")

@@ -72,7 +72,9 @@ class Sweep(Shown, eqx.Module):
 
     @staticmethod
     def design(task: AbstractTask, values: Mapping[str, Any]) -> "Sweep":
-        """One point for each entry of the columns, in natural units; columns of any equal shape are taken row by row.
+        """One point for each entry of the columns, in the units of the table of parameters.
+
+        Columns may have several axes (as chains and draws) if all have the same shape; the last axis runs fastest.
 
         **Raises:** `ValueError` for an unknown name, a value outside its bounds, columns of different lengths, no point.
         """

@@ -70,8 +70,9 @@ def fit(
       condition (a list, `Trials`), a `PerturbedRecording` or several, a `FrequencyResponse`, or names and paths of these
       (with a `PrescribedLength` a file of force and displacement is a perturbed recording, see
       `jaxmuscle.data.two_channels`)
-    - `free`: names to fit (default: `DEFAULT_FREE`, those of them that the task has; where a motor moves the insertion m_w,
-      m_z, too)
+    - `free`: names to fit. By default those marked ● in the table of parameters (docs/reference/parameters.md), and, if
+      the task has them, the correlation time of its noise, the contraction time, and amplitude, frequency and width of its
+      tremor; where a motor moves the insertion m_w and m_z, too
     - `fix`: values to set, which are then not free
     - `noise`: a name or an object
     - `residual`: "log", "linear" or "cumulative"
@@ -84,8 +85,9 @@ def fit(
       noise)
     - `mean_force` (value, sd) [N] as a further residual, by default the target's if it states its mean in newtons: the task
       is then scaled to it (`at_force`) and P_w is free (False: not used)
-    - `max_steps` for each descent
-    - `check_seeds`: fresh noise paths of the reported spectrum (64, or 200 then; 0: not simulated)
+    - `max_steps` of each search from a starting point
+    - `check_seeds`: fresh noise paths of the reported spectrum (64; 200 for a task without linear response; 0: not
+      simulated)
     - `dt` [s]: noise grid of a Monte Carlo fit
     - `progress`: True or a function of (text, share)
     - `rungs`: how many richer models may be tried where the base model does not describe the data (`on_rung`; 3, or 0 where

@@ -61,7 +61,7 @@ class StartTable(Table, kw_only=True):
     """A start of the search: an entry of `starts`."""
 
     cost: Annotated[Number, told("Cost where it ended: half the sum of squares, that of the prior included")]
-    success: Annotated[bool, told("Whether it settled")]
+    success: Annotated[bool, told("Whether its last step lowered the cost by less than a thousandth of it")]
     steps: Annotated[Count, told("Steps taken")]
     values: Annotated[
         tuple[float, ...],
@@ -73,14 +73,14 @@ class StartTable(Table, kw_only=True):
 
 
 class CorrelationTable(Table, kw_only=True):
-    """Correlations of the free parameters: `correlation`; empty where the fit failed."""
+    """Correlations of the free parameters: `correlation`; empty if no spectrum could be fitted (`message` says why)."""
 
-    parameters: Annotated[list[str], told("Names of the parameters", missing="the fit failed")] = msgspec.field(
+    parameters: Annotated[list[str], told("Names of the parameters", missing="no spectrum could be fitted")] = msgspec.field(
         default_factory=list
     )
-    matrix: Annotated[list[list[float]], told("Correlations, a row for each parameter", missing="the fit failed")] = (
-        msgspec.field(default_factory=list)
-    )
+    matrix: Annotated[
+        list[list[float]], told("Correlations, a row for each parameter", missing="no spectrum could be fitted")
+    ] = msgspec.field(default_factory=list)
 
 
 class ProfileTable(Table, kw_only=True):
@@ -103,7 +103,7 @@ class SettingsTable(Table, kw_only=True):
     starts: Annotated[Count, told("Starts of the search")]
     seeds: Annotated[Count, told("How many seeds correct the formula by simulation; 0: not corrected")]
     check_seeds: Annotated[Count, told("New seeds with which the fit was checked")]
-    max_steps: Annotated[Count, told("Largest number of steps of each descent")]
+    max_steps: Annotated[Count, told("Largest number of steps that one search from a starting point may take")]
     dt: Annotated[Annotated[float, Meta(gt=0)], told("Step of the noise [s]")]
     increments: Annotated[
         Literal["gaussian", "weak"],
@@ -169,9 +169,11 @@ class PartTable(Table, kw_only=True):
         dict[str, float | int],
         told(
             "How far formula and simulation differ (docs/fitting.md, section How): `seeds`, how many were simulated; the "
-            "largest difference of a bin, relative (`largest_deviation`), in its standard errors (`largest_deviation_se`), "
-            "in standard deviations of the bin (`largest_deviation_sd`); by how many of its errors the polish moved a "
-            "quantity at most (`polish_moved_se`), and its rounds (`polish_turns`)"
+            "largest difference among the bins, each of the three for itself: relative to the formula "
+            "(`largest_deviation`), in standard errors of the simulated mean (`largest_deviation_se`), in standard "
+            "deviations of the measured bin (`largest_deviation_sd`); by how many of its errors the polish moved a "
+            "quantity at most (`polish_moved_se`), and "
+            "its rounds (`polish_turns`)"
         ),
     ]
     further: Annotated[

@@ -88,9 +88,10 @@ def fit_joint(
     - `seeds` of the nonlinear correction (0: none)
     - `check_seeds`: fresh seeds of the nonlinear model for each reported spectrum (0: linear response times the correction)
     - `bounds`, `priors`, `key`, `residual`, `coefficient_of_variation`, `max_steps`, `increments`, `progress`: as in `fit`
-    - `mean_force` {target: (value, sd)}, by default what the targets state in newtons, if no `tasks` are given: all tasks
-      are then scaled by one number to the first, with a free P_w each. Where one target is of a moved insertion, the masses
-      are not scaled, and are free in all tasks
+    - `mean_force` {target: (value, sd)} [N]: means as further data, of tasks that you have scaled (`at_force`). By default,
+      if no `tasks` are given, the means that the targets state in newtons: then all tasks are scaled by one number, to the
+      first of these means, and every target that states a mean has a free P_w. Where one target is of a moved insertion,
+      the masses are not scaled, and are free in all tasks
     - `rungs`: how many richer models may be tried where the base model does not describe the data (`on_rung`; all targets
       get the same one). Not with `tasks`
     - `answer`: as in `fit`

@@ -53,7 +53,8 @@ class Problem(Shown):
 
     @classmethod
     def of(cls, given: FitProblem, shares: "list[np.ndarray] | None" = None) -> "Problem":
-        """Of the problem of a fit; `shares`, what the harmonic holds of each bin, if that is known."""
+        """For the package itself (you use `jaxmuscle.problem`): of the problem of a fit. `shares`: for each target the share
+        of each bin that the harmonic holds, if that is known."""
         c = given.coordinates
         targets = [part.target for part in given.parts]
         known = all(t.segments is not None or t.sigma is not None or not len(t.bins) for t in targets)

@@ -86,9 +86,10 @@ class Estimate(Shown, eqx.Module):
 
 
 class Start(eqx.Module):
-    """One start of a fit: final cost `½ Σ r²` (None if not finite), whether it settled, steps taken.
+    """One start of a fit: final cost `½ Σ r²` (None if not finite), `success`, steps taken.
 
-    `values`, where the free parameters ended, in the order of `settings["free"]`; empty where that is not finite, and of
+    `success`: whether its last step lowered the cost by less than a thousandth of it. `values`, where the free parameters
+    ended, in the order of `settings["free"]`; empty where that is not finite, and of
     fits that were saved before version 4 of their format.
     """
 
@@ -103,7 +104,8 @@ class FittedPart(eqx.Module):
 
     Its fitted `task`; `chi2_per_bin` about `fitted` (None without knowledge of the spread) and `rms_log_error`; on the
     target's bins the `fitted` proportional power (of fresh seeds where they were simulated), `harmonic_share` of each bin's
-    power, `residual` and `deviation` [standard deviations, log power]; `components`, what share of each bin's power the
+    power; `residual`, target against fit [standard deviations]; `deviation`, the standard deviation of each log power (None
+    where it is unknown); `components`, what share of each bin's power the
     parts of the model have in linear response: the `relaxation` of the active tissue under its noise, the `floor` from
     noise on the passive one, the `harmonic`, the `tremor`, `resonance_2`; `stretch`, time and output of a few simulated
     seconds; `check`, how far linear response and nonlinear simulation differ; `further`, residuals of the coefficient of

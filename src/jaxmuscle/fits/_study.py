@@ -50,7 +50,8 @@ COMPARED = tuple(name for name in DERIVED if name != "high_frequency_floor")  # 
 class StudyResult(Printed, Result, eqx.Module):
     """What a study found.
 
-    `cohort`, the fits, one of each person in each condition; `cells`, whose recordings they stand on; `aic`, the summed AIC
+    `cohort`, the fits, one of each person in each condition; `cells`, one for each of them: `person`, `group`,
+    `condition`, how many `trials`, their sampling `rates` [Hz], and the `target` made of them; `aic`, the summed AIC
     of every model that was tried (by rung), of which the lowest was taken; the `options` as they were used; the `source` of
     the table.
     """

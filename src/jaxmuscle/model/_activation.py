@@ -69,7 +69,11 @@ class Activation(Spelled, eqx.Module):
         return a, b / self.time
 
     def transition(self, dt: Scalar, dtype: Any = None) -> "Transition":
-        """What a step of dt [s] does to the states (a, b = T a'), exactly, where the input runs straight in it."""
+        """What a step of dt [s] does to the states (a, b = T a'), exactly, where the input runs straight in it.
+
+        Its `advance((a, b), n, m)` gives the states after a step in which the input runs from n to m. They have the
+        precision `dtype`, by default JAX's.
+        """
         x = jnp.asarray(dt / self.time, jnp.result_type(float) if dtype is None else dtype)
         share = jnp.asarray(NODES, x.dtype)
         y = x * (1 - share)  # time left in the step

@@ -88,7 +88,8 @@ class AbstractNoise(Spelled, eqx.Module):
 
     `amplitude` is one number for the four coefficients; or four; or five, the last for the drive; or a mapping by name. It
     is a fraction of the base coefficient (`relative`) or in its unit [N/m, N s/m]; that of the drive is a fraction of P_w.
-    `smoothness`: 0 white (has no values), 1 continuous, 2 differentiable. `sort` begins the names of its parameters.
+    `smoothness`: 0 white (has no values), 1 continuous, 2 differentiable. The names of its parameters begin with the
+    class variable `sort`: "noise", if a class does not say otherwise ("resonance" for `ResonantNoise`).
 
     Noises add: `BandLimitedNoise() + ResonantNoise()`.
     """
@@ -116,7 +117,9 @@ class AbstractNoise(Spelled, eqx.Module):
         """Raise a `ValueError` if a grid of step dt [s] is too coarse for this noise."""
 
     def draw(self, key: PRNGKeyArray, steps: int, draws: Draws = Draws()) -> Any:  # noqa: B008
-        """All normals of one seed: those that begin it and those of every step, in rows (of white noise the latter)."""
+        """The standard normal numbers of one seed, shape (steps + 1, numbers): a row that begins the noise and a row for
+        each step. White noise has only the rows of the steps; a sum of noises has a tuple of these.
+        """
         return self._drawn(Stream.of(key, draws), steps, 0)
 
     def _drawn(self, stream: Stream, steps: int, part: int) -> Any:
@@ -128,7 +131,11 @@ class AbstractNoise(Spelled, eqx.Module):
         return jnp.concatenate([jnp.stack(stream.normals(START, part * APART, count))[None], later])
 
     def realise(self, normals: Any, dt: Scalar) -> Realisation:
-        """The unit path that the normals stand for, exact in distribution on the grid of step dt [s]."""
+        """The unit path that the normals stand for, exact in distribution on the grid of step dt [s].
+
+        It has `values` N and `slopes` dN/dt at all grid points, or `increments` between them for white noise; None for
+        what a noise does not have. That of a sum has `parts` instead.
+        """
         made = jax.tree.map(lambda x: jnp.asarray(x, normals.dtype), self.recursion(dt))
         rows = normals.reshape(len(normals), made.numbers, -1)  # of every channel
         if made.direct is not None:
@@ -144,7 +151,7 @@ class AbstractNoise(Spelled, eqx.Module):
         return Realisation(values=made.value(whole), slopes=made.slope(whole))
 
     def psd(self, f: Float[Array | np.ndarray, " frequencies"] | Scalar) -> Float[Array, "..."]:
-        """Two-sided power density `amplitude² density(f)` [amplitude²/Hz], one row per amplitude if there are four."""
+        """Two-sided power density `amplitude² density(f)` [amplitude²/Hz], one row per amplitude if there are several."""
         return jnp.asarray(self.amplitude)[..., None] ** 2 * self.density(jnp.atleast_1d(jnp.asarray(f)))
 
     def __add__(self, other: "AbstractNoise") -> "NoiseSum":

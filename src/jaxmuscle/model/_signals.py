@@ -71,8 +71,8 @@ class Harmonic(Spelled, eqx.Module):
 class SmoothStep(AbstractSignal):
     """A Heaviside step with a finite rise: `initial` before `start`, `level` after `start + rise`.
 
-    Between them `level * (35 p⁴ - 84 p⁵ + 70 p⁶ - 20 p⁷)`, p = (t - start) / rise: three continuous derivatives, which
-    `PrescribedMotion` needs (its P_w contains x_z''').
+    Between them `initial + (level - initial) (35 p⁴ - 84 p⁵ + 70 p⁶ - 20 p⁷)`, p = (t - start) / rise: three continuous
+    derivatives, which `PrescribedMotion` needs (its P_w contains x_z''').
 
     **Arguments:** `level`, `start` [s], `rise` [s] > 0, `initial`. **Raises:** `ValueError` if rise <= 0.
     """

@@ -151,7 +151,11 @@ class AbstractTask(Shown, eqx.Module):
         return {"m": "displacement", "m/s^2": "acceleration"}.get(self.output_unit, "force")
 
     def with_input(self, name: str) -> "AbstractTask":
-        """A copy with the activation (`activation_time`) or the drive's channel of the noise (`noise_P_w`) switched on."""
+        """A copy that has the parameter `name`, of those that a task may lack.
+
+        "activation_time" adds an activation with its default contraction time; "noise_P_w" adds the drive's channel to the
+        noise, with the amplitude 0, which `replace` changes.
+        """
         if name == "activation_time":
             return self.with_parts(activation=Activation())
         parts = list(self.noise.components)

@@ -144,7 +144,10 @@ class PrescribedForce(AbstractTask):
 
     @property
     def smoothness_needed(self) -> tuple[int, ...]:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """x_z'' contains the noise on K_z and C_z."""
+        """The least `smoothness` that the noise on K_w, K_z, C_w, C_z and P_w must have; 0: any.
+
+        With `observe="acceleration"` it is 1 for K_z and C_z, since x_z'' contains their noise.
+        """
         return (0, 0, 0, 0, 0) if self.observe == "displacement" else (0, 1, 0, 1, 0)
 
     def vector_field(self, t: Scalar, y: State, u: Perturbation) -> State:

@@ -59,8 +59,8 @@ def task_for(
         target = jm.load_target("vastus-lateralis-26mvc")
         task = jm.task_for(target, noise="pink")
 
-    Of another `kind` if one is given. It has the target's spectrum settings and default parameters; `noise` is a name of
-    `NOISES` or a noise object.
+    Of another `kind` if one is given. It has the target's spectrum settings and default parameters; `noise` is
+    "white", "band-limited", "ornstein-uhlenbeck", "pink", or a noise object.
     """
     what: Any = target.quantity
     held = Isometric() if target.stiffness is None else PrescribedLength()

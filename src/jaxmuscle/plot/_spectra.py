@@ -11,7 +11,9 @@ from ._style import BLUE, GREY, PALETTE, PROPORTIONAL, axes_or_new, density_unit
 
 @styled
 def estimate(estimate: Any, ax: Axes | None = None, *, log: bool = False) -> Axes:
-    """Draws the proportional power of a `SpectrumEstimate`, with two standard errors either way, and without control.
+    """Draws the proportional power of a `SpectrumEstimate`, with two standard errors either way.
+
+    If it has a control variate, the estimate without it is drawn, too, in grey.
 
     **Arguments:**
 
@@ -81,8 +83,8 @@ def target(target: Any, ax: Axes | None = None, *, log: bool = False) -> Axes:
 
     The band is where an expected spectrum lies at most one standard deviation from the target in log power:
     p_k exp(-bias ± sd). With ν degrees of freedom bias = ψ(ν/2) - ln(ν/2) and sd² = ψ'(ν/2), otherwise bias = 0 and
-    sd² = ln(1 + (sigma_k/p_k)²). Without segments and sigma there is no band. Spectra of trials are thin lines, in the same
-    unit as their mean.
+    sd² = ln(1 + (sigma_k/p_k)²). Without segments and sigma there is no band. The spectra of
+    single trials are thin lines, all divided by the same number (the sum of their mean): a trial with more power is higher.
 
     **Arguments:**
 

@@ -24,9 +24,10 @@ def expected_spectrum(
         E_k = Σ_l M_kl r(l Δ) + line_k,    r(τ) = c exp(𝒜 τ) P cᵀ,    𝒜 P + P 𝒜ᵀ + 𝒬 = 0
 
     𝒜 is the task linearised about its equilibrium together with the filters that shape the noise; M holds window,
-    detrending and low-pass (`covariance_operator`), Δ is the sampling interval, so that aliases are part of it; line_k is
-    the harmonic's response with phase and leakage, all its channels added coherently. The estimate's mean for a process
-    that has forgotten its start; exact where the response is linear, as it is within 0.2 % at human force fluctuations.
+    detrending and low-pass (docs/model.md, *From autocovariance to Welch power*), Δ is the sampling interval, so that
+    aliases are part of it; line_k is the harmonic's response with phase and leakage, all its channels added coherently. The
+    estimate's mean for a process that has forgotten its start; exact where the response is linear, as it is within 0.2 % at
+    human force fluctuations.
 
     **Arguments:** `task`; `settings` (the task's own by default); the analysed `window` [s] (only the harmonic's phase
     and an envelope that changes depend on it).
@@ -54,7 +55,7 @@ def expected_variation(
         CV = √E[s²] / |μ|,    E[s²] = r(0) - Var(mean) + ½ |line|²
 
     r is the autocovariance of the output behind the low-pass of the settings, s² the variance within the window, and μ the
-    output at rest. Slow fluctuations count less in a short window, which hardly holds one of their periods.
+    output at the operating point. Slow fluctuations count less in a short window, which hardly holds one of their periods.
 
     **Arguments:** as of `expected_spectrum`; the `window` [s] also says how long the recording is (10 s by default).
 

@@ -119,12 +119,13 @@ def _carried(task: AbstractTask, mean: Any, unit: Any) -> AbstractTask:
 
 
 def save_preset(path: str | Path, task: AbstractTask, *, description: str = "", fit: dict[str, Any] | None = None) -> None:
-    """Write a task to `path` as a preset: TOML with a description, the fit that made it and the task table.
+    """Write a task to `path` as a preset: TOML with a description and the task table.
 
         jm.save_preset("mine.toml", jm.Isometric(k_w=4e5))
         task = jm.load_preset("mine.toml")
 
-    `load_preset` reads it back equal.
+    `load_preset` reads it back equal. `fit`, a dictionary that says how the task was fitted, is written as a note for the
+    reader.
     """
     table: dict[str, Any] = {"format": FORMAT, "description": description} | ({"fit": fit} if fit else {})
     write_text(path, tomli_w.dumps(table | {"task_table": task_to_table(task)}))

@@ -26,16 +26,16 @@ SIZES_OF_A_SIGNAL = ("level", "initial", "final")
 
 
 def relative_variation(mvc_fraction: Scalar, *, steadiest: Scalar = 0.3, contrast: Scalar = 1.0) -> Scalar:
-    """Coefficient of variation of force at a level L (`mvc_fraction`) over that at the steadiest level L* (`steadiest`).
+    """Coefficient of variation of force at a level L (`mvc_fraction`) over that at the steadiest level `L*` (`steadiest`).
 
         jm.response.relative_variation(0.95)
 
         g(L) = (L*/L · exp(L/L* - 1))^contrast
 
-    With `contrast = 1` the standard deviation grows as exp(L/L*); the smallest coefficient of variation is at L*, whatever
-    the contrast. The largest of 5 to 95 % MVC is at 95 % for L* < 0.305.
+    With `contrast = 1` the standard deviation grows as `exp(L/L*)`; the smallest coefficient of variation is at `L*`,
+    whatever the contrast. The largest of 5 to 95 % MVC is at 95 % for `L* < 0.305`.
 
-    **Source:** standard deviation exponential in force: Slifkin & Newell 1999, doi:10.1037/0096-1523.25.3.837; L* = 0.3:
+    **Source:** standard deviation exponential in force: Slifkin & Newell 1999, doi:10.1037/0096-1523.25.3.837; `L* = 0.3`:
     Taylor, Christou & Enoka 2003, doi:10.1152/jn.00056.2003.
     """
     _check_fraction("mvc_fraction", mvc_fraction)

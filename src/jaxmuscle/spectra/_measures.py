@@ -205,11 +205,16 @@ def peaks(spectrum: Spectrum, *, min_prominence: float = 0.01) -> Peaks:
         jm.spectra.peaks(spectrum).maximum.frequency
 
     The interpolated frequency is the vertex of the parabola through the log power l of a bin and of its two
-    neighbours, f_k + Δf (l_{k-1} - l_{k+1}) / (2 (l_{k-1} - 2 l_k + l_{k+1})). A maximum in the first or last
-    bin is no local maximum, is not interpolated, and has one valley only.
+    neighbours, f_k + Δf (l_{k-1} - l_{k+1}) / (2 (l_{k-1} - 2 l_k + l_{k+1})). The prominence of a maximum is its
+    height in proportional power above the higher of the two valleys beside it (the lowest bins between it and a higher
+    maximum, or the end of the spectrum). A maximum in the first or last bin is no local maximum and is not interpolated;
+    its prominence is its height above the lowest bin.
 
     **Arguments:** `spectrum` without leading axes; `min_prominence` of local maxima, relative to the
     maximum (by default 1 %: smaller ones are mostly the scatter of the estimate).
+
+    **Returns:** `maximum` and `local_maxima` (by rising frequency), each with `bin`, `frequency` and `interpolated`
+    frequency [Hz], proportional `power` and `prominence`.
 
     **Raises:** `ValueError` for leading axes, fewer than 3 bins, and power that is not finite or all zero.
     """

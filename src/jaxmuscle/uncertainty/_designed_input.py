@@ -146,7 +146,7 @@ class DesignedInput(Printed, Result, eqx.Module):
     @property
     def window(self) -> tuple[float, float]:
         """From when to when a record is analysed [s]: whole periods of the motion, after half of one. One period, or as many
-        as reach the error that was asked for, if a person can hold so long."""
+        as reach the error that was asked for; one period if that takes more than an hour."""
         period, seconds = self.lengthening.seconds, 0.0 if self.needed is None else self.needed[1]
         periods = max(1, int(np.ceil(seconds / period - 1e-9))) if seconds <= ENDURED else 1
         return period / 2, period / 2 + periods * period

@@ -85,7 +85,7 @@ class Design(eqx.Module):
         return self.segments is None or sum(self.counts) > 0
 
     def told(self, problem: FitProblem) -> tuple[str, str]:
-        """Task and data in words."""
+        """Task and data in words, beside those of the problem of a fit."""
         data, like = [], self.like(problem)
         if self.spectral:
             settings = like.target.settings if self.settings is None else self.settings
@@ -102,7 +102,11 @@ class Design(eqx.Module):
         return _task_in_words(like.task if self.task is None else self.task, kind), ", ".join(data)
 
     def like(self, problem: FitProblem) -> Part:
-        """The part of a fit that it resembles. Raises `ValueError` for an unknown target."""
+        """The part of a fit that belongs to `target` (by default the first), whose task, segments and settings it takes
+        over.
+
+        **Raises:** `ValueError` for an unknown target.
+        """
         names = [part.name for part in problem.parts]
         if self.target is not None and self.target not in names:
             raise ValueError(f"{self.name}: target: the fit has none called {self.target!r}: {choices(self.target, names)}")

@@ -77,8 +77,9 @@ class Outlook(Printed, Result, eqx.Module):
     `task` and `data` in words; `separate`, the parameters that have other values there; `singular_values` in prior standard
     deviations; `determined`, how many directions are (singular value at least 3); `undetermined`, what can be scaled
     together unnoticed; `products` and ratios of parameters that are determined, with their relative standard errors;
-    `quantities` by name; `gained`, those that become determined; `failed`, why the design is impossible, all else being
-    as at present.
+    `quantities` by name, each with `value`, `unit`, `stderr` by data and prior, `prior_sd` by the prior alone, and whether
+    it is `determined` (at most a tenth of the prior's variance is left); `gained`, those that become determined; `failed`,
+    why the design is impossible, all else being as at present.
     """
 
     name: str
@@ -142,7 +143,7 @@ class IdentifiabilityReport(Printed, Result, eqx.Module):
 
     @property
     def telling_pairs(self) -> tuple[Outlook, ...]:
-        """Pairs that determine more quantities than each of their two designs does, or any other, best first."""
+        """Pairs after which more quantities become determined than after any single design, best first."""
         most = max((len(design.gained) for design in self.designs), default=0)
         return tuple(pair for pair in self.pairs if len(pair.gained) > most)
 

@@ -84,7 +84,8 @@ def design_input(
     - `key` of its phases
     - `spread`: the share of the mean square that is even over the band (a motion of few lines could be foreseen, and would
       not test the model)
-    - `target`: which one of a fit with several
+    - `target`: of a fit with several targets, the one whose task and spectrum settings the new record takes over (by
+      default the first)
     - `durations` [s]: lengths of the record for which the errors are told, too, the motion being repeated
     - `error`: relative, 0.1 say: how long a record takes until every quantity is known to that
 

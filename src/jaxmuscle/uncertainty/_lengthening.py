@@ -63,7 +63,7 @@ class Lengthening(Printed, Result, eqx.Module):
         return Lengthening(self.frequency, self.power * min(1.0, *(most / reached)) ** 2, self.seconds)
 
     def of_motion(self, displacement: Float[np.ndarray, " samples"]) -> "Lengthening":
-        """Its lines in one period of a motion [m]."""
+        """One of the same frequencies, with the power of `displacement` [m], one period of a motion, at each of them."""
         places = np.rint(self.frequency * self.seconds).astype(int)
         power = 2 * np.abs(np.fft.rfft(displacement)[places] / len(displacement)) ** 2
         return Lengthening(self.frequency, power, self.seconds)
@@ -85,7 +85,10 @@ class Lengthening(Printed, Result, eqx.Module):
     def information(
         self, task: PrescribedLength, coordinates: Coordinates, theta: Float[np.ndarray, " own"]
     ) -> Float[np.ndarray, "own own"]:
-        """Fisher information of θ in the response of the force."""
+        """Fisher information of the parameters in the response of the force.
+
+        For the package itself: `coordinates` and `theta` are those of the problem of a fit.
+        """
         return np.tensordot(self.power, information_of_lines(task, coordinates, theta, self.frequency, self.seconds), 1)
 
 

@@ -35,7 +35,11 @@ Modes = tuple[tuple[float, float, float, float], ...]
 
 
 class PosteriorPart(eqx.Module):
-    """One target of a posterior: its `task` at the medians, `replicates`, what spectra the posterior predicts.
+    """One target of a posterior: its `task` at the medians; `replicates`, what spectra the posterior predicts.
+
+    `replicates` has an entry for every draw: proportional powers `expected` by the model and `power` drawn about it; `chi2`
+    of the measured and `chi2_drawn` of the drawn spectrum about the same model; and over all draws `p_value`, how often
+    the drawn one is further away.
 
     `names` {parameter of the task: name among the samples}.
     """
@@ -50,9 +54,10 @@ class Posterior(Shown, eqx.Module):
     """Draws from the posterior of a fit, of one target or of several; arrays have leading axes (chain, draw).
 
     `success` and `message`: whether the chains mixed, or why not; `parts`, a `PosteriorPart` for each target by name;
-    `samples` of the free parameters and `derived` quantities in natural units; `diagnostics` {name: (R-hat, effective size
-    of the bulk, of the tails)}; `determined`, the names that the data determine; `frequency_modes` {harmonic frequency:
-    ((from, median, to, probability), ...)} [Hz]; `chains`, how it was drawn.
+    `samples` of the free parameters and `derived` quantities in the units of the table of parameters; `diagnostics` {name:
+    (R-hat, effective size of the bulk, of the tails)}; `determined`, the names that the data determine; `frequency_modes`
+    {harmonic frequency: ((from, median, to, probability), ...)} [Hz]; `chains`: place, log density, acceptance, steps and
+    divergence of every draw, and the step size.
 
     A posterior of one target has `target`, `task` and `replicates` of its own.
     """
