@@ -244,7 +244,7 @@ class Comparison(Printed, Result, eqx.Module):
         return "every model describes the data" if every else f"these describe the data (p >= 0.01): {'; '.join(fine)}"
 
     def table(self) -> list[dict[str, Any]]:
-        """A row for each model, with the keys that the page Results lists for `to_dataframe`."""
+        """A row for each model, with the columns that *Results as numbers* lists (docs/reference/index.md)."""
         return [{name: getattr(row, name) for name in COLUMNS} for row in self.rows]
 
     def to_dataframe(self) -> "pandas.DataFrame":

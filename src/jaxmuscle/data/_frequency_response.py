@@ -193,11 +193,15 @@ class FrequencyResponse(Printed, eqx.Module):
             chi² = Σ |H|² / stderr²   over the frequencies, and the part of it along (K + iωB - ω²I) / stderr
 
         have the chi² distribution with 2 · frequencies and with 3 degrees of freedom where H is 0. The smaller of both
-        probabilities is doubled, since two are looked at. With a `coherence` the errors are estimated from few `averages`
-        K, and the frequencies are those of overlapping segments, neighbours being correlated by 0.45. Then |H|² / stderr²
-        is replaced by `2 (K - 1) ln(1 + |H|² / (2 (K - 1) stderr²))`, which has the chi² distribution that it should have,
-        and since neighbours are correlated, the first sum and its degrees of freedom are divided by 1.4, the second sum by
-        1.9. Above 0.001 (`UNSEEN`) the displacement says nothing of the muscle, and a fit refuses it.
+        probabilities is doubled, since two are looked at. With a `coherence` the errors are estimated from few averages, n
+        of them (`averages`), and the frequencies are those of overlapping segments, neighbours being correlated by 0.45.
+        Then every H / stderr is made shorter, its phase kept, so that its square is
+
+            2 (n - 1) ln(1 + |H|² / (2 (n - 1) stderr²))
+
+        which has the chi² distribution that it should have. Both sums are made of these. Since neighbours are correlated,
+        the first sum and its degrees of freedom are divided by 1.4; the second sum is divided by 1.9, and keeps its 3.
+        Above 0.001 (`UNSEEN`) the displacement says nothing of the muscle, and a fit refuses it.
         """
         one, shared = self.known, (1.0, 1.0)
         size = (np.abs(one.value) / one.stderr) ** 2

@@ -81,7 +81,7 @@ class PartReport(NamedTuple):
 
 
 def merge(path: str | Path) -> "xarray.Dataset":
-    """Make one ensemble of the parts in a store: checks that all chunks are there, reduces tallies, marks it complete.
+    """Make one ensemble of the parts in a store: checks that all chunks are there, adds up what `reduce` kept.
 
         runs = jm.ensembles.merge("runs.zarr")
 

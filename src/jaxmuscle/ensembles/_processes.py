@@ -108,7 +108,7 @@ def _first_line(error: Exception) -> str:
 def leave(code: int) -> NoReturn:
     """End this process with the exit `code`: JAX's own end would wait for processes that will not come.
 
-    Process 0 lets the others speak first, since they cannot outlive it.
+    Process 0 waits two seconds before it ends: the others end when it does, and have messages to print.
     """
     if jax.process_count() > 1 and jax.process_index() == 0:
         time.sleep(LAST_WORDS)

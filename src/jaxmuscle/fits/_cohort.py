@@ -73,8 +73,8 @@ class CohortResult(Result, eqx.Module):
         return Card("\n".join([folded([heading]), *in_columns(columns, rows)]), heading, columns, tuple(rows))
 
     def table(self) -> list[dict[str, Any]]:
-        """Tidy rows, one per target and quantity (free parameters, then derived ones), with the keys that the page
-        Results lists.
+        """Tidy rows, one per target and quantity (free parameters, then derived ones), with the columns
+        that *Results as numbers* lists (docs/reference/index.md).
 
         `low` and `high` are the ends of the 95 % interval.
         """

@@ -72,7 +72,7 @@ def fit(
       `jaxmuscle.data.two_channels`)
     - `free`: names to fit. By default those marked ● in the table of parameters (docs/reference/parameters.md), and, if
       the task has them, the correlation time of its noise, the contraction time, and amplitude, frequency and width of its
-      tremor; where a motor moves the insertion m_w and m_z, too
+      tremor and of its second resonance; where a motor moves the insertion m_w and m_z, too
     - `fix`: values to set, which are then not free
     - `noise`: a name or an object
     - `residual`: "log", "linear" or "cumulative"

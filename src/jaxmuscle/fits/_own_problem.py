@@ -130,8 +130,9 @@ class Problem(Shown):
     def scattering_as(self, theta: Theta) -> "Problem":
         """The problem whose data scatter as the model at θ says.
 
-        A bin in which the harmonic holds a share ρ of the power scatters less, by 1 - ρ², and so does the coefficient of
-        variation. A fit goes on with this when it has come near its minimum: do the same for the same minimum.
+        A bin in which the harmonic holds a share ρ of the power scatters less: it has 1 / (1 - ρ²) times as many degrees of
+        freedom. The coefficient of variation scatters less, too (docs/fitting.md, *What is minimised*). A fit goes on with
+        this when it has come near its minimum: do the same for the same minimum.
         """
         with jax.enable_x64(True):
             scaled = np.asarray(self.fit_problem.coordinates.theta(np.asarray(theta, dtype=float)))

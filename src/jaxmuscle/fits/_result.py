@@ -175,7 +175,8 @@ class FitResult(Result, eqx.Module):
 
     @property
     def per_newton(self) -> dict[str, float]:
-        """Base stiffness [1/m] and damping [s/m] of both tissues per newton of mean force: free of the scale of force.
+        """Stiffness [1/m] and damping [s/m] of both tissues at rest (`K_w0`, `K_z0`, `C_w0`, `C_z0`) per newton of mean
+        force: free of the scale of force.
 
         Empty where a mean force or a dynamic stiffness was given, and where the output is no force.
         """

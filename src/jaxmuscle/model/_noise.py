@@ -117,8 +117,11 @@ class AbstractNoise(Spelled, eqx.Module):
         """Raise a `ValueError` if a grid of step dt [s] is too coarse for this noise."""
 
     def draw(self, key: PRNGKeyArray, steps: int, draws: Draws = Draws()) -> Any:  # noqa: B008
-        """The standard normal numbers of one seed, shape (steps + 1, numbers): a row that begins the noise and a row for
-        each step. White noise has only the rows of the steps; a sum of noises has a tuple of these.
+        """The standard normal numbers of one seed: a row that begins the noise and a row for each step.
+
+        Shape (steps + 1, n), n = `channels` times the `numbers` of `recursion`. White noise has only the rows of the steps;
+        a sum of noises has a tuple of these. `draws` says how the numbers are made: by which `generator` and as which
+        `increments`, as the arguments of `ensemble`.
         """
         return self._drawn(Stream.of(key, draws), steps, 0)
 

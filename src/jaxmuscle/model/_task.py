@@ -65,8 +65,9 @@ class AbstractTask(Shown, eqx.Module):
 
     `u = (ΔK_w, ΔK_z, ΔC_w, ΔC_z, ΔP_w / P_w)` [N/m, N s/m, 1] is the perturbation of coefficients and drive: noise and
     harmonic, those of K_w, C_w and P_w through the `activation` if there is one. Common to all tasks are the `muscle`, the
-    `noise` (None in a field: the default), the `harmonic`, the `activation` (None: none), how the output's spectrum is
-    estimated (`settings`) and the initial state (`initial`, zero by default).
+    `noise`, the `harmonic`, the `activation`, how the output's spectrum is estimated (`settings`) and the initial state
+    (`initial`). As an argument None stands for the default muscle, noise, harmonic and settings, for no activation, and for
+    an initial state of zero.
 
     `task[name]` and `task.name` read a parameter by its name in the parameter table, `task.replace(name=value)` changes it;
     the tasks of the package take it as an argument, too, and a noise by its name: `Isometric(k_w=4e5, noise="pink")`. A name

@@ -283,20 +283,20 @@ def log_likelihood(task: AbstractTask, data: Target | Recording) -> Scalar:
         target = jm.load_target("vastus-lateralis-26mvc")
         jm.log_likelihood(jm.task_for(target), target)
 
-    A `Target` with segments: its Welch bins are correlated gamma variables about the expected spectrum (`log_density`),
-    their unknown total integrated out; with its coefficient of variation as one more datum, Gaussian in the log with the
-    standard deviation that it has under this task, if it states one; and with its dynamic stiffness, Gaussian in real and
-    imaginary part with the errors that it states, if it has one.
-    A `Recording`: the Whittle likelihood of the periodogram of its window, in its own units, between the first and last
-    bin of the task's settings, about the *expected* periodogram of a window of that length (leakage and aliases included:
-    debiased Whittle, Sykulski et al. 2019, doi:10.1093/biomet/asy071). With a line L_k in noise N_k,
+    A `Target` with segments: its Welch bins are correlated gamma variables about the expected spectrum
+    (docs/uncertainty.md, *The likelihood*), their unknown total integrated out; with its coefficient of variation as one
+    more datum, Gaussian in the log with the standard deviation that it has under this task, if it states one; and with its
+    dynamic stiffness, Gaussian in real and imaginary part with the errors that it states, if it has one. A `Recording`: the
+    Whittle likelihood of the periodogram of its window, in its own units, between the first and last bin of the task's
+    settings, about the *expected* periodogram of a window of that length (leakage and aliases included: debiased Whittle,
+    Sykulski et al. 2019, doi:10.1093/biomet/asy071). With a line L_k in noise N_k,
 
         Σ_k [ln I0(2 √(I_k L_k) / N_k) - (I_k + L_k) / N_k - ln N_k],
 
     the noncentral chi-squared law with two degrees of freedom; without, `-Σ (ln E_k + I_k / E_k)`.
 
-    **Raises:** `ValueError` for a target without segments, a harmonic beyond half the sampling rate, and what
-    `Recording.fft_spectrum` refuses.
+    **Raises:** `ValueError` for a target without segments, a harmonic beyond half the sampling rate, and a
+    recording whose window is constant, too short, or sampled too slowly for the bins.
     """
     if all_concrete(task):
         check_line(task, task.settings)

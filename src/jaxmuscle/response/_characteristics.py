@@ -82,7 +82,7 @@ def static_characteristics(
 
     - `task`: whose muscle it is
     - `span` [m]: displacements from -span to span (by default twice the largest of the operating point's, at least 0.02 m)
-    - `speed` [m/s]: velocities from -speed to speed
+    - `speed` [m/s]: velocities from -speed to speed (by default 1 m/s)
     - `points`: odd to contain 0
 
     **Raises:** `ValueError` for a span or speed that is not positive and for fewer than 3 points.

@@ -116,8 +116,9 @@ class Trajectory(Shown, eqx.Module):
 
         Its coefficient of variation is what a `Target` states and what a fit compares (see `Recording.filtered`).
 
-        **Arguments:** `settings` (the task's by default; their rate must divide this trajectory's, and if it is lower,
-        `sampling="filtered"` low-passes before it); `window` [s].
+        **Arguments:** `settings` (the task's by default; their rate must divide this trajectory's; if it is lower and
+        their `sampling` is "filtered", the output is low-passed against aliases before it is brought down to that rate);
+        `window` [s].
         """
         settings = self.task.settings if settings is None else settings
         passed = lowpass(self._at_rate_of(settings, self.output), settings)

@@ -85,7 +85,10 @@ class Design(eqx.Module):
         return self.segments is None or sum(self.counts) > 0
 
     def told(self, problem: FitProblem) -> tuple[str, str]:
-        """Task and data in words, beside those of the problem of a fit."""
+        """For the package itself:
+
+        task and data in words. What the design leaves open is taken from the `problem` of a fit.
+        """
         data, like = [], self.like(problem)
         if self.spectral:
             settings = like.target.settings if self.settings is None else self.settings
@@ -102,8 +105,8 @@ class Design(eqx.Module):
         return _task_in_words(like.task if self.task is None else self.task, kind), ", ".join(data)
 
     def like(self, problem: FitProblem) -> Part:
-        """The part of a fit that belongs to `target` (by default the first), whose task, segments and settings it takes
-        over.
+        """For the package itself: the part of a fit's problem that belongs to `target` (by default the first), whose task,
+        segments and settings the design takes over.
 
         **Raises:** `ValueError` for an unknown target.
         """

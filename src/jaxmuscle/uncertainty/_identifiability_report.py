@@ -79,7 +79,7 @@ class Outlook(Printed, Result, eqx.Module):
     together unnoticed; `products` and ratios of parameters that are determined, with their relative standard errors;
     `quantities` by name, each with `value`, `unit`, `stderr` by data and prior, `prior_sd` by the prior alone, and whether
     it is `determined` (at most a tenth of the prior's variance is left); `gained`, those that become determined; `failed`,
-    why the design is impossible, all else being as at present.
+    why the design is impossible, or None. An impossible design adds nothing: its numbers are those of the present data.
     """
 
     name: str
