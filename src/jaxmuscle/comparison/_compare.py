@@ -51,7 +51,8 @@ def compare_noise(
     of the harmonic, "two resonances".
 
     Each model is climbed, in linear response, to the highest of the maxima of its posterior from 64 starting points (16
-    without harmonic). Half of those of a model with a resonance begin where the best of the poorer ones ended. There
+    without harmonic). For a model with a resonance ("tremor", "two resonances") half of the searches begin where that of a
+    simpler model of the task's own noise ended, of several the one with the lowest AIC. There
 
         AIC = -2 ln L + 2 p,    p = tr(F (F + Λ)⁻¹),
 

@@ -191,9 +191,9 @@ def fit_cohort(
         targets = [jm.load_target(name) for name in ("vastus-lateralis-26mvc", "fdi-abduction-45mvc")]
         jm.fit_cohort(targets).to_dataframe()
 
-    As `fit` with `method="linear"` for each, without its last steps: no nonlinear correction (0.2 % of a bin), no check
-    on simulated seeds, no profile over the harmonic's frequency; fit a target alone for those. Targets that can share a
-    batch are those of the same task, bins and settings.
+    As `fit` with `method="linear"` for each, without its last steps: no nonlinear correction (which usually changes a bin
+    by 0.2 %), no check on simulated seeds, no profile over the harmonic's frequency; fit a target alone for those. Targets
+    that can share a batch are those of the same task, bins and settings.
 
     **Arguments:**
 

@@ -102,7 +102,8 @@ class Start(eqx.Module):
 class FittedPart(eqx.Module):
     """What a fit found of one target.
 
-    Its fitted `task`; `chi2_per_bin` about `fitted` (None without knowledge of the spread) and `rms_log_error`; on the
+    Its fitted `task`; `chi2_per_bin` about `fitted` (None without knowledge of the spread) and `rms_log_error`, the
+    standard deviation over the bins of ln(target / fitted); on the
     target's bins the `fitted` proportional power (of fresh seeds where they were simulated), `harmonic_share` of each bin's
     power; `residual`, target against fit [standard deviations]; `deviation`, the standard deviation of each log power (None
     where it is unknown); `components`, what share of each bin's power the
@@ -134,7 +135,8 @@ class FittedPart(eqx.Module):
 
     @property
     def data(self) -> int:
-        """Numbers that the fit compares: bins less one, as only their shape counts, and two for each dynamic stiffness."""
+        """Numbers that the fit compares: bins less one, as only their shape counts, and two for each
+        frequency of the dynamic stiffness (real and imaginary part)."""
         return max(len(self.fitted) - 1, 0) + (0 if self.stiffness is None else 2 * len(self.stiffness))
 
     @property

@@ -30,6 +30,7 @@ from ._tasks import Isometric as Isometric
 from ._tasks import PrescribedForce as PrescribedForce
 from ._tasks import PrescribedLength as PrescribedLength
 from ._tasks import PrescribedMotion as PrescribedMotion
+from ._stream import Draws as Draws
 from ._white_noise import BandLimitedNoise as BandLimitedNoise
 from ._white_noise import OrnsteinUhlenbeckNoise as OrnsteinUhlenbeckNoise
 from ._white_noise import WhiteNoise as WhiteNoise

@@ -120,8 +120,7 @@ class AbstractNoise(Spelled, eqx.Module):
         """The standard normal numbers of one seed: a row that begins the noise and a row for each step.
 
         Shape (steps + 1, n), n = `channels` times the `numbers` of `recursion`. White noise has only the rows of the steps;
-        a sum of noises has a tuple of these. `draws` says how the numbers are made: by which `generator` and as which
-        `increments`, as the arguments of `ensemble`.
+        a sum of noises has a tuple of these. `draws` says how the numbers are made.
         """
         return self._drawn(Stream.of(key, draws), steps, 0)
 

@@ -31,7 +31,10 @@ _WEAK = (2.79678067, -6.70456644, 6.73654793)
 
 
 class Draws(NamedTuple):
-    """How random numbers are made: by which `generator`, and as which `increments`."""
+    """How random numbers are made: by which `generator`, and as which `increments`; see the arguments of `ensemble`.
+
+    jm.model.Draws(increments="weak")
+    """
 
     generator: Generator = "hash"
     increments: Increments = "gaussian"

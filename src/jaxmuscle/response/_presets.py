@@ -34,8 +34,8 @@ def load_preset(name_or_path: str | Path) -> AbstractTask:
         unit = "N"          # or "mN", "kN", "kgf", "gf", "lbf"
 
     Then the task is scaled to that force by `at_force`: P_w and F_ext, masses, stiffness and damping are multiplied by one
-    number. The spectrum and the coefficient of variation stay. A fit that starts from the task has its priors in ratio to
-    the new values. A file of `save_preset` and a `fit.json` hold the final numbers and state no mean.
+    number. Proportional power and the coefficient of variation stay. A fit that starts from the task has its priors centred
+    on the new values. A file of `save_preset` and a `fit.json` hold the final numbers and state no mean.
 
     **Raises:** `PresetError` naming the file or the nearest bundled name, and what is wrong: also a unit that is not one of
     these, a mean of zero or of the other sign, and a task whose output is not a force.

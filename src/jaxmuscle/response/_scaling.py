@@ -101,9 +101,9 @@ def at_force(task: AbstractTask, mean: Scalar) -> AbstractTask:
 
         P_w, F_ext, m_j, k_j, c_j ∝ s    (and noise in absolute units),    s = mean / (mean force of the task)
 
-    Every term of (1a) and (1b) is then s times what it was: displacements, times, spectra and the coefficient of variation
-    stay to the last digit, forces are s times as large. So a fit about it has priors in ratio to these values, and a mean
-    force in newtons can be data (`fit(..., mean_force=)`).
+    Every term of (1a) and (1b) is then s times what it was: displacements, times, proportional power and the coefficient of
+    variation stay to the last digit, forces are s times as large. So a fit that starts from this task has its priors
+    centred on these values, and a mean force in newtons can be data (`fit(..., mean_force=)`).
 
     **Arguments:** `mean` [N], of the sign of the task's own mean force.
 

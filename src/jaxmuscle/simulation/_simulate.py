@@ -44,10 +44,13 @@ def simulate(
     substeps: int | None = None,
     sampling: str | None = None,
 ) -> Trajectory:
-    """Simulate one seed: the Stratonovich equation `dy = f(t, y, S) dt + (∂f/∂u) σ ∘ dW`, or with coloured noise in u.
+    """Simulate one seed of the task's equation y' = f(t, y, u), in which noise and harmonic are part of u.
 
         run = jm.simulate(jm.Isometric(k_w=4e5), jax.random.key(0), seed=3)
         run.plot()
+
+    y is the state, u the perturbation (docs/model.md, *Where noise enters*). Coloured noise has a value in u at every
+    instant; white noise of amplitude σ adds `(∂f/∂u) σ ∘ dW`, in the sense of Stratonovich.
 
     Heun's method at fixed steps in diffrax. Differentiable in both modes with respect to the task's parameters, of which
     `output` is a function. `duration`, `dt`, `rate`, `substeps` and `sampling` are static: they decide the shape of the

@@ -197,7 +197,7 @@ class SpectrumSettings(Spelled, eqx.Module):
 
     @classmethod
     def names(cls, *, whole: bool = True) -> tuple[str, ...]:
-        """Names of all settings; without `whole` all but `tapers`, which tables of the first format did not have."""
+        """Names of all settings; without `whole` all but `tapers`, which a table may lack (it is then a single one)."""
         return tuple(field.name for field in dataclasses.fields(cls) if whole or field.name != "tapers")
 
     @classmethod

@@ -56,9 +56,9 @@ class Posterior(Shown, eqx.Module):
     `success` and `message`: whether the chains mixed, or why not; `parts`, a `PosteriorPart` for each target by name;
     `samples` of the free parameters and `derived` quantities in the units of the table of parameters; `diagnostics` {name:
     (R-hat, effective size of the bulk, of the tails)}; `determined`, the names that the data determine; `frequency_modes`
-    {harmonic frequency: ((from, median, to, probability), ...)} [Hz]; `chains`, how it was drawn: of every draw `s`, its
-    place in the sampler's own unbounded coordinates (in units it is in `samples`), `log_density` there, `acceptance`,
-    `steps` and `diverging`; and the `step_size`.
+    {harmonic frequency: ((from, median, to, probability), ...)} [Hz]; `chains`, how the draws were made, with fields for
+    every draw: `s`, its values in the sampler's own unbounded coordinates (`samples` has the same draw in units),
+    `log_density` there, `acceptance`, `steps`, `diverging`; and for all together `step_size`.
 
     A posterior of one target has `target`, `task` and `replicates` of its own.
     """
