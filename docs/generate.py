@@ -57,7 +57,8 @@ motor moved the insertion, `m_w` and `m_z` are free, too.
 
 A default task has no activation, no tremor, no second resonance and no other noise on the drive. For the first three the
 column *default* says with which value they begin when you add them (`jm.on_rung`, `jm.Activation()`, `jm.ResonantNoise()`).
-Noise on the drive you add with a value of your own: `task.replace(noise_P_w=0.02)`. In
+Noise on the drive you add with a value of your own: `task.replace(noise_P_w=0.02)` (0.02 in
+the table is a usual size). In
 `PrescribedMotion` `F_ext` is 10 N by default.
 
 | name | symbol | unit | default | bounds | meaning |

@@ -66,7 +66,8 @@ def compare_noise(
 
     - `task`: whose own noise keeps its values while the others take their defaults
     - `target`: what is fitted, as in `fit`
-    - `noises`: names of `NOISES` and of richer models
+    - `noises`: names of colours ("white", "band-limited", "ornstein-uhlenbeck", "pink") and of richer models ("activation",
+      "tremor", "two resonances"); by default all of them
     - `free`, `fix`, `priors`, `bounds`: as in `fit`, those of a parameter that one model has and another has not for those
       that have it
     - `groups`

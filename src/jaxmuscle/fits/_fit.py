@@ -78,9 +78,11 @@ def fit(
     - `residual`: "log", "linear" or "cumulative"
     - `starts`: from how many points the search starts (100, or 8 for a task without linear response)
     - `seeds`: noise paths of the nonlinear correction (32, or 48 for a task without linear response; 0: no nonlinear
-    correction) - `key`: a `jax.random` key or a seed number - `bounds` {name: (low, high)} - `priors` {name: sd in log, or
-    None for a flat one} - `coefficient_of_variation`: whether the target's, if it states one, is one more residual (it
-    fixes the scale of the
+      correction)
+    - `key`: a `jax.random` key or a seed number
+    - `bounds` {name: (low, high)}
+    - `priors` {name: sd in log, or None for a flat one}
+    - `coefficient_of_variation`: whether the target's, if it states one, is one more residual (it fixes the scale of the
       noise)
     - `mean_force` (value, sd) [N] as a further residual, of a task that you have scaled (`at_force`) and whose P_w you free.
       By default, if the target states its mean in newtons, that mean: then the task is scaled to it, and P_w is free.

@@ -84,7 +84,9 @@ class AbstractMuscle(Spelled, eqx.Module):
 
     @abc.abstractmethod
     def base(self) -> Float[Array, "4"]:
-        """Unperturbed coefficients at zero displacement and velocity, `(K_w0, K_z0, C_w0, C_z0)` [N/m, N s/m]."""
+        """Unperturbed coefficients `(K_w0, K_z0, C_w0, C_z0)` [N/m, N s/m], of which relative amplitudes of noise and
+        harmonic are fractions. Of the paper's muscle they are those at zero displacement and velocity.
+        """
 
     def drive(self, force: Scalar, u: Perturbation) -> Scalar:
         """What becomes of the prescribed P_w [N] under its perturbation, `P_w (1 + u[4])`.

@@ -38,8 +38,8 @@ class Recursion(eqx.Module):
     """One channel of a unit noise from grid point to grid point, exact in distribution: `q ← A q + L z`, z standard normals.
 
     `N = H q` at the grid points, `dN/dt = S q` if it is differentiable, and white noise has the increment `direct z`
-    between them. The states q are scaled to a stationary covariance of 1. What is structurally zero in the tables is None.
-    They apply to scalars and to arrays (of channels, of seeds) alike.
+    between them. The states q are scaled to a stationary covariance of 1. An entry of A, L, H or S that is always zero may
+    be None. The methods take states and normals that are scalars or arrays (of channels, of seeds) alike.
     """
 
     A: tuple[tuple[Scalar | None, ...], ...]

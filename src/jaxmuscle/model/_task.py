@@ -125,7 +125,8 @@ class AbstractTask(Shown, eqx.Module):
         return set_parameters(self, values)
 
     def with_parts(self: Task, **parts: Any) -> Task:
-        """A copy with whole parts exchanged: fields of the task, as `muscle`, `noise`, `harmonic`, `settings`, and inputs.
+        """A copy with whole parts exchanged: fields of the task, as `muscle`, `noise`, `harmonic`, `settings`, and inputs
+        over time, as `P_w`. The tasks of the package take parameters here, too, as `k_w=4e5`.
 
             task = jm.Isometric().with_parts(noise=jm.PinkNoise())
 

@@ -52,10 +52,11 @@ def expected_variation(
 
         jm.response.expected_variation(jm.Isometric(k_w=4e5))
 
-        CV = √E[s²] / |μ|,    E[s²] = r(0) - Var(mean) + ½ |line|²
+        CV = √E[s²] / |μ|,    E[s²] = r(0) - Var(mean) + ½ h²
 
-    r is the autocovariance of the output behind the low-pass of the settings, s² the variance within the window, and μ the
-    output at the operating point. Slow fluctuations count less in a short window, which hardly holds one of their periods.
+    r is the autocovariance of the output behind the low-pass of the settings, s² the variance within the window, μ the
+    output at the operating point, and h the amplitude of the harmonic in the low-passed output. Slow fluctuations count
+    less in a short window, which hardly holds one of their periods.
 
     **Arguments:** as of `expected_spectrum`; the `window` [s] also says how long the recording is (10 s by default).
 

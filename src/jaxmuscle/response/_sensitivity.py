@@ -27,7 +27,8 @@ if TYPE_CHECKING:
 class Sensitivity(Shown, eqx.Module):
     """`d ln p_k / d ln v_j` of proportional power p_k with respect to parameters v_j, shape (parameters, bins).
 
-    Where a parameter is zero, or may be negative and so has no logarithm, it is `d ln p_k / d v_j`: see `relative`.
+    Where a parameter is zero, or may be negative and so has no logarithm, it is `d ln p_k / d v_j`. `relative` says for
+    every parameter which of the two it is: True for the logarithm.
     `power` has the same of absolute power; `frequency` [Hz]; `names`, `values` and `units` of the parameters.
     """
 

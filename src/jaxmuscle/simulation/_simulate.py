@@ -50,7 +50,8 @@ def simulate(
         run.plot()
 
     y is the state, u the perturbation (docs/model.md, *Where noise enters*). Coloured noise has a value in u at every
-    instant; white noise of amplitude σ adds `(∂f/∂u) σ ∘ dW`, in the sense of Stratonovich.
+    instant. White noise adds `(∂f/∂u) σ ∘ dW`, in the sense of Stratonovich: W is a standard Wiener process, and σ the
+    amplitude over √rate.
 
     Heun's method at fixed steps in diffrax. Differentiable in both modes with respect to the task's parameters, of which
     `output` is a function. `duration`, `dt`, `rate`, `substeps` and `sampling` are static: they decide the shape of the
@@ -59,7 +60,7 @@ def simulate(
     **Arguments:**
 
     - `task`: what is simulated, as `jaxmuscle.Isometric()`
-    - `key`: a `jax.random` key or a seed number, from which seed i takes `fold_in(key, i)`
+    - `key`: a `jax.random` key, or a whole number n for `jax.random.key(n)`; seed i draws from `fold_in(key, i)`
     - `seed`: number of the noise path; for several use `ensemble`, or `jax.vmap`
     - `duration` [s]
     - `dt` [s]: the grid on which noise is drawn, which must divide the sampling interval

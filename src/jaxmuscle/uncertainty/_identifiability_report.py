@@ -74,9 +74,10 @@ class Known(eqx.Module):
 class Outlook(Printed, Result, eqx.Module):
     """What is known with the data of a design, or of several, added to the present ones.
 
-    `task` and `data` in words; `separate`, the parameters that have other values there; `singular_values` in prior standard
-    deviations; `determined`, how many directions are (singular value at least 3); `undetermined`, what can be scaled
-    together unnoticed; `products` and ratios of parameters that are determined, with their relative standard errors;
+    `task` and `data` in words; `separate`, the parameters that have other values there; `singular_values`: by how
+    many of their standard errors the data move if the parameters change by a standard deviation of the prior along each
+    direction; `determined`, how many directions are (singular value at least 3); `undetermined`, sentences: what can be
+    scaled together unnoticed; `products` and ratios of parameters that are determined, with their relative standard errors;
     `quantities` by name, each with `value`, `unit`, `stderr` by data and prior, `prior_sd` by the prior alone, and whether
     it is `determined` (at most a tenth of the prior's variance is left); `gained`, those that become determined; `failed`,
     why the design is impossible, or None. An impossible design adds nothing: its numbers are those of the present data.

@@ -74,8 +74,8 @@ def posterior(
 
     **Returns:** a `Posterior`; check `success` or call `summary()`.
 
-    **Raises:** `ValueError` for a target without spread information, a prior outside its bounds or improper, a fit that
-    failed, a task without linear response; `ImportError` without blackjax (extra `posterior`).
+    **Raises:** `ValueError` for a target that states neither segments nor sigma, a prior outside its bounds or improper, a
+    fit that failed, a task without linear response; `ImportError` without blackjax (extra `posterior`).
 
     **Source:** Neal 2011, arXiv:1206.1901 (Hamiltonian Monte Carlo, trajectories of random length); Vehtari et al. 2021,
     doi:10.1214/20-BA1221 (R-hat, effective sample size).

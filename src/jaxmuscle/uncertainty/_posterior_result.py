@@ -58,7 +58,8 @@ class Posterior(Shown, eqx.Module):
     (R-hat, effective size of the bulk, of the tails)}; `determined`, the names that the data determine; `frequency_modes`
     {harmonic frequency: ((from, median, to, probability), ...)} [Hz]; `chains`, how the draws were made, with fields for
     every draw: `s`, its values in the sampler's own unbounded coordinates (`samples` has the same draw in units),
-    `log_density` there, `acceptance`, `steps`, `diverging`; and for all together `step_size`.
+    `log_density` there, `acceptance`, `steps`, `diverging`; and for all together `step_size`; `settings`, how
+    the draws were asked for: free parameters with prior and bounds, chains, draws, warm-up, and the spectrum settings.
 
     A posterior of one target has `target`, `task` and `replicates` of its own.
     """

@@ -128,8 +128,8 @@ def profile(
     - `level` of the interval
     - `free`, `priors`, `bounds`: instead of the fit's
 
-    **Returns:** a `Profile`. **Raises:** `ValueError` for an unknown or fixed name, a target without spread information, a
-    level outside (0, 1), and a failed fit.
+    **Returns:** a `Profile`. **Raises:** `ValueError` for an unknown or fixed name, a target that states neither segments
+    nor sigma, a level outside (0, 1), and a failed fit.
 
     **Source:** Raue et al. 2009, doi:10.1093/bioinformatics/btp358.
     """
