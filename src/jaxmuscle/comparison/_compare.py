@@ -71,7 +71,8 @@ def compare_noise(
     - `free`, `fix`, `priors`, `bounds`: as in `fit`, those of a parameter that one model has and another has not for those
       that have it
     - `groups`
-    - `key`: for an eighth of the starting points
+    - `key`: a `jax.random` key or a number; an eighth of the starting points is drawn with it, the others are always the
+    same
     - `progress`: as in `fit`
 
     **Returns:** a `Comparison`. A model that the task cannot carry is in its `left_out`, with the reason. With a sigma but

@@ -100,7 +100,8 @@ def ensemble(  # pyright: ignore[reportInconsistentOverload]
     - `task`: or a `Sweep`, or tasks that differ in numbers only
     - `key`, `duration` [s], `dt` [s], `rate` [Hz], `substeps`, `sampling`: as in `simulate`
     - `chunk`: how many seeds (points times seeds) run at once
-    - `progress`: True for a bar or a function of (text, share)
+    - `progress`: True for a bar; or a function of (text, share), the share of the work that is done, from 0 to 1; or a
+      `Watch`
 
     `control` carries the linearised task along on the same noise paths, as control variate for the mean spectrum; None
     does so wherever it pays: the run covers the analysed window and the task has a stable equilibrium whose transients

@@ -91,8 +91,8 @@ def merge(path: str | Path) -> "xarray.Dataset":
 
     **Returns:** the opened `xarray.Dataset`. Its attribute `failed` lists (point, seed) of what did not stay finite.
 
-    **Raises:** `StoreError` that names the missing parts and how to run them; for a store without parts; for what is no
-    ensemble's store.
+    **Raises:** `StoreError` that names the missing parts and how to run them; for a store that is not complete and has no
+    parts; for what is no ensemble's store.
     """
     import xarray
 

@@ -32,7 +32,9 @@ def peak_memory() -> int:
 
 
 def measure(task: AbstractTask, seeds: int, duration: float, threads: int | None = None) -> dict[str, Any]:
-    """Compile time [s], speed and memory of a reduced ensemble: the first call, then the median of three.
+    """Compile time, speed and memory of a reduced ensemble, which is run four times.
+
+    The median time of the last three gives the speed. What the first took beyond that is the compile time.
 
     **Arguments:**
 
@@ -41,7 +43,9 @@ def measure(task: AbstractTask, seeds: int, duration: float, threads: int | None
     - `duration` [s]
     - `threads`: how many cores of a CPU (None: all)
 
-    **Returns:** a table of numbers and names.
+    **Returns:** a dictionary: what was run (`task`, `noise`, `precision`, `device`, `threads`, `seeds`, `duration_s`,
+    `substeps`), `compile_s`, `warm_s` (the median), `seeds_per_s`, `million_steps_per_s`, `real_time_factor`,
+    `memory_above_start_mib`, and `device_memory_peak_mib` if the device states it.
     """
     before = peak_memory()
     jax.config.update("jax_compilation_cache_dir", None)

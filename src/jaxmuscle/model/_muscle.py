@@ -76,7 +76,8 @@ class AbstractMuscle(Spelled, eqx.Module):
 
     where P_w stands for `drive(P_w, u)`. Whoever writes the methods and two masses gets simulation, noise, spectra and fits:
     everything stochastic is derived from them by differentiation with respect to `u`. `contraction_velocity` is only asked
-    for by `PrescribedMotion`. A task looks at the methods when it is made: which of them does not return what is asked?
+    for by `PrescribedMotion`. The first task of a class checks the methods: an error names the one that does not return
+    what it must.
     """
 
     m_w: eqx.AbstractVar[Scalar]

@@ -51,7 +51,8 @@ class Harmonic(Spelled, eqx.Module):
 
     **Raises:** `ValueError` for a negative amplitude or a frequency that is not positive.
 
-    **Source:** the paper, S(t) in equation (2); the envelope is what it changes during the simulation of [12].
+    **Source:** the paper, S(t) in equation (2). In its simulation of [12] the amplitude of the harmonic changes in time:
+    that is what the envelope is for.
     """
 
     amplitude: Scalar = default("harmonic_amplitude")

@@ -41,7 +41,7 @@ class Draws(NamedTuple):
 
     @classmethod
     def of(cls, generator: str, increments: str) -> "Draws":
-        """Checked. **Raises:** `ValueError` for an unknown one."""
+        """The same after a check. **Raises:** `ValueError` for an unknown generator or unknown increments."""
         for name, value, known in (("generator", generator, get_args(Generator)), ("increments", increments,
                                                                                   get_args(Increments))):  # fmt: skip
             if value not in known:

@@ -31,10 +31,11 @@ class StaticCharacteristics(eqx.Module):
     """What a muscle's springs and dampers do, one by one and together; made by `static_characteristics`.
 
     **Fields**, all (points,): `displacement` x [m] and `velocity` v [m/s] of one tissue; for tissue j = w, z at them the
-    coefficients `K_j` [N/m] and `C_j` [N s/m] of equation (2), their `K_j_tangent` = dF_j/dx and `C_j_tangent` = dF_j/dv,
-    which small fluctuations see, and the spring force `F_j` [N]; `F_ext` [N], the static force at the insertion held at
-    x_z = `displacement`, at rest (P_w = 0) and `F_ext_active` at the task's P_w, not a number where there is no equilibrium.
-    Numbers: `P_w` [N], `x_w` and `x_z` [m] of the task's operating point. `units` names the unit of every field.
+    coefficients `K_j` [N/m] and `C_j` [N s/m] of equation (2), their tangents `K_j_tangent` = dF_j/dx and `C_j_tangent` =
+    dD_j/dv (D_j: force of the damper), which small fluctuations see, and the spring force `F_j` [N]; `F_ext` [N], the
+    static force at the insertion held at x_z = `displacement`, at rest (P_w = 0) and `F_ext_active` at the task's P_w, not
+    a number where there is no equilibrium. Numbers: `P_w` [N], `x_w` and `x_z` [m] of the task's operating point. `units`
+    names the unit of every field.
     """
 
     displacement: Points

@@ -50,8 +50,8 @@ def simulate(
         run.plot()
 
     y is the state, u the perturbation (docs/model.md, *Where noise enters*). Coloured noise has a value in u at every
-    instant. White noise adds `(∂f/∂u) σ ∘ dW`, in the sense of Stratonovich: W is a standard Wiener process, and σ the
-    amplitude over √rate.
+    instant. White noise adds `(∂f/∂u) σ ∘ dW`, in the sense of Stratonovich: W are standard Wiener processes, and σ is
+    the noise's amplitude, in the unit of its coefficient, over the root of the `rate` of the noise.
 
     Heun's method at fixed steps in diffrax. Differentiable in both modes with respect to the task's parameters, of which
     `output` is a function. `duration`, `dt`, `rate`, `substeps` and `sampling` are static: they decide the shape of the

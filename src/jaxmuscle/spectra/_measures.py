@@ -213,8 +213,8 @@ def peaks(spectrum: Spectrum, *, min_prominence: float = 0.01) -> Peaks:
     **Arguments:** `spectrum` without leading axes; `min_prominence` of local maxima, relative to the
     maximum (by default 1 %: smaller ones are mostly the scatter of the estimate).
 
-    **Returns:** `maximum` and `local_maxima` (by rising frequency), each with `bin`, `frequency` and `interpolated`
-    frequency [Hz], proportional `power` and `prominence`.
+    **Returns:** `maximum` and `local_maxima` (by rising frequency), each with its number `bin` (k of `SpectrumSettings`,
+    not the place in the array), `frequency` and `interpolated` frequency [Hz], proportional `power` and `prominence`.
 
     **Raises:** `ValueError` for leading axes, fewer than 3 bins, and power that is not finite or all zero.
     """
