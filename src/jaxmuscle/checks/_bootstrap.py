@@ -40,9 +40,10 @@ def bootstrap(
 
     For every replicate the nonlinear simulator gives one recording for each trial, as long as its Welch segments ask for,
     analysed as the target's (a target with sigma alone: spectra drawn from the Gaussian law in the log about the fit). It
-    is fitted as `result` was, with its free parameters, priors, bounds and further data, from 32 starts in linear response
-    (no nonlinear correction: where `result.check` shows a nonlinear response, the bias contains it). For each quantity that
-    the fit determines: spread of the refits over the stated standard error, bias, and how many of the refits' own 95 %
+    is fitted as `result` was, with its free parameters, priors and bounds, and with a coefficient of variation, a mean
+    force and a dynamic stiffness made for this replicate where the fit used them, from 32 starts in linear response (no
+    nonlinear correction: where `result.check` shows a nonlinear response, the bias contains it). For each quantity that the
+    fit determines: spread of the refits over the stated standard error, bias, and how many of the refits' own 95 %
     intervals (±1.96 errors) hold the value that was simulated.
 
     **Arguments:**

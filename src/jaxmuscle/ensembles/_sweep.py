@@ -24,8 +24,9 @@ class Sweep(Shown, eqx.Module):
 
     `Sweep.grid(task, k_w=[...], c_w=[...])` is every combination, the last name fastest; `Sweep.design(task, {name:
     values})` one point for each row of equally long columns, such as `posterior.samples`; `Sweep.of(tasks)` any tasks that
-    differ in numbers only, such as the fits of several persons. `len(sweep)`, `sweep[i]` is the task of point i, `labels`
-    {name: values} say what differs.
+    differ in numbers only, such as the fits of several persons. `len(sweep)` is the number of points, `sweep[i]` the task
+    of point i; `labels` {name: values} say what differs; `task` holds the tasks of all points in one, each of its numbers an
+    array with a leading axis of points.
 
     Seed i has the same noise at every point (common random numbers), so differences between points are sharp.
     """
@@ -42,7 +43,7 @@ class Sweep(Shown, eqx.Module):
 
     @staticmethod
     def of(tasks: Sequence[AbstractTask], names: Sequence[str] | None = None) -> "Sweep":
-        """The given tasks, labelled by `names` (their numbers by default) and by the parameters that differ.
+        """The given tasks, labelled by `names`, if you give them, and by the parameters that differ.
 
         **Raises:** `ValueError` for no task, and for tasks that differ in more than numbers.
         """

@@ -38,7 +38,8 @@ class Activation(Spelled, eqx.Module):
     """`H_a(s) = 1 / (1 + s T)²`, impulse response `t/T² exp(-t/T)`: a twitch with the contraction time T.
 
     It stands between the nervous drive and the active tissue: perturbations of K_w, C_w and P_w, noise and harmonic alike,
-    pass it; those of the passive tissue do not. The mean passes unchanged, H_a(0) = 1.
+    pass it; those of the passive tissue do not. Slow perturbations pass undiminished, H_a(0) = 1. The prescribed drive
+    P_w(t) itself does not pass it.
 
     **Arguments:** `time` T [s] > 0. **Raises:** `ValueError` for others.
     """

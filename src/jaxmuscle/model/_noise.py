@@ -119,6 +119,8 @@ class AbstractNoise(Spelled, eqx.Module):
     def draw(self, key: PRNGKeyArray, steps: int, draws: Draws = Draws()) -> Any:  # noqa: B008
         """The standard normal numbers of one seed: a row that begins the noise and a row for each step.
 
+        `key` is the seed's own, that of seed i of a simulation `jax.random.fold_in(key, i)`.
+
         Shape (steps + 1, n), n = `channels` times the `numbers` of `recursion`. White noise has only the rows of the steps;
         a sum of noises has a tuple of these. `draws` says how the numbers are made.
         """

@@ -56,9 +56,9 @@ class DesignedInput(Printed, Result, eqx.Module):
     it that have other lengths [s]; `needed`, the relative error that was asked for and the length [s] of the record that
     reaches it, or None; `notices`, what to know before; `elsewhere`, of each quantity that is hardly known so far: its value
     one standard error below and above, and the error that this motion gives there, both in its unit; `masses` [kg] that the
-    fit does not have free, and which of them are `held`: the others are fitted with the record,
-    their errors are in the rest; `wider`, a frequency [Hz] twice as high as the band's highest, and the errors with a flat
-    motion up to there, or None; `moved`, whether a moved record is known already; `allowed`, the rms [m] that was
+    fit does not have free. Those among them that are `held`, fixed in the fit of a moved record, count as known; the others
+    are fitted with the new record; `wider`, a frequency [Hz] twice as high as the band's highest, and the errors with a
+    flat motion up to there, or None; `moved`, whether a moved record is known already; `allowed`, the rms [m] that was
     asked for, and the largest displacement [m], speed [m/s] and acceleration [m/s²], infinite where there is no limit.
     """
 

@@ -68,14 +68,15 @@ def posterior(
     - `draws` of each (by default 600, and as long as the chains have not mixed up to 3000)
     - `warmup` steps before them
     - `free`: names
-    - `priors` {name: sd, or (centre, sd)}
+    - `priors` {name: sd, or (centre, sd)}; None as sd: a flat prior, which needs bounds
     - `bounds` {name: (low, high)}
     - `progress`: True or a function of (text, share)
 
     **Returns:** a `Posterior`; check `success` or call `summary()`.
 
-    **Raises:** `ValueError` for a target that states neither segments nor sigma, a prior outside its bounds or improper, a
-    fit that failed, a task without linear response; `ImportError` without blackjax (extra `posterior`).
+    **Raises:** `ValueError` for a target that states neither segments nor sigma, a prior centred outside its bounds, a flat
+    one without bounds, a fit that failed, a task without linear response; `ImportError` without blackjax (extra
+    `posterior`).
 
     **Source:** Neal 2011, arXiv:1206.1901 (Hamiltonian Monte Carlo, trajectories of random length); Vehtari et al. 2021,
     doi:10.1214/20-BA1221 (R-hat, effective sample size).
