@@ -183,10 +183,11 @@ class Recording(Shown, eqx.Module):
     def steady(self, window: Sequence[float | int] | None = None) -> "Recording":
         """The recording with its steady part as window: the one that is given, or the plateau of a ramp-and-hold.
 
-        The plateau is the longest stretch in which the running median over 1 s stays within a tenth of its level,
-        which is the median of what lies more than half-way between rest and extreme. It has to hold at least half of
-        the time spent beyond half-way; one second is taken off at the ramps. Without a ramp (running median within
-        a fifth of its largest value) all of it is steady. So is an acceleration, which holds no level.
+        The plateau is the longest stretch in which the running median over 1 s differs from the level by at most a tenth of
+        the height from rest to level. Rest is that extreme of the running median which is nearer to zero, the peak is the
+        other one, and the level is the median of what lies more than half-way from rest to peak. The plateau has to hold at
+        least half of the time spent beyond half-way; one second is taken off at the ramps. Without a ramp (running median
+        within a fifth of its largest value) all of it is steady. So is an acceleration, which holds no level.
 
         **Arguments:** `window` (start, stop) [s], in the recording's own time.
 

@@ -180,9 +180,9 @@ def steadiness(recordings: Recording | Iterable[Recording]) -> Steadiness:
 
     - Three or more, "trials": the standard deviation between the trials over √n; of the peak, the jackknife over trials. A
       fit takes the larger of this scatter and of what trials of this length scatter by chance: five may happen to agree.
-    - One or two, "spectrum": the ordinates of the spectrum are independent, with variance 2/3 of their square, as in a
-      stationary Gaussian signal; of the mean, from the four slowest. What is slower than the recording is not in it: where
-      the level wanders, the mean of the next trial differs by more.
+    - One or two, "spectrum": the ordinates of the spectrum are taken as independent, the variance of each as 2/3 of its
+      square, as in a stationary Gaussian signal; of the mean, from the four slowest. What is slower than the recording is
+      not in it: where the level wanders, the mean of the next trial differs by more.
     - One or two, "parts" (entropies, DFA exponent): the standard deviation of the values of the four quarters over 2;
       "segments" (peak): the jackknife over Welch segments.
 

@@ -137,7 +137,10 @@ class Target(Shown, eqx.Module):
 
     @property
     def degrees_of_freedom(self) -> float | None:
-        """Equivalent degrees of freedom ν of each bin, the sum over the trials; `None` without `segments`."""
+        """Equivalent degrees of freedom ν of a bin, the sum over the trials; `None` without `segments`.
+
+        Bin 1 has fewer (docs/fitting.md, *What is minimised*), which is not counted here.
+        """
         if self.segments is None:
             return None
         return float(sum(self.settings.degrees_of_freedom(K) for K in self.segments))
@@ -152,9 +155,9 @@ class Target(Shown, eqx.Module):
         """Mean force and its standard error [N]; `None` without a mean in newtons.
 
         The error: that of the trials' scatter or that of a recording of this length, whichever is larger. If it is the
-        former, with Student's t, so that ± 1.96 of it hold 95 % (of three trials or more). The latter follows from the
-        density S₁ in the lowest bin: `√(S₁ / 2T)`, T the time recorded, but at least 0.2 % of the mean. If the target lacks
-        segments or coefficient of variation, it is taken as 2 % of the mean.
+        former, with Student's t, so that ± 1.96 of it hold 95 % (of three trials or more). The latter is
+        `√(S₁ / 2T)`, S₁ the density in the lowest bin and T the time of all trials together, but at least 0.2 % of the
+        mean; or 2 % of the mean, if the target lacks segments or coefficient of variation.
         """
         if self.mean is None or self.unit not in NEWTONS or self.quantity != "force":
             return None

@@ -107,7 +107,7 @@ class Trials(Shown, Sequence[Recording]):
         return notices_of(self.recordings, [r.filtered(chosen) for r in self], chosen.rate, [()] * len(self), quantity)
 
     def plot(self, settings: SpectrumSettings | str | None = None, ax: Any = None) -> Any:
-        """Draw the windows and the spectra of all recordings, that of one as `Recording.plot`; returns the figure."""
+        """Draw the windows and the spectra of the recordings; a single one as by `Recording.plot`. Returns the figure."""
         return plot.trials(self, settings, ax)
 
     def _card(self) -> Card:

@@ -24,13 +24,13 @@ from ._signals import Harmonic as Harmonic
 from ._signals import RampHold as RampHold
 from ._signals import Sampled as Sampled
 from ._signals import SmoothStep as SmoothStep
+from ._stream import Draws as Draws
 from ._tasks import TASKS as TASKS
 from ._tasks import AbstractTask as AbstractTask
 from ._tasks import Isometric as Isometric
 from ._tasks import PrescribedForce as PrescribedForce
 from ._tasks import PrescribedLength as PrescribedLength
 from ._tasks import PrescribedMotion as PrescribedMotion
-from ._stream import Draws as Draws
 from ._white_noise import BandLimitedNoise as BandLimitedNoise
 from ._white_noise import OrnsteinUhlenbeckNoise as OrnsteinUhlenbeckNoise
 from ._white_noise import WhiteNoise as WhiteNoise

@@ -39,6 +39,8 @@ def lines_in(band: tuple[float, float], seconds: float) -> Float[np.ndarray, " l
 class Lengthening(Printed, Result, eqx.Module):
     """A periodic lengthening of the muscle: `x(t) = Σ_k √(2 p_k) cos(2π f_k t + φ_k)`, recorded for one period.
 
+    The phases φ_k may be any: what the record tells does not depend on them.
+
     **Arguments:**
 
     - `frequency` f_k [Hz] (lines,), multiples of 1 / `seconds`

@@ -56,10 +56,11 @@ class Posterior(Shown, eqx.Module):
     `success` and `message`: whether the chains mixed, or why not; `parts`, a `PosteriorPart` for each target by name;
     `samples` of the free parameters and `derived` quantities in the units of the table of parameters; `diagnostics` {name:
     (R-hat, effective size of the bulk, of the tails)}; `determined`, the names that the data determine; `frequency_modes`
-    {harmonic frequency: ((from, median, to, probability), ...)} [Hz]; `chains`, how the draws were made, with fields for
-    every draw: `s`, its values in the sampler's own unbounded coordinates (`samples` has the same draw in units),
-    `log_density` there, `acceptance`, `steps`, `diverging`; and for all together `step_size`; `settings`, how
-    the draws were asked for: free parameters with prior and bounds, chains, draws, warm-up, and the spectrum settings.
+    {harmonic frequency: ((from, median, to, probability), ...)}, of each mode its lowest draw, median and highest draw
+    [Hz], and its share of the draws; `chains`, how the draws were made, with fields for every draw: `s`, its values in the
+    sampler's own unbounded coordinates (`samples` has the same draw in units), `log_density` there, `acceptance`, `steps`,
+    `diverging`; and for all together `step_size`; `settings`, how the draws were asked for: free parameters with prior and
+    bounds, chains, draws, warm-up, and the spectrum settings.
 
     A posterior of one target has `target`, `task` and `replicates` of its own.
     """
@@ -88,7 +89,10 @@ class Posterior(Shown, eqx.Module):
 
     @property
     def modes(self) -> Modes:
-        """Modes of the harmonic's frequency: (from, median, to, probability). Of the first where several are free."""
+        """Modes of the harmonic's frequency:
+
+        (lowest draw, median, highest draw, probability). Of the first where several are free.
+        """
         return next(iter(self.frequency_modes.values()), ())
 
     @property
