@@ -47,8 +47,8 @@ def compare_noise(
 
         print(jm.compare_noise(jm.task_for(target), target))
 
-    So are the richer models that a fit may climb to (`on_rung`), with the task's own noise: "activation", "tremor" instead
-    of the harmonic, "two resonances".
+    The richer models that a fit may climb to (`on_rung`) are compared, too, with the task's own noise: "activation",
+    "tremor" instead of the harmonic, "two resonances".
 
     Each model is climbed, in linear response, to the highest of the maxima of its posterior from 64 starting points (16
     without harmonic). For a model with a resonance ("tremor", "two resonances") half of the searches begin where that of a

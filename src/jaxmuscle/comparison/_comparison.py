@@ -211,7 +211,7 @@ class Comparison(Printed, Result, eqx.Module):
 
     @property
     def harmonic(self) -> Decision | None:
-        """Of the noises that were fitted both ways the best with a harmonic against the best without; None if there is none."""
+        """Of noises that were fitted both ways the best with a harmonic against the best without; None if there is none."""
         both = {row.noise for row in self.rows if row.harmonic}
         sides = [[row for row in self.rows if row.harmonic == present and row.noise in both] for present in (True, False)]
         if not all(sides):

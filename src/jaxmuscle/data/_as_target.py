@@ -34,9 +34,10 @@ def as_target(
         target = jm.data.as_target("vastus-lateralis-26mvc")
 
     `given`: a `Target` is taken as it is. A `Recording`, `Trials` or several recordings of one condition give theirs
-    (`Trials.target`), in the windows that they have. The path of a recording, or several of trials, is read, and the steady
-    part of each found (`Recording.steady`). The path of a frequency response is read by `load_frequency_response`. Another
-    path, or the name of a bundled target, is read as a spectrum.
+    (`Trials.target`), in the windows that they have; a `PerturbedRecording` gives its own, and a `FrequencyResponse` one
+    without a spectrum. The path of a recording, or several of trials, is read, and the steady part of each found
+    (`Recording.steady`). The path of a frequency response is read by `load_frequency_response`. Another path, or the name
+    of a bundled target, is read as a spectrum.
 
     **Arguments:** `quantity`, `segments`, `dataset`, `axis`, how a spectrum is read, as in `load_target`; `segments`,
     `lever_arm`, how a frequency response is read, as in `load_frequency_response`.

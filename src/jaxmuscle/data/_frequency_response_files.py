@@ -51,7 +51,7 @@ def load_frequency_response(
 
     **Arguments:**
 
-    - `path`: a CSV file
+    - `path`: the file
     - `segments`: the number of independent averages, one or one for each frequency, needed without `stderr`
     - `lever_arm` [m]: which turns torque over angle into force over displacement
     - `name`: by default that of the file

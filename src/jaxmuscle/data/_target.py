@@ -36,7 +36,8 @@ class Target(Shown, eqx.Module):
     **Arguments:**
 
     - `name`: how reports call it.
-    - `proportional_power`: p_k > 0, shape `(bins,)`; divided by its sum. At `frequency` [Hz] afterwards.
+    - `proportional_power`: p_k > 0, shape `(bins,)`; it is divided by its sum. The target's attribute `frequency` has the
+      frequency [Hz] of each.
     - `bins`: bin numbers on the grid of `settings`, increasing; all selected bins by default.
     - `quantity`: what was recorded; torque is fitted as force, since p has no scale.
     - `provenance`, `source`: how and from where the numbers were obtained.

@@ -289,11 +289,13 @@ def log_likelihood(task: AbstractTask, data: Target | Recording) -> Scalar:
     dynamic stiffness, Gaussian in real and imaginary part with the errors that it states, if it has one. A `Recording`: the
     Whittle likelihood of the periodogram of its window, in its own units, between the first and last bin of the task's
     settings, about the *expected* periodogram of a window of that length (leakage and aliases included: debiased Whittle,
-    Sykulski et al. 2019, doi:10.1093/biomet/asy071). With a line L_k in noise N_k,
+    Sykulski et al. 2019, doi:10.1093/biomet/asy071). With the periodogram I_k and its
+    expectation E_k = N_k + L_k, N_k from the noise and L_k from the line,
 
         Σ_k [ln I0(2 √(I_k L_k) / N_k) - (I_k + L_k) / N_k - ln N_k],
 
-    the noncentral chi-squared law with two degrees of freedom; without, `-Σ (ln E_k + I_k / E_k)`.
+    the noncentral chi-squared law with two degrees of freedom (I0 is the modified Bessel function); without a line
+    `-Σ (ln E_k + I_k / E_k)`.
 
     **Raises:** `ValueError` for a target without segments, a harmonic beyond half the sampling rate, and a
     recording whose window is constant, too short, or sampled too slowly for the bins.

@@ -43,7 +43,7 @@ class Design(eqx.Module):
     - `name`: a noun phrase, "a second force level 2 times as high": reports make sentences of it.
     - `task`: what is measured, at the values expected; the fitted task itself by default.
     - `segments`: Welch segments of its spectrum, of one trial or of several; as many as the target's by default; 0 for
-      no new recording, only the numbers that follow.
+      no new spectrum: only what `coefficient_of_variation`, `mean` and `lengthening` say is measured.
     - `settings`: how its spectrum is estimated; as the target's by default.
     - `coefficient_of_variation`: whether that of its output is measured.
     - `mean`: relative standard error with which the mean output is measured, 0.02 say; None if it is not.

@@ -111,10 +111,10 @@ def standard_designs(result: FitResult, target: Target | None = None) -> tuple[D
 
     The coefficient of variation and the mean (to 2 %) of the same recording, if the fit does not have them; of an
     `Isometric` fit the displacement under the load that the sensor had held (`PrescribedForce` at the same operating point,
-    perturbations included), of a `PrescribedForce` fit the force of `Isometric`; 60 s in which a motor moves the insertion,
-    by 0.1 mm rms to 10 Hz and by 1 mm rms to 5 Hz, both from 0.5 Hz on (`Lengthening`); twice and half the force (none above
-    100 % MVC where the target states its level), where noise and harmonic have other, unknown amplitudes and the muscle is
-    as before; a recording ten times as long. None knows fatigue.
+    with the same noise and harmonic), of a `PrescribedForce` fit the force of `Isometric`; 60 s in which a motor moves the
+    insertion, by 0.1 mm rms to 10 Hz and by 1 mm rms to 5 Hz, both from 0.5 Hz on (`Lengthening`); twice and half the force
+    (none above 100 % MVC where the target states its level), where noise and harmonic have other, unknown amplitudes and
+    the muscle is as before; a recording ten times as long. None knows fatigue.
     """
     with fitting():
         problem, theta = fitted_problem(result, target)
