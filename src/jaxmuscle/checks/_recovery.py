@@ -113,8 +113,8 @@ class Bootstrap(Printed, Result, eqx.Module):
 
     `quantities` {name: `Recovery`}, those that the fit determines: of each the value `true` simulated from, the standard
     error `stated` by the fit, the `values` that refits found and the errors `stderrs` that these state; `replicates` asked
-    for; `failed` {replicate: why it was not simulated or fitted}; `source`, how the data were made; `tasks`, made from;
-    `target`, name of what was fitted; `seed`; `versions`.
+    for; `failed` {replicate: why it was not simulated or fitted}; `source`, how the data were made; `tasks` {target: the
+    fitted task from which its data were made}; `target`, name of what was fitted; `seed`; `versions`.
     """
 
     target: str

@@ -49,17 +49,17 @@ class DesignedInput(Printed, Result, eqx.Module):
     """A periodic motion of the insertion, made by `design_input`, and what one record of it is expected to tell.
 
     `quantity`, the names of what it was made for; `lengthening`, its lines; `even`, those of a flat motion: of even density
-    in the band and as large as the same limits allow; `displacement` [m] at `time` [s], one period at
-    `rate` [Hz], positive where the muscle gets longer (the motor pulls away from it: x_z = -displacement); `values` and
-    `units` of every free parameter and derived quantity, and their standard errors in these units: `prior`, without any
-    data; `now`, without the record; `flat`, with the flat motion; `stderr`, with this one; `by_seconds`, with records of
-    it that have other lengths [s]; `needed`, the relative error that was asked for and the length [s] of the record that
-    reaches it, or None; `notices`, what to know before; `elsewhere`, of each quantity that is hardly known so far: its value
-    one standard error below and above, and the error that this motion gives there, both in its unit; `masses` [kg] that the
-    fit does not have free. Those among them that are `held`, fixed in the fit of a moved record, count as known; the others
-    are fitted with the new record; `wider`, a frequency [Hz] twice as high as the band's highest, and the errors with a
-    flat motion up to there, or None; `moved`, whether a moved record is known already; `allowed`, the rms [m] that was
-    asked for, and the largest displacement [m], speed [m/s] and acceleration [m/s²], infinite where there is no limit.
+    in the band and as large as the same limits allow; `displacement` [m] at `time` [s], one period at `rate` [Hz], positive
+    where the muscle gets longer (the motor pulls away from it: x_z = -displacement); `values` and `units` of every free
+    parameter and derived quantity, and their standard errors in these units: `prior`, without any data; `now`, without the
+    record; `flat`, with the flat motion; `stderr`, with this one; `by_seconds`, with records of it that have other lengths
+    [s]; `needed`, the relative error that was asked for and the length [s] of the record that reaches it, or None;
+    `notices`, what to know before; `elsewhere`, of each quantity that is hardly known so far: its value one standard error
+    below and above, and the error that this motion gives there, both in its unit; `masses` [kg] that the given fit does not
+    have free. Those among them that are `held` count as known: that fit has a moved record already, and had them fixed. All
+    others are fitted with the new record; `wider`, a frequency [Hz] twice as high as the band's highest, and the errors
+    with a flat motion up to there, or None; `moved`, whether a moved record is known already; `allowed`, the rms [m] that
+    was asked for, and the largest displacement [m], speed [m/s] and acceleration [m/s²], infinite where there is no limit.
     """
 
     quantity: tuple[str, ...] = eqx.field(static=True)
