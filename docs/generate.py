@@ -52,8 +52,9 @@ factor of 1.6 either way.)
 ## Values
 
 *Bounds* say which values are physically possible. (For a mass, a cut-off, a correlation time and the frequency of the
-harmonic 0 itself is refused.) A name with a dot (●) is free in a default fit: the fit looks for its value. Where a
-motor moved the insertion, `m_w` and `m_z` are free, too.
+harmonic 0 itself is refused.) A name with a dot (●) is free in a default fit: the fit looks for its value. If
+the task has them, `noise_correlation_time`, `activation_time` and all `resonance_` and `resonance_2_` are free, too. So are
+`m_w` and `m_z` where a motor moved the insertion.
 
 A default task has no activation, no tremor, no second resonance and no other noise on the drive. For the first three the
 column *default* says with which value they begin when you add them (`jm.on_rung`, `jm.Activation()`, `jm.ResonantNoise()`).

@@ -103,15 +103,14 @@ class FittedPart(eqx.Module):
     """What a fit found of one target.
 
     Its fitted `task`; `chi2_per_bin` about `fitted` (None without knowledge of the spread) and `rms_log_error`, the
-    standard deviation over the bins of ln(target / fitted); on the
-    target's bins the `fitted` proportional power (of fresh seeds where they were simulated), `harmonic_share` of each bin's
-    power; `residual`, target against fit [standard deviations]; `deviation`, the standard deviation of each log power (None
-    where it is unknown); `components`, what share of each bin's power the
-    parts of the model have in linear response: the `relaxation` of the active tissue under its noise, the `floor` from
-    noise on the passive one, the `harmonic`, the `tremor`, `resonance_2`; `stretch`, time and output of a few simulated
-    seconds; `check`, how far linear response and nonlinear simulation differ; `further`, residuals of the coefficient of
-    variation and of the mean, as far as they are data [standard deviations, model above data]; `stiffness`, the fitted
-    dynamic stiffness [N/m] at the frequencies of the target's.
+    standard deviation over the bins of ln(target / fitted); on the target's bins the `fitted` proportional power (of fresh
+    seeds where they were simulated), `harmonic_share` of each bin's power; `residual`, target against fit [standard
+    deviations]; `deviation`, the standard deviation of each log power (None where it is unknown); `components`, what share
+    of each bin's power the parts of the model have in linear response: the `relaxation` of the active tissue under its
+    noise, the `floor` from noise on the passive one, the `harmonic`, the `tremor`, `resonance_2`; `stretch`, time and
+    output of a few simulated seconds; `check`, how far linear response and nonlinear simulation differ; `further`,
+    residuals of the coefficient of variation and of the mean, as far as they are data [standard deviations], positive where
+    the model is above the data; `stiffness`, the fitted dynamic stiffness [N/m] at the frequencies of the target's.
     """
 
     target: Target

@@ -43,19 +43,17 @@ PROFILE = ("frequency_hz", "chi2_rise")
 class FitResult(Result, eqx.Module):
     """What a fit found, of one target or of several.
 
-    `success` and `message`, whether the search converged; `adequacy`, whether the model describes the data (an
-    `Adequacy`, None where the scatter of the data is unknown or there is no fit); `parts`, a `FittedPart` for each
-    target by name; `method`; `parameters` and `derived` (`Estimate`s in natural units; with several targets, what
-    belongs to one is called "name@target", what is the same number for all by its own name), their errors widened by
-    `adequacy.widening`; `products` and ratios of parameters that the data determine; `correlation` of the free
-    parameters; `undetermined`, sentences naming what can be scaled together without the data noticing;
+    `success` and `message`, whether the search converged; `adequacy`, whether the model describes the data (an `Adequacy`,
+    None where the scatter of the data is unknown or there is no fit); `parts`, a `FittedPart` for each target by name;
+    `method`; `parameters` and `derived` (`Estimate`s; with several targets, what belongs to one is called "name@target",
+    what is the same number for all by its own name), their errors multiplied by `adequacy.widening`, √(chi² / expected),
+    where the model does not describe the data; `products` and ratios of parameters that the data determine; `correlation`
+    of the free parameters; `undetermined`, sentences naming what can be scaled together without the data noticing;
     `ladder`, the models that were tried (`Rung`s; empty where one was asked for, in a cohort the one that all got);
-    `singular_values` of the Jacobian (residuals in standard deviations, parameters in the prior's); the table of
-    `starts`; `profile`, harmonic frequencies [Hz] and the rise of chi² there, all else fitted anew; `harmonic_p_value`,
-    how often spectra without harmonic would show one as strong (both None with several targets); `notices`; `seed`;
-    `settings`; `versions`.
-
-    A fit of one target has what its part has as its own: `task`, `target`, `chi2_per_bin`, `fitted` and so on.
+    `singular_values` of the Jacobian (residuals in standard deviations, parameters in the prior's); the table of `starts`;
+    `profile`, harmonic frequencies [Hz] and the rise of chi² there, all else fitted anew; `harmonic_p_value`, how often
+    spectra without harmonic would show one as strong (both None with several targets); `notices`; `seed`; `settings`;
+    `versions`.  A fit of one target has what its part has as its own: `task`, `target`, `chi2_per_bin`, `fitted` and so on.
     """
 
     success: bool
