@@ -25,7 +25,8 @@ class Difference(eqx.Module):
     part of that spread), or "fits", the standard errors of the fits, where a group has one member only.
 
     In a study also: `kind`, "groups" (at `where`, a condition), "conditions" (`b` minus `a` within people) or "interaction"
-    (the difference between conditions, `where`, in group `b` minus that in group `a`); `p_corrected` for all comparisons of
+    (the change between two conditions in group `b` minus that in group `a`; with `where` "tired - rest" the change is the
+    value in tired minus that in rest); `p_corrected` for all comparisons of
     that kind; `left_out`, people whose fits do not determine the quantity.
     """
 

@@ -53,7 +53,9 @@ class FitResult(Result, eqx.Module):
     `singular_values` of the Jacobian (residuals in standard deviations, parameters in the prior's); the table of `starts`;
     `profile`, harmonic frequencies [Hz] and the rise of chi² there, all else fitted anew; `harmonic_p_value`, how often
     spectra without harmonic would show one as strong (both None with several targets); `notices`; `seed`; `settings`;
-    `versions`.  A fit of one target has what its part has as its own: `task`, `target`, `chi2_per_bin`, `fitted` and so on.
+    `versions`. An `Adequacy`, a `Rung` and a `Start` have as attributes what docs/reference/files.md lists for `adequacy`,
+    `ladder` and `starts`. A fit of one target has what its part has as its own: `task`, `target`, `chi2_per_bin`, `fitted`
+    and so on.
     """
 
     success: bool
