@@ -54,7 +54,8 @@ factor of 1.6 either way.)
 *Bounds* say which values are physically possible. (For a mass, a cut-off, a correlation time and the frequency of the
 harmonic 0 itself is refused.) A name with a dot (●) is free in a default fit: the fit looks for its value. If
 the task has them, `noise_correlation_time`, `activation_time` and all `resonance_` and `resonance_2_` are free, too. So are
-`m_w` and `m_z` where a motor moved the insertion.
+`m_w` and `m_z` where a motor moved the insertion. (If a target has no spectrum, only `k_w`, `k_z`, `c_w`, `c_z`, `m_w`
+and `m_z` are free.)
 
 A default task has no activation, no tremor, no second resonance and no other noise on the drive. For the first three the
 column *default* says with which value they begin when you add them (`jm.on_rung`, `jm.Activation()`, `jm.ResonantNoise()`).
@@ -121,7 +122,8 @@ the task and of its parts. `type` is the class of a part. What a task does not h
 from which a simulation begins; in its spectrum settings `filter_cutoff`, the low-pass) is written as `"none"`. Format 1
 has no key `format`, and may leave out what a task does not have."""
 TARGET = """TOML, format 1. `Target.save` writes it and `load_target` reads it. The `target_table` of a fit.json has
-the same keys without `format`, and `null` for what is not stated."""
+the same keys without `format`, none of which may be missing: `null` stands for what is not stated. *If missing* is for the
+.toml."""
 STUDY = """A study is a table of recordings with options ([a study](../study.md)). `run_study` reads it. You can write it in
 two ways:
 

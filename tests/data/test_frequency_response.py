@@ -150,6 +150,14 @@ def test_a_target_with_a_stiffness_is_saved_and_read_back_equal(spectrum, tmp_pa
     assert (found.name, found.segments, found.settings) == (target.name, target.segments, target.settings)
 
 
+def test_a_mean_without_a_spectrum_is_known_to_two_percent():
+    """Its density at low frequencies is not known: the error is that of a target without segments."""
+    measured = jm.FrequencyResponse(F, GAIN, 5.0 * np.ones(4))
+    stated = {"mean": 20.0, "unit": "N", "stiffness": measured}
+    with_all = jm.Target("anna", None, segments=12, coefficient_of_variation=0.02, **stated)
+    assert with_all.mean_force == jm.Target("anna", None, **stated).mean_force == pytest.approx((20.0, 0.4))
+
+
 def test_a_target_without_spectrum_needs_a_stiffness(tmp_path):
     table = {"name": "a", "quantity": "force", "provenance": "user", "source": "b", "frequency_hz": [],
              "proportional_power": []}  # fmt: skip

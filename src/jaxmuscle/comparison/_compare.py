@@ -51,8 +51,9 @@ def compare_noise(
     "tremor" instead of the harmonic, "two resonances".
 
     Each model is climbed, in linear response, to the highest of the maxima of its posterior from 64 starting points (16
-    without harmonic). For a model with a resonance ("tremor", "two resonances") half of the searches begin where that of a
-    simpler model of the task's own noise ended, of several the one with the lowest AIC. There
+    without harmonic). For a model with a resonance ("tremor", "two resonances") a third of the searches begin, in the
+    parameters that both have, where that of a simpler model of the task's own noise ended, of several the one with the
+    lowest AIC. There
 
         AIC = -2 ln L + 2 p,    p = tr(F (F + Λ)⁻¹),
 
@@ -71,8 +72,8 @@ def compare_noise(
     - `free`, `fix`, `priors`, `bounds`: as in `fit`, those of a parameter that one model has and another has not for those
       that have it
     - `groups`
-    - `key`: a `jax.random` key or a number; an eighth of the starting points is drawn with it, the others are always the
-    same
+    - `key`: a `jax.random` key or a number; 8 of the starting points of each model are drawn with it, the others are always
+      the same
     - `progress`: as in `fit`
 
     **Returns:** a `Comparison`. A model that the task cannot carry is in its `left_out`, with the reason. With a sigma but

@@ -26,6 +26,7 @@ TABLES = "the table of a study (.csv, .tsv, .txt or .toml)"
 LABELS = (*NEEDED, "group", "condition", "trial")
 FILES, SPECTRA = (*Reading._fields, "skip_rows"), ("spectrum", "mvc")  # of `load_recording`, of `Trials.target`
 EDGES = ("window_start", "window_stop")
+STEADY = "`window` of the study.toml, else its steady part; an error beside the other edge"
 NUMBERS = ("rate", "max_gap", "lever_arm", "skip_rows", "mvc", *EDGES)
 COLUMNS = (*LABELS, *FILES, *SPECTRA, *EDGES)
 READING = (*FILES, *SPECTRA, "window")
@@ -45,7 +46,7 @@ class ReadingTable(Table, kw_only=True):
              missing="the only one besides the time, or the only force or torque by its name or unit; else an error"),
     ] = None  # fmt: skip
     rate: Annotated[Above0 | None, told("Sampling rate [Hz]", missing="as the file says; an error if it does not")] = None
-    units: Annotated[str | None, told("Unit of the column", missing="as the file says, else N")] = None
+    units: Annotated[str | None, told("Unit of the column", missing="as the file says, else N; of a point an error")] = None
     axis: Annotated[
         str | None,
         told("Of a point: x, y, z, or principal, along which it moves most", missing="the column is not a point"),
@@ -53,9 +54,10 @@ class ReadingTable(Table, kw_only=True):
     reference: Annotated[
         str | int | None, told("Column or point that is subtracted from it", missing="nothing is subtracted")
     ] = None
-    time: Annotated[str | int | None, told("Column of the time", missing="found by its name or unit, if there is one")] = (
-        None
-    )
+    time: Annotated[
+        str | int | None,
+        told("Column of the time", missing="found by its name or unit; or a first column that rises evenly"),
+    ] = None
     max_gap: Annotated[Annotated[float, Meta(ge=0)] | None, told("Longest gap that is closed [s]", missing="0.2")] = None
     lever_arm: Annotated[
         Above0 | None,
@@ -67,7 +69,8 @@ class ReadingTable(Table, kw_only=True):
         told("standard, slow (resolves what is below 1 Hz), multitaper or pwelch; the same for all", missing="standard"),
     ] = None
     mvc: Annotated[
-        Above0 | None, told("Maximal voluntary contraction, in the recording's unit", missing="level in % MVC unknown")
+        Above0 | None,
+        told("Maximal voluntary contraction, in the recording's unit", missing="level unknown, if the unit is not % MVC"),
     ] = None
 
 
@@ -88,10 +91,8 @@ class RecordingTable(ReadingTable, kw_only=True):
         str | int | None,
         told("Which of several trials in a condition", missing="no name; a person may have several trials without one"),
     ] = None
-    window_start: Annotated[
-        float | None, told("Where the part to analyse begins [s]", missing="its steady part is looked for")
-    ] = None
-    window_stop: Annotated[float | None, told("Where it ends [s]", missing="its steady part is looked for")] = None
+    window_start: Annotated[float | None, told("Where the part to analyse begins [s]", missing=STEADY)] = None
+    window_stop: Annotated[float | None, told("Where it ends [s]", missing=STEADY)] = None
 
 
 class StudyFile(ReadingTable, kw_only=True):

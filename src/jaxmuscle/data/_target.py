@@ -158,13 +158,13 @@ class Target(Shown, eqx.Module):
         The error: that of the trials' scatter or that of a recording of this length, whichever is larger. If it is the
         former, with Student's t, so that ± 1.96 of it hold 95 % (of three trials or more). The latter is
         `√(S₁ / 2T)`, S₁ the density in the lowest bin and T the time of all trials together, but at least 0.2 % of the
-        mean; or 2 % of the mean, if the target lacks segments or coefficient of variation.
+        mean; or 2 % of the mean, if the target lacks a spectrum, segments or coefficient of variation.
         """
         if self.mean is None or self.unit not in NEWTONS or self.quantity != "force":
             return None
         means = NEWTONS[self.unit] * np.asarray(self.mean)
         relative = MEAN_ERROR
-        if self.segments is not None and self.coefficient_of_variation is not None:
+        if self.segments is not None and self.coefficient_of_variation is not None and self.bins.size:
             density = (
                 np.mean(np.square(self.coefficient_of_variation)) * self.proportional_power[0] / self.settings.resolution
             )

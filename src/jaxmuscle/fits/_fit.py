@@ -72,7 +72,8 @@ def fit(
       `jaxmuscle.data.two_channels`)
     - `free`: names to fit. By default those marked ● in the table of parameters (docs/reference/parameters.md), and, if
       the task has them, the correlation time of its noise, the contraction time, and amplitude, frequency and width of its
-      tremor and of its second resonance; where a motor moves the insertion m_w and m_z, too
+      tremor and of its second resonance; where a motor moves the insertion m_w and m_z, too. Of a target without
+      a spectrum only k_w, k_z, c_w, c_z, m_w and m_z
     - `fix`: values to set, which are then not free
     - `noise`: a name or an object
     - `residual`: "log", "linear" or "cumulative"
@@ -98,7 +99,8 @@ def fit(
       solvers, `optimistix.Dogleg(1e-9, 1e-9)` say (for others there is `problem`)
     - `increments`: "weak" for the faster random numbers of `ensemble` in all that is simulated here, of which only means
       over the seeds are taken
-    - `answer`: a function that gets the result as soon as the search ends, before simulated check, profile and p-value
+    - `answer`: a function that gets the result as soon as the search ends: with the verdict, before the simulated
+      check, and before profile and p-value of the harmonic
 
     **Returns:** a `FitResult`; a fit that fails is one, too, and says why.
 

@@ -73,14 +73,14 @@ class StartTable(Table, kw_only=True):
 
 
 class CorrelationTable(Table, kw_only=True):
-    """Correlations of the free parameters: `correlation`; empty if no spectrum could be fitted (`message` says why)."""
+    """Correlations of the free parameters: `correlation`; empty if the fit has no result (`message` says why)."""
 
-    parameters: Annotated[list[str], told("Names of the parameters", missing="no spectrum could be fitted")] = msgspec.field(
+    parameters: Annotated[list[str], told("Names of the parameters", missing="the fit has no result")] = msgspec.field(
         default_factory=list
     )
-    matrix: Annotated[
-        list[list[float]], told("Correlations, a row for each parameter", missing="no spectrum could be fitted")
-    ] = msgspec.field(default_factory=list)
+    matrix: Annotated[list[list[float]], told("Correlations, a row for each parameter", missing="the fit has no result")] = (
+        msgspec.field(default_factory=list)
+    )
 
 
 class ProfileTable(Table, kw_only=True):

@@ -35,9 +35,11 @@ Theta = Float[Array | np.ndarray, " free"]
 class Problem(Shown):
     """A fit as functions of numbers without bounds: give them to any optimiser or sampler. Made by `problem`.
 
-    `names` are the free parameters, `start` is θ at the task's own values, an array with a number for each name. A parameter
-    with two finite bounds is `v = low + (high - low) sigmoid(θ)` (in the log, if it is positive); another
-    `ln v = ln v0 + sd θ`, or `v = v0 + sd θ` where it may be negative: v0 the task's value, sd the prior's.
+    `names` are the free parameters, `start` is θ at the task's own values, an array with a number for each name. A
+    parameter with bounds is `v = low + (high - low) sigmoid(θ)`; of a positive one these are logarithms, and a low of 0
+    counts as none. If it has only one bound, the other is set 20 prior standard deviations from the task's value. A
+    parameter without bounds is `ln v = ln v0 + sd θ`, or `v = v0 + sd θ` where it may be negative: v0 the task's value, sd
+    the prior's (1 if flat).
 
     All methods are functions of θ that JAX compiles and differentiates, also twice: `jax.hessian(problem.log_density)`.
     Turn on double precision first (`jax.config.update("jax_enable_x64", True)`): in single precision a search ends early.
@@ -110,7 +112,9 @@ class Problem(Shown):
         return self.likelihood.marginal(self._moments(self._scaled(theta)))
 
     def log_prior(self, theta: Theta) -> Scalar:
-        """Log density of the prior as one of θ, up to a constant. Flat, and then improper, where the prior is None."""
+        """Log density of the prior as one of θ, up to a constant. Where a prior is None it is flat in the parameter
+        (of a positive one in its logarithm), and improper unless that has bounds.
+        """
         scaled, theta, c = self._scaled(theta), jnp.asarray(theta), self.objective.coordinates
         bounded = np.isfinite(c.low)
         width = np.log(np.where(bounded, c.high - c.low, 1.0))

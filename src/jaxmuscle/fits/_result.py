@@ -47,15 +47,15 @@ class FitResult(Result, eqx.Module):
     None where the scatter of the data is unknown or there is no fit); `parts`, a `FittedPart` for each target by name;
     `method`; `parameters` and `derived` (`Estimate`s; with several targets, what belongs to one is called "name@target",
     what is the same number for all by its own name), their errors multiplied by `adequacy.widening`, √(chi² / expected),
-    where the model does not describe the data; `products` and ratios of parameters that the data determine; `correlation`
-    of the free parameters; `undetermined`, sentences naming what can be scaled together without the data noticing;
-    `ladder`, the models that were tried (`Rung`s; empty where one was asked for, in a cohort the one that all got);
-    `singular_values` of the Jacobian (residuals in standard deviations, parameters in the prior's); the table of `starts`;
-    `profile`, harmonic frequencies [Hz] and the rise of chi² there, all else fitted anew; `harmonic_p_value`, how often
-    spectra without harmonic would show one as strong (both None with several targets); `notices`; `seed`; `settings`;
-    `versions`. An `Adequacy`, a `Rung` and a `Start` have as attributes what docs/reference/files.md lists for `adequacy`,
-    `ladder` and `starts`. A fit of one target has what its part has as its own: `task`, `target`, `chi2_per_bin`, `fitted`
-    and so on.
+    where the model does not describe the data (but not that of a measured mean or coefficient of variation which the fit
+    meets); `products` and ratios of parameters that the data determine; `correlation` of the free parameters;
+    `undetermined`, sentences naming what can be scaled together without the data noticing; `ladder`, the models that were
+    tried (`Rung`s; empty where one was asked for, in a cohort the one that all got); `singular_values` of the Jacobian
+    (residuals in standard deviations, parameters in the prior's); the table of `starts`; `profile`, harmonic frequencies
+    [Hz] and the rise of chi² there, all else fitted anew; `harmonic_p_value`, how often spectra without harmonic would show
+    one as strong (both None with several targets); `notices`; `seed`; `settings`; `versions`. An `Adequacy`, a `Rung` and a
+    `Start` have as attributes what docs/reference/files.md lists for `adequacy`, `ladder` and `starts`. A fit of one target
+    has what its part has as its own: `task`, `target`, `chi2_per_bin`, `fitted` and so on.
     """
 
     success: bool

@@ -269,8 +269,8 @@ def run_study(study: "str | os.PathLike[str] | Iterable[Mapping[str, Any]]", *, 
     - `rung`: the model of all people (`on_rung`), 0 to 3; by default 2, with activation and tremor. "auto" fits several and
       takes the one whose AIC, summed over all targets, is lowest; that is three or four times as long.
     - `noise`: as in `fit`; `starts` of each fit; `key` of its random numbers.
-    - `quantities`: what is reported and compared; by default the derived quantities but
-      `high_frequency_floor`. The fewer, the less the correction
+    - `quantities`: what is reported and compared. By default the derived quantities but `high_frequency_floor` are
+      compared, and all quantities reported. The fewer, the less the correction
       costs.
     - `alpha`: level of the tests, by default 0.05. Intervals hold 1 - alpha.
     - `correction` for many comparisons: "holm" (default), "fdr" or "none". All comparisons of one kind (groups, conditions,

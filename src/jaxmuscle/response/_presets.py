@@ -60,7 +60,11 @@ class PresetFile(Table, kw_only=True):
     description: Annotated[str, told("What the task is", missing="not described")] = ""
     mean: Annotated[
         Any,
-        told("Mean force to which the task is scaled when it is loaded", missing="not scaled", kind="number, not 0"),
+        told(
+            "Mean force to which the task is scaled when it is loaded",
+            missing="not scaled; an error beside `unit`",
+            kind="number, not 0",
+        ),
     ] = None
     unit: Annotated[
         Any, told("Unit of `mean`: N, mN, kN, kgf, gf or lbf", missing="not scaled; an error beside `mean`", kind="text")

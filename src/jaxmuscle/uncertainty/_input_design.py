@@ -76,7 +76,7 @@ def design_input(
     - `result` of a fit, or a task, whose usual free parameters are then free with their prior
     - `quantity`: a free parameter or a derived quantity such as K_w0, K_z0, C_w0, C_z0, K_w_tangent, or several. In a fit of
       several targets write "K_w_tangent@NAME" for that of one. Without "@NAME" it is that of `target`, if you give one;
-      otherwise that of the target that has a dynamic stiffness
+      otherwise that of the first target that has a dynamic stiffness, or of the first of all if none has
     - `rms` [m], `peak` [m], `speed` [m/s], `acceleration` [m/s²]: at most; where the motion would pass `peak`, `speed` or
       `acceleration` it gets smaller or slower
     - `band` [Hz]: from 0.5 Hz on, as drift and slow movements of the person are not in the model
