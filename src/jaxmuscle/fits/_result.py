@@ -290,7 +290,7 @@ def load_result(path: str | Path) -> FitResult:
         result.save("fit.json")
         result = jm.load_result("fit.json")
 
-    Nothing gets a default: a key that is missing, unknown, of a wrong type, or that contradicts another is an error.
+    A key is an error if it is unknown, of a wrong type, contradicts another, or is missing against docs/reference/files.md.
     """
     if not isinstance(path, str | os.PathLike):
         raise ResultError(f"path {path!r}: give the path of a fit.json")

@@ -191,7 +191,10 @@ class AbstractTask(Shown, eqx.Module):
         return jnp.zeros(size) if self.initial is None else jnp.stack([jnp.asarray(v) * 1.0 for v in self.initial])
 
     def noise_scale(self, noise: AbstractNoise | None = None) -> Float[Array, " inputs"]:
-        """Amplitude of the noise, or of one of its components, in the units of the inputs that it acts on."""
+        """Amplitudes of the noise, or of `noise`, one of its components: for each entry of u that it acts on, in its unit.
+
+        Relative amplitudes are multiplied by K_w0, K_z0, C_w0 and C_z0; that of the drive stays a fraction.
+        """
         noise = self.noise if noise is None else noise
         amplitude = jnp.asarray(noise.amplitude)
         if not noise.relative or len(noise.acts_on) == 1:

@@ -9,7 +9,9 @@ from ._style import PALETTE, axes_or_new, legend, output_label, styled
 
 @styled
 def moments(summary: Any, ax: Axes | None = None, point: int = 0) -> Axes:
-    """Draws the mean of a reduced ensemble over time, and the bands between its outer quantiles.
+    """Draws the mean of a reduced ensemble over time, with a band from its lowest to its highest quantile.
+
+    Further quantiles make further bands within it.
 
     **Arguments:**
 

@@ -33,7 +33,8 @@ def frequency_response(response: Any, ax: Axes | None = None) -> Figure | SubFig
 def perturbed(recording: Any, settings: Any = None, ax: Axes | None = None) -> Figure | SubFigure:
     """Draws a recording of force and displacement: both with the window, four seconds of it larger, and the response.
 
-    The response has its spring, damper and mass (`PerturbedRecording.second_order`) as a line.
+    The response has its spring, damper and mass (`PerturbedRecording.second_order`) as a line. `settings`:
+    `SpectrumSettings` or a name, as of `Recording.spectrum`.
     """
     heights = (1.2, 1.3, 1.5, 1.1, 1.2)
     fig = canvas(ax, (COLUMN, sum(heights)))

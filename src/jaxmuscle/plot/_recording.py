@@ -28,7 +28,10 @@ MOST = 8  # traces of trials that are drawn
 
 @styled
 def recording(recording: Any, settings: Any = None, ax: Axes | None = None) -> Figure | SubFigure:
-    """Draws a recording: the trace with its window, the window larger, and its spectra (Welch, FFT), linear, logarithmic."""
+    """Draws a recording: the trace with its window, the window larger, and its spectra (Welch, FFT), linear, logarithmic.
+
+    `settings`: `SpectrumSettings` or a name, as of `Recording.spectrum`.
+    """
     heights = (1.2, 1.4, 1.9)
     fig = canvas(ax, (COLUMN, sum(heights)))
     grid = fig.add_gridspec(3, 2, height_ratios=heights)
@@ -49,7 +52,7 @@ def trials(trials: Any, settings: Any = None, ax: Axes | None = None) -> Figure 
     """Draws several recordings below each other, each with its window, and their spectra with the mean.
 
     On the left each whole recording with the window shaded, on the right the window larger, low-passed. Below these the
-    spectra, linear and logarithmic.
+    spectra, linear and logarithmic. `settings`: `SpectrumSettings` or a name, as of `Recording.spectrum`.
     """
     if len(trials) == 1:
         return recording(trials[0], settings, ax)

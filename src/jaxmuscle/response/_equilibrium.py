@@ -22,7 +22,7 @@ def equilibrium(task: AbstractTask, time: Scalar | float = HOLD) -> Float[Array,
 
         state = jm.response.equilibrium(jm.Isometric())
 
-    Not finite where there is none. Functions that need one (`at_force`, `at_level`) raise an `OperatingPointError` there.
+    Not finite where there is none. Functions that need one (`at_force`, `at_level`) end with an `OperatingPointError` there.
     """
     if all(is_concrete(leaf) for leaf in jax.tree.leaves((task, time))):
         return _kept_equilibrium(mechanics(task), np.asarray(time, jnp.result_type(float)))

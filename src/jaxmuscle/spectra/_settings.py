@@ -139,7 +139,7 @@ class SpectrumSettings(Spelled, eqx.Module):
 
     @property
     def name(self) -> str | None:
-        """The name of the spectrum, whatever the low-pass and the sampling; `None` if it is nobody's but yours."""
+        """Which of the names of `named` these settings have, without regard to low-pass and sampling; `None` if none."""
         plain = self.replace(**{field: getattr(SpectrumSettings(), field) for field in _AROUND})
         return next((name for name in NAMED if plain == SpectrumSettings.named(name)), None)
 
