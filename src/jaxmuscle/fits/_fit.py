@@ -81,7 +81,7 @@ def fit(
     - `seeds`: noise paths of the nonlinear correction (32, or 48 for a task without linear response; 0: no nonlinear
       correction)
     - `key`: a `jax.random` key or a seed number
-    - `bounds` {name: (low, high)}
+    - `bounds` {name: (low, high)} in the unit of the parameter; infinite where there is none
     - `priors` {name: sd in log, or None for a flat one}
     - `coefficient_of_variation`: whether the target's, if it states one, is one more residual (it fixes the scale of the
       noise)

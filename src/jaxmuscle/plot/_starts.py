@@ -13,10 +13,11 @@ from ._style import BLUE, COLUMN, GREY, axes_or_new, ink, legend, log_axis, styl
 
 @styled
 def starts(result: Any, ax: Axes | None = None) -> Axes:
-    """Draws where the starts of a fit ended, the best first (a waterfall): a step is a solution found again.
+    """Draws where the starts of a fit ended, the best first (a waterfall plot).
 
-    The ordinate is the rise of chi² above the best start's, linear below 1 and logarithmic above. A grey cross did not
-    settle. Starts without a finite cost are left out.
+    A level stretch is one solution that several starts found. The ordinate is the rise of chi² above the best start's,
+    linear below 1 and logarithmic above. A grey cross is a start that did not settle: its last step still lowered the cost
+    by a thousandth of it or more. Starts without a finite cost are left out.
 
     **Arguments:** `result`, what `jaxmuscle.fit` returns; `ax`. **Returns:** the axes (`ax` or new).
     """
