@@ -142,7 +142,7 @@ class FitResult(Result, eqx.Module):
 
     @property
     def closeness(self) -> str:
-        """Chi² of the verdict, `adequacy.chi2`, divided by `data`, as "chi2 per bin 0.73"; empty if that cannot be judged."""
+        """Chi² of the verdict, `adequacy.chi2`, divided by `data`, as "chi2 per bin 0.73"; empty if it cannot be judged."""
         if self.adequacy is None:
             return ""
         each = "bin" if all(part.stiffness is None for part in self.parts.values()) else "datum"
