@@ -179,7 +179,9 @@ def test_posterior_as_files_and_figures(tmp_path):
 
 
 def of_few_draws():
-    return jm.posterior(well_known()[1], key=5, draws=100, warmup=50)
+    return jm.posterior(
+        well_known()[1], key=5, draws=100, warmup=50, bounds={"c_w": (1.0, 1e4), "noise_K_z": (1e-5, np.inf)}
+    )
 
 
 @functools.cache
@@ -190,6 +192,12 @@ def short():
 @pytest.mark.slow
 def test_the_same_key_gives_the_same_draws():
     np.testing.assert_array_equal(of_few_draws().samples["c_w"], short().samples["c_w"])
+
+
+@pytest.mark.slow
+def test_the_bounds_that_held_are_kept():
+    assert short().settings["bounds"] == {"c_w": [1.0, 1e4], "noise_K_z": [1e-5, None]}
+    assert drawn().settings["bounds"] == well_known()[1].settings["bounds"]
 
 
 @pytest.mark.slow

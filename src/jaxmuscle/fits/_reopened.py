@@ -18,6 +18,13 @@ from ._joint import planned_jointly
 from ._result import FitResult
 
 
+def bounds_of(
+    result: FitResult, names: Iterable[str], bounds: Mapping[str, tuple[float, float]] | None
+) -> dict[str, tuple[float, float]]:
+    """The bounds that hold for the free parameters `names`: those of the fit, before them the given ones."""
+    return {n: _open(*b) for n, b in result.settings["bounds"].items() if n in names} | proper_values(bounds)
+
+
 def reopened(
     result: FitResult,
     target: Target | None = None,
@@ -38,7 +45,7 @@ def reopened(
         raise ValueError(f"target: this fit has several ({', '.join(result.parts)}), so none of them can be exchanged")
     settings = result.settings
     names = proper_names(settings["free"] if free is None else free) or ()
-    priors, bounds = proper_values(priors), proper_values(bounds)
+    priors = proper_values(priors)
     fitted = settings["prior_centre"]
     centres = {n: fitted[n] if n in fitted else _default(result, n) for n in names}
     sds = {
@@ -48,7 +55,7 @@ def reopened(
         if name not in names:
             raise ValueError(f"priors: {name} is not free; free are {', '.join(names)}")
         centres[name], sds[name] = given if isinstance(given, tuple) else (centres[name], given)
-    limits = {n: _open(*b) for n, b in settings["bounds"].items() if n in names} | bounds
+    limits = bounds_of(result, names, bounds)
     for name, (low, high) in limits.items():
         if name in centres and not low < centres[name] < high:
             raise ValueError(f"the prior of {name} is centred at {centres[name]:g}, outside its bounds ({low:g}, {high:g}): "

@@ -14,7 +14,7 @@ from jaxmuscle._common.programs import kept
 from jaxmuscle._common.progress import told
 from jaxmuscle._common.types import Key
 from jaxmuscle.data._target import Target
-from jaxmuscle.fits._reopened import reopened
+from jaxmuscle.fits._reopened import bounds_of, reopened
 from jaxmuscle.fits._result import FitResult
 from jaxmuscle.objective._arguments import settings_of
 from jaxmuscle.objective._consequences import Tables, frequency_of
@@ -87,11 +87,12 @@ def posterior(
             raise ValueError(f"{name} = {count} must be at least {least}")
     with told(progress, f"posterior of {result.title}") as tell, fitting():
         problem = reopened(result, target, free=free, priors=priors, bounds=bounds, key=key)
+        limits = bounds_of(result, problem.coordinates.names, bounds)
         likelihood = Likelihood.of(problem)
         tell("searching the most probable parameters", 0.0)
         density, _, _ = density_about(problem, likelihood, problem.theta_of(tuple(result.tasks.values())))
         attempts = (
-            _reported(problem, whitened, found, result, key, warmup)
+            _reported(problem, whitened, found, result, key, warmup, limits)
             for found, whitened in sample(density, fold_in(problem.key, 5), chains, lengths, warmup, tell)
         )
         drawn = next(attempts)
@@ -101,8 +102,9 @@ def posterior(
 
 
 def _reported(
-    problem: FitProblem, density: PosteriorDensity, found: Chains, result: FitResult, key: Key, warmup: int
-) -> Posterior:
+    problem: FitProblem, density: PosteriorDensity, found: Chains, result: FitResult, key: Key, warmup: int,
+    limits: dict[str, tuple[float, float]],
+) -> Posterior:  # fmt: skip
     shape, names = found.log_density.shape, problem.coordinates.names
     theta, s = _thetas(problem, density, found)
     found = found._replace(s=s)
@@ -115,7 +117,7 @@ def _reported(
     determined = tuple(name for name in (*samples, *known) if name in result.determined)
     diagnostics = {name: diagnosed(x) for name, x in (samples | known).items()}
     success, message = verdict(found, diagnostics, determined)
-    settings = settings_of(problem, {}) | {
+    settings = settings_of(problem, limits) | {
         "chains": shape[0], "draws": shape[1], "warmup": warmup, "step_size": found.step_size,
         "frequencies": max(1, sum(len(np.unique(band.frequency)) for band in density.bands)),
         "spectrum": {part.target.name: part.target.settings.to_dict() for part in problem.parts},

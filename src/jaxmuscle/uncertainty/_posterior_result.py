@@ -59,8 +59,8 @@ class Posterior(Shown, eqx.Module):
     {harmonic frequency: ((from, median, to, probability), ...)}, of each mode its lowest draw, median and highest draw
     [Hz], and its share of the draws; `chains`, how the draws were made, with fields for every draw: `s`, its values in the
     sampler's own unbounded coordinates (`samples` has the same draw in units), `log_density` there, `acceptance`, `steps`,
-    `diverging`; and for all together `step_size`; `settings`, how the draws were asked for: free parameters and their
-    prior, chains, draws, warm-up, and the spectrum settings.
+    `diverging`; and for all together `step_size`; `settings`, how the draws were asked for: free parameters with prior and
+    bounds, chains, draws, warm-up, and the spectrum settings.
 
     A posterior of one target has `target`, `task` and `replicates` of its own.
     """
