@@ -59,8 +59,8 @@ and `m_z` are free.)
 
 A default task has no activation, no tremor, no second resonance and no other noise on the drive. For the first three the
 column *default* says with which value they begin when you add them (`jm.on_rung`, `jm.Activation()`, `jm.ResonantNoise()`).
-Noise on the drive you add with a value of your own: `task.replace(noise_P_w=0.02)` (0.02 in
-the table is a usual size). In
+Noise on the drive you add with a value of your own: `task.replace(noise_P_w=0.02)` (0.02 in the
+table is a usual size). In
 `PrescribedMotion` `F_ext` is 10 N by default.
 
 | name | symbol | unit | default | bounds | meaning |
@@ -122,7 +122,7 @@ the task and of its parts. `type` is the class of a part. What a task does not h
 from which a simulation begins; in its spectrum settings `filter_cutoff`, the low-pass) is written as `"none"`. Format 1
 has no key `format`, and may leave out what a task does not have."""
 TARGET = """TOML, format 1. `Target.save` writes it and `load_target` reads it. The `target_table` of a fit.json has
-the same keys without `format`, none of which may be missing: `null` stands for what is not stated. *If missing* is for the
+the same keys without `format`, and `null` for what is not stated; only format 2 may lack keys. *If missing* is for the
 .toml."""
 STUDY = """A study is a table of recordings with options ([a study](../study.md)). `run_study` reads it. You can write it in
 two ways:

@@ -26,7 +26,7 @@ class Table(msgspec.Struct, forbid_unknown_fields=True):
     """The schema of a table in a file: a field for each key, its type annotated with what it means."""
 
 
-def told(meaning: str, *, missing: str | None = None, kind: str | None = None) -> Meta:
+def says(meaning: str, *, missing: str | None = None, kind: str | None = None) -> Meta:
     """What a key of a table means; what its absence says, of one that may be `missing`; its type where code checks that."""
     return Meta(description=meaning, extra={"missing": missing, "kind": kind})
 

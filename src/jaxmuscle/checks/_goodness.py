@@ -164,8 +164,8 @@ class Goodness(Printed, Result, eqx.Module):
     """Whether a fit is as good as the scatter of its data allows.
 
     `parts`, a `GoodnessPart` for each target by name; `p_value`, that of the smallest p-value of all checks of all targets;
-    `lost`, replicates whose refit was not finite; `seed`, `versions`. A
-    `Goodness` of one target has what its part has: `residual`, `observed`, `p_values` and so on.
+    `lost`, replicates whose refit was not finite; `seed`, `versions`. A `Goodness` of one
+    target has what its part has: `residual`, `observed`, `p_values` and so on.
     """
 
     parts: dict[str, GoodnessPart]

@@ -142,10 +142,7 @@ class ComparedModel(eqx.Module):
 
     @property
     def evidence(self) -> "Evidence":
-        """What decides between models:
-
-        the AIC, the score of every bin (None if there is none), whether the search converged.
-        """
+        """What decides between models: AIC, the score of every bin (or None), whether the search converged."""
         return Evidence(self.aic, self.scores, self.success)
 
     @property

@@ -12,7 +12,7 @@ from jaxtyping import Complex, Float
 
 from jaxmuscle import plot
 from jaxmuscle._common.cards import Printed
-from jaxmuscle._common.documents import Table, checked, told
+from jaxmuscle._common.documents import Table, checked, says
 from jaxmuscle._common.files import write_text
 from jaxmuscle._common.text import folded, probability
 from jaxmuscle.spectra._settings import require
@@ -28,17 +28,17 @@ COLUMNS = ("frequency_hz", "gain_N/m", "phase_deg", "stderr_N/m", "coherence")
 class ResponseTable(Table, kw_only=True):
     """A dynamic stiffness as a table: `stiffness` of a target."""
 
-    name: Annotated[str, told("How reports call it")]
-    source: Annotated[str, told("Where it comes from")]
-    notices: Annotated[list[str], told("What was done to it")]
-    frequency_hz: Annotated[Numbers, told("Frequencies [Hz], rising, above 0")]
-    real: Annotated[Numbers, told("Real part [N/m]")]
-    imaginary: Annotated[Numbers, told("Imaginary part [N/m]")]
+    name: Annotated[str, says("How reports call it")]
+    source: Annotated[str, says("Where it comes from")]
+    notices: Annotated[list[str], says("What was done to it")]
+    frequency_hz: Annotated[Numbers, says("Frequencies [Hz], rising, above 0")]
+    real: Annotated[Numbers, says("Real part [N/m]")]
+    imaginary: Annotated[Numbers, says("Imaginary part [N/m]")]
     stderr: Annotated[
         list[float | Literal["inf"]],
-        told('Standard error of both [N/m]; "inf" (a text) where a fit is to leave the frequency out'),
+        says('Standard error of both [N/m]; "inf" (a text) where a fit is to leave the frequency out'),
     ]
-    coherence: Annotated[Numbers | None, told("Squared coherence, 0 to 1", missing="unknown")] = None
+    coherence: Annotated[Numbers | None, says("Squared coherence, 0 to 1", missing="unknown")] = None
 
 
 class FrequencyResponse(Printed, eqx.Module):

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal, NamedTuple
 from msgspec import Meta
 
 from jaxmuscle._common.arguments import is_real
-from jaxmuscle._common.documents import Table, checked, parsed, told
+from jaxmuscle._common.documents import Table, checked, parsed, says
 from jaxmuscle._common.files import expanded
 from jaxmuscle._common.inputs import looked_at, read_text
 from jaxmuscle._common.text import choices
@@ -41,36 +41,36 @@ class ReadingTable(Table, kw_only=True):
 
     column: Annotated[
         str | int | None,
-        told("Column of the force: its name, or its number from 0. Or NAME of a [point](../recordings.md#what-is-read), "
+        says("Column of the force: its name, or its number from 0. Or NAME of a [point](../recordings.md#what-is-read), "
              "if its coordinates are the columns NAME_x, NAME_y, NAME_z",
              missing="the only one besides the time, or the only force or torque by its name or unit; else an error"),
     ] = None  # fmt: skip
-    rate: Annotated[Above0 | None, told("Sampling rate [Hz]", missing="as the file says; an error if it does not")] = None
-    units: Annotated[str | None, told("Unit of the column", missing="as the file says, else N; of a point an error")] = None
+    rate: Annotated[Above0 | None, says("Sampling rate [Hz]", missing="as the file says; an error if it does not")] = None
+    units: Annotated[str | None, says("Unit of the column", missing="as the file says, else N; of a point an error")] = None
     axis: Annotated[
         str | None,
-        told("Of a point: x, y, z, or principal, along which it moves most", missing="the column is not a point"),
+        says("Of a point: x, y, z, or principal, along which it moves most", missing="the column is not a point"),
     ] = None
     reference: Annotated[
-        str | int | None, told("Column or point that is subtracted from it", missing="nothing is subtracted")
+        str | int | None, says("Column or point that is subtracted from it", missing="nothing is subtracted")
     ] = None
     time: Annotated[
         str | int | None,
-        told("Column of the time", missing="found by its name or unit; or a first column that rises evenly"),
+        says("Column of the time", missing="found by its name or unit; or a first column that rises evenly"),
     ] = None
-    max_gap: Annotated[Annotated[float, Meta(ge=0)] | None, told("Longest gap that is closed [s]", missing="0.2")] = None
+    max_gap: Annotated[Annotated[float, Meta(ge=0)] | None, says("Longest gap that is closed [s]", missing="0.2")] = None
     lever_arm: Annotated[
         Above0 | None,
-        told("From the axis to where the force acts [m]: turns a torque into N", missing="a torque stays a torque"),
+        says("From the axis to where the force acts [m]: turns a torque into N", missing="a torque stays a torque"),
     ] = None
-    skip_rows: Annotated[Annotated[int, Meta(ge=0)] | None, told("Lines to leave out at the top", missing="0")] = None
+    skip_rows: Annotated[Annotated[int, Meta(ge=0)] | None, says("Lines to leave out at the top", missing="0")] = None
     spectrum: Annotated[
         str | None,
-        told("standard, slow (resolves what is below 1 Hz), multitaper or pwelch; the same for all", missing="standard"),
+        says("standard, slow (resolves what is below 1 Hz), multitaper or pwelch; the same for all", missing="standard"),
     ] = None
     mvc: Annotated[
         Above0 | None,
-        told("Maximal voluntary contraction, in the recording's unit", missing="level unknown, if the unit is not % MVC"),
+        says("Maximal voluntary contraction, in the recording's unit", missing="level unknown, if the unit is not % MVC"),
     ] = None
 
 
@@ -78,44 +78,44 @@ class RecordingTable(ReadingTable, kw_only=True):
     """Which recording: a row of a study.csv, or an entry of `[[recordings]]`."""
 
     file: Annotated[
-        str, told("Path, from the folder of the study.csv, or of the study.toml where the recordings stand in it")
+        str, says("Path, from the folder of the study.csv, or of the study.toml where the recordings stand in it")
     ]
-    person: Annotated[str | int, told("Name of the person")]
+    person: Annotated[str | int, says("Name of the person")]
     group: Annotated[
-        str | int | None, told("Group of the person; all recordings have one, or none", missing="no groups")
+        str | int | None, says("Group of the person; all recordings have one, or none", missing="no groups")
     ] = None
     condition: Annotated[
-        str | int | None, told("Condition of the recording; all have one, or none", missing="no conditions")
+        str | int | None, says("Condition of the recording; all have one, or none", missing="no conditions")
     ] = None
     trial: Annotated[
         str | int | None,
-        told("Which of several trials in a condition", missing="no name; a person may have several trials without one"),
+        says("Which of several trials in a condition", missing="no name; a person may have several trials without one"),
     ] = None
-    window_start: Annotated[float | None, told("Where the part to analyse begins [s]", missing=STEADY)] = None
-    window_stop: Annotated[float | None, told("Where it ends [s]", missing=STEADY)] = None
+    window_start: Annotated[float | None, says("Where the part to analyse begins [s]", missing=STEADY)] = None
+    window_stop: Annotated[float | None, says("Where it ends [s]", missing=STEADY)] = None
 
 
 class StudyFile(ReadingTable, kw_only=True):
     """What else a study.toml may say."""
 
     table: Annotated[
-        str | None, told("Path of a study.csv, from the folder of the study.toml", missing="needs `recordings`")
+        str | None, says("Path of a study.csv, from the folder of the study.toml", missing="needs `recordings`")
     ] = None
-    recordings: Annotated[list[RecordingTable] | None, told("The recordings themselves", missing="needs a `table`")] = None
+    recordings: Annotated[list[RecordingTable] | None, says("The recordings themselves", missing="needs a `table`")] = None
     window: Annotated[
         tuple[float, float] | Literal["all"] | None,
-        told("Part to analyse: begin and end [s]; or 'all' in place of both", missing="the steady parts are looked for"),
+        says("Part to analyse: begin and end [s]; or 'all' in place of both", missing="the steady parts are looked for"),
     ] = None
-    rung: Annotated[int | str | None, told("Model of all people: 0 to 3, or auto", missing="2")] = None
+    rung: Annotated[int | str | None, says("Model of all people: 0 to 3, or auto", missing="2")] = None
     noise: Annotated[
         str | None,
-        told("Colour of the noise: white, band-limited, ornstein-uhlenbeck or pink", missing="band-limited"),
+        says("Colour of the noise: white, band-limited, ornstein-uhlenbeck or pink", missing="band-limited"),
     ] = None
     quantities: Annotated[
-        list[str] | None, told("Quantities that are compared", missing="all derived quantities but `high_frequency_floor`")
+        list[str] | None, says("Quantities that are compared", missing="all derived quantities but `high_frequency_floor`")
     ] = None
-    alpha: Annotated[float | None, told("Level of the tests, between 0 and 1", missing="0.05")] = None
-    correction: Annotated[str | None, told("Correction for many comparisons: holm, fdr or none", missing="holm")] = None
+    alpha: Annotated[float | None, says("Level of the tests, between 0 and 1", missing="0.05")] = None
+    correction: Annotated[str | None, says("Correction for many comparisons: holm, fdr or none", missing="holm")] = None
 
 
 class Row(NamedTuple):

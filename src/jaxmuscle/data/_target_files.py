@@ -10,7 +10,7 @@ import msgspec
 import numpy as np
 
 from jaxmuscle._common.bundled import bundled_text, list_targets
-from jaxmuscle._common.documents import Table, checked, parsed, told
+from jaxmuscle._common.documents import Table, checked, parsed, says
 from jaxmuscle._common.errors import TargetError
 from jaxmuscle._common.files import text_of
 from jaxmuscle._common.inputs import read_bytes
@@ -155,57 +155,57 @@ def _parse_toml(text: str, file: str, axis: str) -> Raw:
 class TargetFile(Table, kw_only=True):
     """A target: in a .toml, and as `target_table` in a fit.json."""
 
-    format: Annotated[Any, told("Version of the format", missing="1", kind="1")] = 1
-    name: Annotated[Any, told("How reports call it", kind="text")]
-    quantity: Annotated[Any, told("What was recorded", kind=QUANTITIES)]
-    provenance: Annotated[Any, told("From where the numbers are", kind=PROVENANCES)]
-    source: Annotated[Any, told("Article, figure, recording", kind="text")]
+    format: Annotated[Any, says("Version of the format", missing="1", kind="1")] = 1
+    name: Annotated[Any, says("How reports call it", kind="text")]
+    quantity: Annotated[Any, says("What was recorded", kind=QUANTITIES)]
+    provenance: Annotated[Any, says("From where the numbers are", kind=PROVENANCES)]
+    source: Annotated[Any, says("Article, figure, recording", kind="text")]
     frequency_hz: Annotated[
         Any,
-        told(
+        says(
             "Frequencies [Hz], rising; empty if there is a stiffness, but no spectrum",
             kind="list of numbers, each at least 0",
         ),
     ]
     proportional_power: Annotated[
-        Any, told("Power at each frequency, of any scale; empty if there is no spectrum", kind=f"list of {POSITIVES}")
+        Any, says("Power at each frequency, of any scale; empty if there is no spectrum", kind=f"list of {POSITIVES}")
     ]
     sigma: Annotated[
         Any,
-        told("Standard error of each averaged power, in the unit of the power", missing="errors follow from `segments`",
+        says("Standard error of each averaged power, in the unit of the power", missing="errors follow from `segments`",
              kind=f"list of {POSITIVES}"),
     ] = None  # fmt: skip
     segments: Annotated[
         Any,
-        told("Welch segments that were averaged, of each trial; one number means one recording",
+        says("Welch segments that were averaged, of each trial; one number means one recording",
              missing="errors follow from `sigma`; without it they are unknown, and so is chi²",
              kind="whole number from 1, or a list of them"),
     ] = None  # fmt: skip
     coefficient_of_variation: Annotated[
         Any,
-        told("Standard deviation over mean, of each trial", missing="unknown",
+        says("Standard deviation over mean, of each trial", missing="unknown",
              kind="number above 0, at most 1, or a list of them"),
     ] = None  # fmt: skip
     mvc_fraction: Annotated[
-        Any, told("Mean level as a share of the maximum", missing="unknown", kind="number above 0, at most 1")
+        Any, says("Mean level as a share of the maximum", missing="unknown", kind="number above 0, at most 1")
     ] = None
     mean: Annotated[
         Any,
-        told("Mean force or torque of each trial, in `unit`", missing="unknown", kind="number above 0, or a list of them"),
+        says("Mean force or torque of each trial, in `unit`", missing="unknown", kind="number above 0, or a list of them"),
     ] = None
-    unit: Annotated[Any, told("Unit of `mean`", missing="unknown: `mean` fixes no scale of force", kind="text")] = None
+    unit: Annotated[Any, says("Unit of `mean`", missing="unknown: `mean` fixes no scale of force", kind="text")] = None
     dispersion: Annotated[
         Any,
-        told("Dispersion of the trials (1 if they are alike), and its error",
+        says("Dispersion of the trials (1 if they are alike), and its error",
              missing="follows from `trial_power`; else unknown", kind=f"list of two {POSITIVES}"),
     ] = None  # fmt: skip
     reason: Annotated[
-        Any, told("What was assumed", missing="nothing; an error if `provenance` is reconstructed", kind="text")
+        Any, says("What was assumed", missing="nothing; an error if `provenance` is reconstructed", kind="text")
     ] = None
-    notices: Annotated[Any, told("What was done to the numbers", missing="no notices", kind="list of texts")] = None
+    notices: Annotated[Any, says("What was done to the numbers", missing="no notices", kind="list of texts")] = None
     trial_power: Annotated[
         Any,
-        told(
+        says(
             "Spectrum of each trial: a row for each of `segments`, with a power for each of `frequency_hz`, in one unit. "
             "Weighted with `segments`, their mean has the shape of `proportional_power`",
             missing="unknown",
@@ -213,10 +213,10 @@ class TargetFile(Table, kw_only=True):
         ),
     ] = None
     stiffness: Annotated[
-        Any, told("Dynamic stiffness measured beside it", missing="not measured", kind="table, see below")
+        Any, says("Dynamic stiffness measured beside it", missing="not measured", kind="table, see below")
     ] = None
     settings: Annotated[
-        Any, told("How the spectrum was estimated: the fields of `SpectrumSettings`", missing="their defaults", kind="table")
+        Any, says("How the spectrum was estimated: the fields of `SpectrumSettings`", missing="their defaults", kind="table")
     ] = None
 
 

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal, NamedTuple
 import tomli_w
 
 from jaxmuscle._common.bundled import bundled_text, list_presets
-from jaxmuscle._common.documents import Table, checked, parsed, told
+from jaxmuscle._common.documents import Table, checked, parsed, says
 from jaxmuscle._common.errors import PresetError
 from jaxmuscle._common.files import expanded, write_text
 from jaxmuscle._common.inputs import read_text
@@ -56,21 +56,21 @@ def load_preset(name_or_path: str | Path) -> AbstractTask:
 class PresetFile(Table, kw_only=True):
     """A saved task."""
 
-    format: Annotated[Literal[1, 2], told("Version of the format", missing="format 1")] = 1
-    description: Annotated[str, told("What the task is", missing="not described")] = ""
+    format: Annotated[Literal[1, 2], says("Version of the format", missing="format 1")] = 1
+    description: Annotated[str, says("What the task is", missing="not described")] = ""
     mean: Annotated[
         Any,
-        told(
+        says(
             "Mean force to which the task is scaled when it is loaded",
             missing="not scaled; an error beside `unit`",
             kind="number, not 0",
         ),
     ] = None
     unit: Annotated[
-        Any, told("Unit of `mean`: N, mN, kN, kgf, gf or lbf", missing="not scaled; an error beside `mean`", kind="text")
+        Any, says("Unit of `mean`: N, mN, kN, kgf, gf or lbf", missing="not scaled; an error beside `mean`", kind="text")
     ] = None
-    fit: Annotated[Any, told("How it was fitted: a note for the reader, not used", missing="no note")] = None
-    task_table: Annotated[dict[str, Any], told("The task, every number of it")]
+    fit: Annotated[Any, says("How it was fitted: a note for the reader, not used", missing="no note")] = None
+    task_table: Annotated[dict[str, Any], says("The task, every number of it")]
 
 
 class _InFit(NamedTuple):
