@@ -34,6 +34,7 @@ if TYPE_CHECKING:
 
 
 FURTHEST = 0.01  # quantiles that weak increments are good for
+AT_ONCE = 16  # seeds of a fit that a core simulates side by side
 
 Progress = bool | Callable[[str, float], None] | Watch
 
@@ -180,9 +181,12 @@ def ensemble(  # pyright: ignore[reportInconsistentOverload]
 
 
 def runs_for_means(task: AbstractTask, key: Key, seeds: int, draws: Draws) -> Trajectory:
-    """Seeds 0 to seeds - 1 as `ensemble` simulates them, with weak numbers, too: for means over the seeds alone."""
+    """Seeds 0 to seeds - 1 as `ensemble` simulates them, with weak numbers, too: for means over the seeds alone.
+
+    `AT_ONCE` of them at once: one program for any number, and each core of a CPU has some.
+    """
     plan = plan_of(task, DURATION, DT, None, None, None)
-    cut = cut_of(task, seeds, plan, None, shared=False)
+    cut = cut_of(task, seeds, plan, AT_ONCE, shared=False)
     linear = companions(task, DURATION, None)
     layout = laid_out(task, key_of(key), range(seeds), plan, linear, cut=cut, states=True, spectrum=False, draws=draws,
                       threads=None)  # fmt: skip

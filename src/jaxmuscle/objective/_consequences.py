@@ -25,7 +25,8 @@ def frequency_of(part: PartResiduals) -> Float[Array, " bins"]:
 
 
 BATCH = 32
-POINTS, EACH = 128, 2
+SOMETIMES = ("P_w", "m_w", "m_z")  # free with a known mean force, with a moved insertion and in designs, mostly together
+POINTS = 128
 LATEST = 4
 
 
@@ -78,7 +79,7 @@ def _quantities(part: PartResiduals, seen: Expansion) -> tuple[dict[str, Array],
         slopes, values = jax.jacfwd(everything, has_aux=True)(seen.theta)
         return values, slopes
 
-    return jax.vmap(one)(seen)
+    return jax.lax.map(one, seen)
 
 
 class Consequences(NamedTuple):
@@ -91,9 +92,9 @@ class Consequences(NamedTuple):
 
 
 def consequences(objective: Residuals, seen: Expansion) -> Consequences:
-    """What follows at the point where the model was seen; slopes with respect to θ."""
-    rows = consequences_of_rows(objective, jax.tree.map(lambda x: np.asarray(x)[None], seen))
-    return jax.tree.map(lambda x: x[0], rows)
+    """What follows at the point where the model was seen; slopes with respect to θ. By the program of `BATCH` points."""
+    rows = jax.tree.map(lambda x: np.broadcast_to(x, (BATCH, *np.shape(x))), seen)
+    return jax.tree.map(lambda x: x[0], consequences_of_rows(objective, rows))
 
 
 def consequences_of_rows(objective: Residuals, seen: Expansion) -> Consequences:
@@ -121,7 +122,7 @@ def _consequences(part: PartResiduals, seen: Expansion) -> tuple[Any, Any]:
         slopes, values = jax.jacfwd(everything, has_aux=True)(seen.theta)
         return values, slopes
 
-    return jax.vmap(one)(seen)
+    return jax.lax.map(one, seen)
 
 
 class _Response(eqx.Module):
@@ -137,28 +138,33 @@ class _Response(eqx.Module):
 
 @kept
 def _moments_and_slopes(part: Any, theta: Float[Array | np.ndarray, "points free"]) -> tuple[Any, Any]:
-    def one(theta):
-        def twice(theta):
-            moments = part.moments(theta)
-            return moments, moments
+    return jax.vmap(lambda theta: _with_slopes(part, theta))(theta)
 
-        slopes, moments = jax.jacfwd(twice, has_aux=True)(theta)
-        return moments, slopes
 
-    return jax.vmap(one)(theta)
+@eqx.filter_jit  # traced once, though asked for its shape, too
+def _with_slopes(part: Any, theta: Float[Array, " free"]) -> tuple[Any, Any]:
+    def twice(theta):
+        moments = part.moments(theta)
+        return moments, moments
+
+    slopes, moments = jax.jacfwd(twice, has_aux=True)(theta)
+    return moments, slopes
 
 
 @kept
 def _of_rows(part: Any, theta: Float[Array | np.ndarray, "points free"], count: Any) -> tuple[Any, Any]:
-    """Moments and slopes of the first `count` points, `EACH` at a time; zeros for the others, which so take no time."""
+    """Moments and slopes of the first `count` points, one after the other; zeros for the others, which so take no time.
 
-    def some(i: Any, found: Any) -> Any:
-        new = _moments_and_slopes(part, jax.lax.dynamic_slice_in_dim(theta, i * EACH, EACH))
-        return jax.tree.map(lambda all, new: jax.lax.dynamic_update_slice_in_dim(all, new, i * EACH, 0), found, new)
+    Were some of them mapped at once, they would take as long, and a third longer to trace and to compile.
+    """
 
-    one = jax.eval_shape(_moments_and_slopes, part, theta[:EACH])
-    nothing = jax.tree.map(lambda x: jnp.zeros((len(theta), *x.shape[1:]), x.dtype), one)
-    return jax.lax.fori_loop(0, (count + EACH - 1) // EACH, some, nothing)
+    def put(i: Any, found: Any) -> Any:
+        new = _with_slopes(part, jax.lax.dynamic_index_in_dim(theta, i, keepdims=False))
+        return jax.tree.map(lambda all, new: jax.lax.dynamic_update_index_in_dim(all, new, i, 0), found, new)
+
+    one = jax.eval_shape(_with_slopes, part, theta[0])
+    nothing = jax.tree.map(lambda x: jnp.zeros((len(theta), *x.shape), x.dtype), one)
+    return jax.lax.fori_loop(0, count, put, nothing)
 
 
 def expand(objective: Any, theta: Float[np.ndarray, "points free"]) -> Expansion:
@@ -205,9 +211,13 @@ def _response_of(part: PartResiduals, model: Linear) -> tuple[_Response, Int[np.
 
 
 def _with_the_usual(coordinates: Coordinates, task: AbstractTask) -> Coordinates:
-    """The coordinates and those of what is usually free, in one order whatever is asked for: θ = 0 is the task's value."""
-    known = task.parameter_names
-    names = tuple(dict.fromkeys([*(name for name in USUALLY_FREE if name in known), *coordinates.names]))
+    """The coordinates and those of what is usually free, in one order whatever is asked for: θ = 0 is the task's value.
+
+    Of `SOMETIMES` all or none, so that a fit of a hold, one with its mean force, and what to measure next make two programs.
+    """
+    known, own = task.parameter_names, coordinates.names
+    usual = (*USUALLY_FREE, *(SOMETIMES if any(name in own for name in SOMETIMES) else ()))
+    names = tuple(dict.fromkeys([*(name for name in usual if name in known), *own]))
     given = {name: i for i, name in enumerate(coordinates.names)}
     rows = [(coordinates.centre[given[n]], coordinates.sd[given[n]], coordinates.positive[given[n]]) if n in given
             else (float(task[n]), 1.0, False) for n in names]  # fmt: skip

@@ -82,7 +82,7 @@ def _local(likelihood: Likelihood, bins: AllBins, seen: Expansion, offset: Array
         height, slope = jax.value_and_grad(value)(both)
         return height, slope, likelihood.information(seen, bins)
 
-    return jax.vmap(one)(bins, seen, offset)
+    return jax.lax.map(lambda row: one(*row), (bins, seen, offset))
 
 
 def maximise(

@@ -88,5 +88,5 @@ def _moments(
         check_equilibrium(task, np.asarray(system.point), np.asarray(system.A))
         check_power(task, moments)
     if concrete:
-        warn_beyond(task, settings)
+        warn_beyond(task, settings, moments)
     return moments, settings

@@ -75,7 +75,7 @@ def line_levels(
         reply = transfer(system, 2 * jnp.pi * f)
         return 2 * table.level[0] / table.passed, jnp.abs(reply) ** 2 * table.passed
 
-    return jax.vmap(one)(jnp.asarray(frequency))
+    return jax.lax.map(one, jnp.asarray(frequency))
 
 
 def _turns(turns: Float[Array, ""], start: int, samples: Int[Array | np.ndarray, ""] | int) -> Complex[Array, ""]:
@@ -96,6 +96,12 @@ def line_table(
 
     Segments are those of the window; its variance is that of so many samples from the window's begin on.
     """
+    return _differentiable(settings, window, frequency, jnp.asarray(samples))
+
+
+def _table(
+    settings: SpectrumSettings, window: tuple[float, float], frequency: Float[Array, ""], samples: Int[Array, ""]
+) -> LineTable:
     angle = 2 * jnp.pi * frequency / settings.rate
     turn, gain = turn_of(angle), _sampled(angle, settings.sampling)
     start, stop = (round(edge * settings.rate) for edge in window)
@@ -110,6 +116,18 @@ def line_table(
     level = jnp.stack([level, -jnp.real(turning), jnp.imag(turning)])
     once, twice = (through**k * _turns(k * frequency / settings.rate, start, samples) for k in (1, 2))
     return LineTable(level, jnp.abs(through) ** 2, once, twice)
+
+
+_differentiable = jax.custom_jvp(_table, nondiff_argnums=(0, 1))
+
+
+@_differentiable.defjvp
+def _slope_of_table(settings: SpectrumSettings, window: tuple[float, float], at: Any, towards: Any) -> tuple[Any, Any]:
+    """It depends on one number: its slope is computed once, for however many directions."""
+    frequency, samples = at
+    one = jnp.ones_like(frequency)
+    table, slope = jax.jvp(lambda f: _table(settings, window, f, samples), (frequency,), (one,))
+    return table, jax.tree.map(lambda x: x * towards[0].astype(x.dtype), slope)
 
 
 def harmonic_line(

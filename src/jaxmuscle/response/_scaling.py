@@ -238,5 +238,5 @@ def _moments(task: AbstractTask) -> Moments:
         moments, system = expected_moments(as_doubles(task), task.settings, WINDOW)
         check_equilibrium(task, np.asarray(system.point), np.asarray(system.A))
         check_inputs(task)
-        warn_beyond(task)
+        warn_beyond(task, moments=moments)
         return jax.tree.map(as_numbers, moments)

@@ -21,7 +21,7 @@ from jaxmuscle.model._white_noise import BandLimitedNoise, WhiteNoise
 from jaxmuscle.spectra._settings import WINDOW, SpectrumSettings
 
 from ._equilibrium import HOLD, mechanics
-from ._expected import covariance_operator, expected_moments
+from ._expected import Moments, covariance_operator, expected_moments
 from ._linearised import Linearisation, linearised
 
 NOTICED = 0.1
@@ -153,7 +153,9 @@ def negative_coefficients(task: AbstractTask) -> tuple[str, ...]:
                  if part > NEGATIVE and base > 0)  # fmt: skip
 
 
-def second_order(task: AbstractTask, settings: SpectrumSettings | None = None) -> SecondOrder:
+def second_order(
+    task: AbstractTask, settings: SpectrumSettings | None = None, moments: Moments | None = None
+) -> SecondOrder:
     """The power and the mean that the second order adds to the linear response of a task.
 
     With y₁ the linear response and u the perturbation, x = (y₁, u) Gaussian, M_a the Hessians of vector field and output,
@@ -164,13 +166,16 @@ def second_order(task: AbstractTask, settings: SpectrumSettings | None = None) -
     and the harmonic counts as a narrow resonance, which doubles its overtone: an indicator, good to a factor of two or so
     (docs/model.md has it beside simulations). White noise counts as its samples do.
 
+    **Arguments:** `task`; `settings` (the task's own by default); `moments` in linear response with these settings, where
+    they are known already: no other program is needed then.
+
     **Returns:** a `SecondOrder`. **Raises:** as `expected_spectrum` does.
     """
     settings = task.settings if settings is None else settings
     arrays = as_doubles(task)
     with jax.enable_x64(True):
         system = linearised(arrays).system
-        moments, _ = expected_moments(arrays, settings, WINDOW)
+        moments = expected_moments(arrays, settings, WINDOW)[0] if moments is None else moments
         bare = mechanics(arrays)
         hessians, parts, system = jax.tree.map(np.asarray, (_hessians(bare, system), _parts(bare), system))
     n = len(system.A)
@@ -218,7 +223,7 @@ def _added(
     return operator @ autocovariance, mean
 
 
-def warn_beyond(task: AbstractTask, settings: SpectrumSettings | None = None) -> None:
-    """Warn (`FirstOrderWarning`) where the linear numbers of a task are not the model's."""
-    for notice in (*second_order(task, settings).notices, *negative_coefficients(task)):
+def warn_beyond(task: AbstractTask, settings: SpectrumSettings | None = None, moments: Moments | None = None) -> None:
+    """Warn (`FirstOrderWarning`) where the linear numbers of a task are not the model's; arguments of `second_order`."""
+    for notice in (*second_order(task, settings, moments).notices, *negative_coefficients(task)):
         warnings.warn(f"{type(task).__name__}: {notice}", FirstOrderWarning, stacklevel=3)
