@@ -1,7 +1,7 @@
 .POSIX:
 PYTHON ?= python3
 BIN = .venv/bin
-# Two workers, whatever the machine: each compiles a lot and takes up to 5 GiB.
+# Two workers, whatever the machine: each compiles a lot and takes up to 7 GiB.
 PYTEST = $(BIN)/python -m pytest -q -n 2 --dist loadfile --no-loadscope-reorder
 PIP = $(BIN)/python -m pip --quiet --disable-pip-version-check install
 

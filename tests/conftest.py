@@ -21,6 +21,7 @@ shapes.check("jaxmuscle")  # before the first test module imports the package
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 
 os.environ["MPLBACKEND"] = "Agg"  # the environment reaches commands and notebooks, too
+os.environ["NUMBA_DISABLE_JIT"] = "1"  # antropy, a reference: compiled it takes seven seconds more than it saves
 
 # Compilation takes far longer than a deadline, and the outcome of a run should not depend on a draw.
 hypothesis.settings.register_profile("jaxmuscle", deadline=None, derandomize=True)
@@ -44,8 +45,9 @@ def _keep_compiled_programs(folder: Path) -> None:
     os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0"
 
 
+OPTIMISATION = "xla_backend_optimization_level"
 QUICK_COMPILER = (
-    "--xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=1 --xla_cpu_parallel_codegen_split_count=1 "
+    f"--{OPTIMISATION}=1 --xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1 "
     "--xla_backend_extra_options=xla_cpu_disable_loop_unrolling,xla_cpu_disable_slp_vectorizer "
     "--xla_disable_hlo_passes=simplification"
 )
@@ -54,8 +56,7 @@ QUICK_COMPILER = (
 def _compile_quickly(known: Path) -> None:
     """XLA's older emitters, LLVM at its first level, loops as they are, no rounds of simplification before it: compiled in
     less than half the time, run as fast, the same numbers to rounding; and each program in one piece, since a worker has
-    one core. Without optimisation a whole run compiles 0.8 of 1.7 ks less and computes 0.6 ks longer: compiled.py does so
-    where a program runs a few times.
+    one core.
 
     An XLA that no longer has them ends the process at the flag: tried once for every version, in a process of its own.
     """
@@ -74,7 +75,7 @@ def _compile_quickly(known: Path) -> None:
 
 
 # Kept programs that are computed often, or draw: where random numbers are rounded must not depend on who draws them. All
-# others are computed a few times, and without optimisation compile in half the time.
+# others, and what a test compiles itself, are computed a few times: without optimisation they compile in half the time.
 OPTIMISED = {"_of_rows", "_moments_and_slopes", "_step", "_start", "run_seeds", "run_points", "_driven", "filtered_power",
              "_lowpass", "decimated", "_normal", "_cells", "_key", "_folded", "_wrapped", "_frequencies",
              "_values"}  # fmt: skip
@@ -84,13 +85,14 @@ def _optimise_only_what_runs_often() -> None:
     from jaxmuscle._common import programs
 
     def kept(function: Any) -> Any:
-        return programs.Kept(function, programs.OPTIONS | ({} if function.__name__ in OPTIMISED else plain))
+        return programs.Kept(function, programs.OPTIONS | {OPTIMISATION: int(function.__name__ in OPTIMISED)})
 
-    plain = {"xla_backend_optimization_level": 0}
     programs.kept = kept
+    programs.kept_to_run_long = lambda function: programs.Kept(function, {OPTIMISATION: 1})
 
 
-MOST_MAPS, MOST_MEMORY = 25_000, 3 * 2**30
+# Of a process: what it forgets, which takes seconds, it traces and loads again.
+MOST_MAPS, MOST_MEMORY, SHARE = 25_000, 5 * 2**30, 1 / 6
 # Tracing makes objects by the million, few of them in circles: looking for these at Python's own pace takes a tenth of it.
 gc.set_threshold(5_000, 20, 10)
 
@@ -102,6 +104,7 @@ _optimise_only_what_runs_often()
 def pytest_configure(config: pytest.Config) -> None:
     config.pluginmanager.register(timing.Timing(config))
     _keep_to_own_cores(getattr(config, "workerinput", {}))
+    _begin_without_optimisation()
 
 
 def _keep_to_own_cores(worker: dict[str, Any]) -> None:
@@ -111,6 +114,15 @@ def _keep_to_own_cores(worker: dict[str, Any]) -> None:
         own = cores[int(worker["workerid"].removeprefix("gw")) % count :: count]
         if own:
             os.sched_setaffinity(0, own)
+
+
+def _begin_without_optimisation() -> None:
+    """XLA reads its flags once. Commands that a test starts read theirs later: they have `QUICK_COMPILER` as it is."""
+    flags = os.environ.get("XLA_FLAGS")
+    if flags == QUICK_COMPILER:
+        os.environ["XLA_FLAGS"] = flags.replace(f"{OPTIMISATION}=1", f"{OPTIMISATION}=0")
+        jax.devices()
+        os.environ["XLA_FLAGS"] = flags
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
@@ -146,8 +158,9 @@ def _is_full() -> bool:
     maps, pages = Path("/proc/self/maps"), Path("/proc/self/statm")
     if not maps.exists():
         return True
-    resident = int(pages.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
-    return resident > MOST_MEMORY or len(maps.read_text().splitlines()) > MOST_MAPS
+    resident, there = int(pages.read_text().split()[1]), os.sysconf("SC_PHYS_PAGES")
+    most = min(MOST_MEMORY / os.sysconf("SC_PAGE_SIZE"), SHARE * there)
+    return resident > most or len(maps.read_text().splitlines()) > MOST_MAPS
 
 
 @pytest.fixture(scope="module", autouse=True)

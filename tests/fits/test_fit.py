@@ -11,7 +11,7 @@ import pytest
 import references
 import scipy.signal
 import scipy.stats
-from compiled import once
+from compiled import drawing
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -126,7 +126,7 @@ def test_moments_are_those_of_a_plain_ensemble(x64, task):
     grid = Grid(dt, 6000, 4, runs.substeps)
     chosen = np.array([0, 3, 10, 29])
     model = MonteCarlo.of(task.settings, key, seeds, grid, chosen, WINDOW, control=False)
-    moments = eqx.filter_jit(model.moments)(as_arrays(task))
+    moments = drawing(lambda task: model.moments(task))(as_arrays(task))
 
     def powers(signal):
         return np.asarray(jm.spectra.spectrum_of(signal, task.settings, WINDOW).power)[..., chosen]
@@ -370,7 +370,7 @@ def test_gradients_of_the_residuals_are_differences(x64, residual):
         theta = objective.theta(s)
         return objective.residuals(theta, (_moments()(theta),), objective.data)
 
-    forward = once(jax.jacfwd(lambda s: _residuals(s, (objective, objective.data, seen))[0]))(s)
+    forward = jax.jit(jax.jacfwd(lambda s: _residuals(s, (objective, objective.data, seen))[0]))(s)
     h = 1e-4
     central = np.stack([(evaluate(s + h * e) - evaluate(s - h * e)) / (2 * h) for e in np.eye(3)], axis=1)
     assert np.all(np.isfinite(forward))
@@ -389,7 +389,7 @@ def test_slopes_that_were_seen_are_those_of_the_whole(x64):
         theta = objective.theta(s)
         return objective.residuals(theta, (objective.parts[0].moments(theta),), objective.data)
 
-    forward = once(jax.jacfwd(lambda s: _residuals(s, (objective, objective.data, seen))[0]))(s)
+    forward = jax.jit(jax.jacfwd(lambda s: _residuals(s, (objective, objective.data, seen))[0]))(s)
     # Normals have single precision, which two programs round differently: 6e-8 of each of thousands.
     np.testing.assert_allclose(forward, eqx.filter_jit(jax.jacfwd(whole))(s), rtol=1e-6, atol=6e-8)
 

@@ -6,7 +6,6 @@ import numpy as np
 import optimistix as optx
 import pytest
 import scipy
-from compiled import once
 
 import jaxmuscle as jm
 
@@ -89,7 +88,7 @@ def test_the_prior_is_a_density_of_the_coordinates(problem):
 def test_log_density_and_its_slope(problem):
     """The likelihood is that of `log_likelihood` but for a constant; both halves are differentiable."""
     theta = problem.theta({"c_w": 90.0, "harmonic_frequency": 7.0})
-    both = once(problem.log_density)
+    both = jax.jit(problem.log_density)
     bare = jm.Target("spectrum alone", TARGET.proportional_power, segments=TARGET.segments)  # its law is the same everywhere
     alone = jm.problem(TASK, bare)
     ours = float(alone.log_likelihood(theta) - alone.log_likelihood(alone.start))
@@ -106,8 +105,8 @@ def test_the_log_density_has_second_derivatives():
     """Against differences of the slope, in a step so small that the ripple along the frequency does not show."""
     problem = jm.problem(TASK, TARGET, free=("c_w", "noise_K_w", "harmonic_frequency"))
     theta, step = problem.theta({"c_w": 90.0, "harmonic_frequency": 7.0}), 1e-6 * np.eye(3)
-    slope = once(jax.grad(problem.log_density))
-    found = np.asarray(once(jax.hessian(problem.log_density))(theta))
+    slope = jax.jit(jax.grad(problem.log_density))
+    found = np.asarray(jax.jit(jax.hessian(problem.log_density))(theta))
     differences = np.stack([(np.asarray(slope(theta + e)) - np.asarray(slope(theta - e))) / 2e-6 for e in step])
     np.testing.assert_allclose(found, differences, rtol=1e-4)  # a slope of 300 is rounded by 1e-12, divided by the step
     np.testing.assert_allclose(found, found.T, rtol=1e-8)
@@ -148,7 +147,7 @@ def test_scipy_finds_the_minimum_of_the_fit(problem, result):
     """
     near = problem.theta({name: result[name].value for name in problem.names})
     for turn, used in enumerate((problem, problem.scattering_as(near))):
-        given = once(used.residuals), near + 0.05 * (-1.0) ** np.arange(len(near)), once(jax.jacfwd(used.residuals))
+        given = jax.jit(used.residuals), near + 0.05 * (-1.0) ** np.arange(len(near)), jax.jit(jax.jacfwd(used.residuals))
         found = scipy.optimize.least_squares(*given, ftol=1e-12, xtol=1e-12)
         ours = 0.5 * float(jnp.sum(given[0](near) ** 2)) if turn else min(start.cost for start in result.starts)
         assert found.success and found.cost == pytest.approx(ours, rel=1e-3)

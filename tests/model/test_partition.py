@@ -5,7 +5,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from compiled import once
 
 import jaxmuscle as jm
 
@@ -46,9 +45,9 @@ def test_precision_is_the_callers():
 @pytest.mark.slow
 def test_slopes_by_name_against_differences_and_against_replace(x64):
     values, rebuild = jm.model.partition(TASK, NAMES)
-    slopes = once(jax.grad(lambda v: loss(rebuild(v))))(values)
+    slopes = jax.jit(jax.grad(lambda v: loss(rebuild(v))))(values)
     assert set(slopes) == set(NAMES)
-    direct = once(jax.jacfwd(lambda v: loss(TASK.replace(**dict(zip(NAMES, v, strict=True))))))
+    direct = jax.jit(jax.jacfwd(lambda v: loss(TASK.replace(**dict(zip(NAMES, v, strict=True))))))
     together = direct(jnp.stack([values[name] for name in NAMES]))
     np.testing.assert_allclose([slopes[name] for name in NAMES], together, rtol=1e-9)
     for name in NAMES:
@@ -64,7 +63,7 @@ def test_what_filter_grad_says_of_numbers_and_of_arrays(x64):
     assert eqx.filter_grad(loss)(TASK).muscle.stiffness_w.k is None
     values, rebuild = jm.model.partition(TASK, NAMES)
     whole = eqx.filter_jit(eqx.filter_grad(loss))(jax.tree.map(jnp.asarray, TASK))
-    slopes = once(jax.grad(lambda v: loss(rebuild(v))))(values)
+    slopes = jax.jit(jax.grad(lambda v: loss(rebuild(v))))(values)
     np.testing.assert_allclose(whole.muscle.stiffness_w.k, slopes["k_w"], rtol=1e-9)
     np.testing.assert_allclose(whole.noise.amplitude[0], slopes["noise_K_w"], rtol=1e-9)
     np.testing.assert_allclose(whole.P_w.level, slopes["P_w"], rtol=1e-9)
@@ -84,7 +83,7 @@ def test_a_gradient_step_by_an_optimiser_of_pytrees(x64):
     logs = jax.tree.map(jnp.log, values)
     descent = optax.sgd(0.3)
     state, costs = descent.init(logs), []
-    both = once(jax.value_and_grad(misfit))
+    both = jax.jit(jax.value_and_grad(misfit))
     for _ in range(10):
         cost, slopes = both(logs)
         costs.append(float(cost))

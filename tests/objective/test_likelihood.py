@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 import scipy.signal
 import scipy.stats
-from compiled import once
 from scipy.special import digamma, gammaln
 
 import jaxmuscle as jm
@@ -163,7 +162,7 @@ def _scores():
     def slope(log_power):
         return jax.grad(lambda e: log_marginal(bins._replace(log_power=log_power), jnp.exp(e), jnp.zeros(30)))(truth)
 
-    return np.asarray(once(jax.vmap(slope))(shares))
+    return np.asarray(jax.jit(jax.vmap(slope))(shares))
 
 
 def bins_information(bins):

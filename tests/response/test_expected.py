@@ -12,7 +12,6 @@ import references
 import scipy.linalg
 import scipy.optimize
 import scipy.signal
-from compiled import once
 
 import jaxmuscle as jm
 from jaxmuscle._common.arrays import as_arrays
@@ -507,10 +506,10 @@ def test_every_derivative_forward_reverse_and_by_differences(x64, name):
         return jnp.log(jm.expected_spectrum(task.replace(**values)).power)
 
     one = np.ones(scale.size)
-    forward = np.asarray(once(jax.jacfwd(log_power))(one))
-    reverse = np.asarray(once(jax.jacrev(log_power))(one))
+    forward = np.asarray(jax.jit(jax.jacfwd(log_power))(one))
+    reverse = np.asarray(jax.jit(jax.jacrev(log_power))(one))
     h = 1e-5  # truncation h² f''' / 6, and rounding 1e-12 / h of an equilibrium found to 1e-12
-    value = once(log_power)
+    value = jax.jit(log_power)
     differences = np.stack([value(one + h * e) - value(one - h * e) for e in np.eye(one.size)], axis=1) / (2 * h)
     largest = np.abs(forward).max()
     np.testing.assert_allclose(reverse, forward, rtol=1e-8, atol=1e-9 * largest)
@@ -577,7 +576,7 @@ def test_heavy_forces_on_soft_tissue_have_an_equilibrium_in_single_precision(nam
 
 def test_a_task_from_outside_a_compiled_function():
     task = jm.Isometric()
-    scaled = once(lambda x: x * jm.expected_spectrum(task).power)(2.0)
+    scaled = jax.jit(lambda x: x * jm.expected_spectrum(task).power)(2.0)
     np.testing.assert_allclose(scaled, 2 * np.asarray(jm.expected_spectrum(task).power), rtol=1e-5)
 
 
@@ -657,7 +656,7 @@ def test_the_expected_coefficient_of_variation_is_that_of_simulations(x64):
 
     k, step = float(task["k_w"]), 1e-4
     difference = (one(k * (1 + step)) - one(k * (1 - step))) / (2 * k * step)
-    np.testing.assert_allclose(once(jax.grad(one))(k), difference, rtol=1e-6)
+    np.testing.assert_allclose(jax.jit(jax.grad(one))(k), difference, rtol=1e-6)
 
 
 @pytest.mark.slow
@@ -754,7 +753,7 @@ def test_what_has_no_linear_response(x64, name):
 
 @pytest.mark.slow
 def test_without_an_equilibrium_under_a_transformation_it_is_not_finite(x64):
-    @once
+    @jax.jit
     def power(F_ext, k_w):
         return jm.expected_spectrum(snapped().replace(F_ext=F_ext, k_w=k_w)).power
 
@@ -796,8 +795,8 @@ def test_the_expected_spectrum_has_a_second_derivative(x64):
         return jnp.log(jm.expected_spectrum(task.replace(k_w=k)).power[4])
 
     k, step = task["k_w"], 10.0
-    slope = once(jax.grad(power))
-    second = float(once(jax.grad(jax.grad(power)))(k))
+    slope = jax.jit(jax.grad(power))
+    second = float(jax.jit(jax.grad(jax.grad(power)))(k))
     assert second == pytest.approx(float(slope(k + step) - slope(k - step)) / (2 * step), rel=1e-4)
 
 

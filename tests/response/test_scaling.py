@@ -4,7 +4,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from compiled import once
 
 import jaxmuscle as jm
 from jaxmuscle._common.arrays import as_arrays
@@ -192,14 +191,14 @@ def test_derivatives_and_batches_go_through(x64):
         task = scaled(at_level(jm.Isometric(), level), size)
         return task["noise_K_w"] * task["k_w"]
 
-    slopes = once(jax.jacfwd(change, argnums=(0, 1)))(0.6, 1.2)
+    slopes = jax.jit(jax.jacfwd(change, argnums=(0, 1)))(0.6, 1.2)
     step = 1e-5
     for i, slope in enumerate(slopes):
         up, down = ([0.6, 1.2] for _ in range(2))
         up[i], down[i] = up[i] + step, down[i] - step
         assert slope == pytest.approx(float(change(*up) - change(*down)) / (2 * step), rel=1e-5)
     levels = jnp.asarray([0.1, 0.3, 0.9])
-    several = once(jax.vmap(lambda level: at_level(jm.Isometric(), level)["noise_K_w"]))(levels)
+    several = jax.jit(jax.vmap(lambda level: at_level(jm.Isometric(), level)["noise_K_w"]))(levels)
     np.testing.assert_allclose(several, [at_level(jm.Isometric(), float(level))["noise_K_w"] for level in levels], rtol=1e-8)
 
 

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from compiled import once
+from compiled import drawing
 
 import jaxmuscle as jm
 
@@ -45,10 +45,12 @@ def test_every_parameter_forward_reverse_and_by_differences(x64, name):
         return jnp.log(run.spectrum(window=(1.0, 4.0)).power)
 
     one = jnp.ones_like(scale)
-    forward = np.asarray(once(jax.jacfwd(log_power))(one))
-    reverse = np.asarray(once(jax.jacrev(log_power))(one))
+    forward = np.asarray(jax.jit(jax.jacfwd(log_power))(one))
+    reverse = np.asarray(jax.jit(jax.jacrev(log_power))(one))
     h = 1e-5  # truncation h² f''' / 6 and rounding 1e-15 / h
-    ahead, behind = jnp.split(once(jax.vmap(log_power))(one + h * jnp.concatenate([np.eye(one.size), -np.eye(one.size)])), 2)
+    ahead, behind = jnp.split(
+        jax.jit(jax.vmap(log_power))(one + h * jnp.concatenate([np.eye(one.size), -np.eye(one.size)])), 2
+    )
     differences = np.asarray(ahead - behind).T / (2 * h)
 
     assert forward.shape == (12, len(names)) and np.all(np.isfinite(forward))
@@ -85,6 +87,6 @@ def test_a_mean_spectrum_and_the_filtered_output_by_differences(x64):
 
     h = 5.0
     ahead, value, behind = (np.asarray(of(k_w)) for k_w in (5e5 + h, 5e5, 5e5 - h))
-    again, slope = jax.jit(lambda k_w: jax.jvp(of, (k_w,), (jnp.ones_like(k_w),)))(jnp.asarray(5e5))
+    again, slope = drawing(lambda k_w: jax.jvp(of, (k_w,), (jnp.ones_like(k_w),)))(jnp.asarray(5e5))
     np.testing.assert_allclose(again, value, rtol=1e-9)
     np.testing.assert_allclose(slope, (ahead - behind) / (2 * h), rtol=1e-5, atol=1e-5 * np.abs(slope).max())

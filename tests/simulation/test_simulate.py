@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import references
 import scipy.signal
+from compiled import drawing
 
 import jaxmuscle as jm
 from jaxmuscle._common.arrays import is_concrete
@@ -180,7 +181,7 @@ def test_tables_of_inputs_and_harmonic_change_nothing(x64, task):
     }[task]
     options = {"duration": 0.8, "rate": 500.0, "substeps": 3}
     plain = jm.simulate(task, KEY, **options)
-    traced = jax.jit(lambda key: jm.simulate(task, key, **options).output)(KEY)
+    traced = drawing(lambda key: jm.simulate(task, key, **options).output)(KEY)
     np.testing.assert_allclose(plain.output, traced, rtol=1e-9, atol=1e-9 * np.abs(plain.output).max())
 
 
@@ -334,7 +335,7 @@ def test_ensembles_under_vmap_and_jit(x64):
     def output(k_w):
         return jm.ensemble(task.replace(k_w=k_w), KEY, seeds=2, duration=1.0).output
 
-    both = jax.jit(jax.vmap(output))(stiffness)
+    both = drawing(jax.vmap(output))(stiffness)
     assert both.shape == (2, 2, 101)
     for i, k_w in enumerate((4e5, 6e5)):
         np.testing.assert_allclose(both[i], output(k_w), rtol=1e-9, atol=1e-12)

@@ -10,7 +10,6 @@ import pages
 import pytest
 import references
 import scipy.optimize
-from compiled import once
 
 import jaxmuscle as jm
 from jaxmuscle.model import SmoothStep
@@ -359,7 +358,7 @@ def test_gradients_of_the_spectrum(x64):
     def power(values):
         return jm.expected_spectrum(task.replace(**dict(zip(names, values, strict=True)))).power[10]
 
-    forward, reverse = once(jax.jacfwd(power))(at), once(jax.grad(power))(at)
+    forward, reverse = jax.jit(jax.jacfwd(power))(at), jax.jit(jax.grad(power))(at)
     steps = h * np.diag(np.asarray(at))
     difference = [(power(at + s) - power(at - s)) / (2 * s.sum()) for s in steps]
     np.testing.assert_allclose(forward, reverse, rtol=1e-8)
@@ -377,7 +376,7 @@ def test_gradients_of_a_simulation(x64):
         return jnp.sum(run.output[30:] ** 2)
 
     at = jnp.array([3.6, 0.04])
-    forward, reverse = once(jax.jacfwd(moved))(at), once(jax.grad(moved))(at)
+    forward, reverse = jax.jit(jax.jacfwd(moved))(at), jax.jit(jax.grad(moved))(at)
     steps = 1e-5 * np.diag(np.asarray(at))
     difference = [(moved(at + s) - moved(at - s)) / (2 * s.sum()) for s in steps]
     np.testing.assert_allclose(forward, reverse, rtol=1e-9)

@@ -46,10 +46,13 @@ IN_NOTEBOOKS = {
     "07-your-own-muscle": {"starts=16": FEW},
     "08-perturb-and-measure": {"rungs=0, check_seeds=0": "rungs=0, check_seeds=0, starts=16"},
 }
-CALLED_OFTEN = ("fit", "ensemble", "profile", "posterior", "identifiability", "compare_noise", "goodness", "bootstrap")
+CALLED_OFTEN = ("fit", "fit_cohort", "ensemble", "profile", "posterior", "identifiability", "compare_noise", "goodness",
+                "bootstrap")  # fmt: skip
 FEWER: dict[str, dict[str, Any]] = {
-    "goodness": {"replicates": 199},
-    "bootstrap": {"replicates": 10},
+    "ensemble": {"chunk": 16},  # one program for any number of seeds
+    "fit_cohort": {"starts": 8},
+    "goodness": {"replicates": 39},
+    "bootstrap": {"replicates": 6},
     "compare_noise": {"groups": 3, "noises": ("white", "band-limited", "ornstein-uhlenbeck")},
     "posterior": {"chains": 2, "draws": 150, "warmup": 200},
 }
