@@ -81,14 +81,27 @@ OPTIMISED = {"_of_rows", "_moments_and_slopes", "_step", "_start", "run_seeds", 
              "_values"}  # fmt: skip
 
 
+class _AsCommands(dict):
+    """Options with which a program is made here as a command makes it that has `QUICK_COMPILER`: each loads the other's."""
+
+    def __init__(self, options: Any) -> None:
+        super().__init__(options, **{OPTIMISATION: 1})
+        self.said = repr(options)  # stands in the name of the program's file
+
+    def __repr__(self) -> str:
+        return self.said
+
+
 def _optimise_only_what_runs_often() -> None:
     from jaxmuscle._common import programs
 
     def kept(function: Any) -> Any:
-        return programs.Kept(function, programs.OPTIONS | {OPTIMISATION: int(function.__name__ in OPTIMISED)})
+        options = programs.OPTIONS
+        often = function.__name__ in OPTIMISED
+        return programs.Kept(function, _AsCommands(options) if often else options | {OPTIMISATION: 0})
 
     programs.kept = kept
-    programs.kept_to_run_long = lambda function: programs.Kept(function, {OPTIMISATION: 1})
+    programs.kept_to_run_long = lambda function: programs.Kept(function, _AsCommands({}))
 
 
 # Of a process: what it forgets, which takes seconds, it traces and loads again.
