@@ -15,6 +15,7 @@ import jaxlib
 import pytest
 import shapes
 import timing
+from compiled import OPTIMISATION
 
 shapes.check("jaxmuscle")  # before the first test module imports the package
 
@@ -45,7 +46,6 @@ def _keep_compiled_programs(folder: Path) -> None:
     os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0"
 
 
-OPTIMISATION = "xla_backend_optimization_level"
 QUICK_COMPILER = (
     f"--{OPTIMISATION}=1 --xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1 "
     "--xla_backend_extra_options=xla_cpu_disable_loop_unrolling,xla_cpu_disable_slp_vectorizer "

@@ -123,7 +123,7 @@ _differentiable = jax.custom_jvp(_table, nondiff_argnums=(0, 1))
 
 @_differentiable.defjvp
 def _slope_of_table(settings: SpectrumSettings, window: tuple[float, float], at: Any, towards: Any) -> tuple[Any, Any]:
-    """It depends on one number: its slope is computed once, for however many directions."""
+    """The table depends on one number. So its slope is computed once, for however many directions."""
     frequency, samples = at
     one = jnp.ones_like(frequency)
     table, slope = jax.jvp(lambda f: _table(settings, window, f, samples), (frequency,), (one,))
