@@ -152,6 +152,7 @@ def likeliest_offset(bins: Bins, power: Powers, line: Powers) -> tuple[Scalar, S
     return u, 1 / jnp.sqrt(jnp.maximum(-curvature(u), least))
 
 
+@jax.jit  # a user calls it outside a program, too, and its loop would be traced anew each time
 def log_marginal(bins: Bins, power: Powers, line: Powers) -> Scalar:
     """Log density of proportional powers: `log_density` integrated over the offset, by the trapezoidal rule."""
     middle, width = jax.tree.map(jax.lax.stop_gradient, likeliest_offset(bins, power, line))

@@ -106,12 +106,15 @@ def _table(
     turn, gain = turn_of(angle), _sampled(angle, settings.sampling)
     start, stop = (round(edge * settings.rate) for edge in window)
     begins = start + settings.step * np.arange(settings.segments(stop - start))
-    rows = jnp.asarray(bin_rows(settings), turn.dtype)
-    spin = turn_of(angle * np.arange(settings.length, dtype=angle.dtype))
-    ahead, behind = rows @ spin, rows @ jnp.conj(spin)
+    # With ahead, behind = rows @ e^(±i angle m) and z the same of the real and of the imaginary rows, which takes no complex
+    # product: Σ |ahead|² + |behind|² = 2 Σ |z|² and Σ ahead conj(behind) = Σ z².
+    rows = bin_rows(settings)
+    rows = jnp.asarray(np.concatenate([rows.real, rows.imag], axis=1), angle.dtype)
+    spin = angle * np.arange(settings.length, dtype=angle.dtype)
+    z = jax.lax.complex(rows @ jnp.cos(spin), rows @ jnp.sin(spin))
     through = gain * _low_pass(settings, turn)
-    level = 0.25 * jnp.abs(through) ** 2 * jnp.sum(jnp.abs(ahead) ** 2 + jnp.abs(behind) ** 2, axis=1)
-    both = jnp.sum(ahead * jnp.conj(behind), axis=1)
+    level = 0.5 * jnp.abs(through) ** 2 * jnp.sum(jnp.abs(z) ** 2, axis=1)
+    both = jnp.sum(z**2, axis=1)
     turning = 0.5 * through**2 * jnp.mean(turn_of(2 * angle * begins.astype(angle.dtype))) * both
     level = jnp.stack([level, -jnp.real(turning), jnp.imag(turning)])
     once, twice = (through**k * _turns(k * frequency / settings.rate, start, samples) for k in (1, 2))

@@ -208,15 +208,17 @@ def _added(
     each[0] = stationary
     for i in range(1, len(each)):
         each[i] = step @ each[i - 1]
-    turned = np.einsum("aij,tjk->taik", forms, each)
-    covariance = 2 * np.einsum("taij,tbij->tab", turned, np.einsum("tij,bjk->tbik", each, forms))
+    kinds, size = len(forms), len(matrix)
+    left = np.tensordot(forms, each, (2, 1)).transpose(2, 0, 1, 3).reshape(-1, kinds, size**2)  # M_a R
+    right = np.tensordot(each, forms, (2, 1)).transpose(0, 1, 3, 2).reshape(-1, size**2, kinds)  # R M_b
+    covariance = 2 * left @ right
     half = interval * np.fft.rfft(covariance, count, axis=0)
     density = half + np.conj(np.swapaxes(half, 1, 2)) - interval * covariance[0]
     omega = 2 * np.pi * np.fft.rfftfreq(count, interval)
     n = len(system.A)
     row = np.linalg.solve((1j * omega[:, None, None] * np.eye(n) - system.A).swapaxes(1, 2), system.C[:, None])[..., 0]
     row = np.concatenate([row, np.ones((len(row), 1))], axis=1)
-    seen = np.einsum("fa,fab,fb->f", row, density, row.conj()).real
+    seen = (row[:, None] @ density @ row.conj()[..., None])[:, 0, 0].real
     autocovariance = np.fft.irfft(seen, count)[: operator.shape[1]] / interval
     forced = np.einsum("aij,ij->a", forms, stationary)
     mean = float(forced[-1] - system.C @ np.linalg.solve(system.A, forced[:-1]))
