@@ -17,7 +17,9 @@ import shapes
 import timing
 from compiled import OPTIMISATION
 
-shapes.check("jaxmuscle")  # before the first test module imports the package
+shapes.check("jaxmuscle")  # before anything of the package is imported
+
+from jaxmuscle._common import figures  # noqa: E402
 
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 
@@ -34,7 +36,8 @@ OUT = Path(__file__).parents[1] / ".test-out"
 os.environ |= {"MALLOC_TOP_PAD_": f"{2**26}", "MALLOC_TRIM_THRESHOLD_": f"{2**30}", "MALLOC_MMAP_THRESHOLD_": f"{2**25}"}
 # Programs are made without the lines of Python that they come from, which nobody reads.
 os.environ["JAX_TRACEBACK_IN_LOCATIONS_LIMIT"] = "0"
-jax.config.update("jax_traceback_in_locations_limit", 0)
+with contextlib.suppress(AttributeError):  # of a JAX that has no such option
+    jax.config.update("jax_traceback_in_locations_limit", 0)
 
 
 def _keep_compiled_programs(folder: Path) -> None:
@@ -110,6 +113,20 @@ def _optimise_only_what_runs_often() -> None:
     programs.kept_to_run_long = lambda function: programs.Kept(function, _AsCommands({}))
 
 
+DPI = figures.DPI
+
+
+def _draw_coarsely() -> None:
+    """A command's figures: at 300 dots per inch, as journals want them, each takes half a second more."""
+    figures.DPI = 75
+
+
+@pytest.fixture
+def as_fine_as_shipped(monkeypatch):
+    """Figures as commands write them outside the tests."""
+    monkeypatch.setattr(figures, "DPI", DPI)
+
+
 # Of a process: what it forgets, which takes seconds, it traces and loads again.
 MOST_MAPS, MOST_MEMORY, SHARE = 45_000, 8 * 2**30, 0.3
 # Tracing makes objects by the million, few of them in circles: looking for these at Python's own pace takes a tenth of it.
@@ -118,6 +135,7 @@ gc.set_threshold(50_000, 20, 10)
 _keep_compiled_programs(OUT / "jax-cache")
 _compile_quickly(OUT / "compiler.txt")
 _optimise_only_what_runs_often()
+_draw_coarsely()
 
 
 def pytest_configure(config: pytest.Config) -> None:

@@ -6,6 +6,7 @@ import numpy as np
 import optimistix as optx
 import pytest
 import scipy
+from compiled import at_once
 
 import jaxmuscle as jm
 
@@ -88,16 +89,17 @@ def test_the_prior_is_a_density_of_the_coordinates(problem):
 def test_log_density_and_its_slope(problem):
     """The likelihood is that of `log_likelihood` but for a constant; both halves are differentiable."""
     theta = problem.theta({"c_w": 90.0, "harmonic_frequency": 7.0})
-    both = jax.jit(problem.log_density)
     bare = jm.Target("spectrum alone", TARGET.proportional_power, segments=TARGET.segments)  # its law is the same everywhere
     alone = jm.problem(TASK, bare)
     ours = float(alone.log_likelihood(theta) - alone.log_likelihood(alone.start))
     theirs = float(jm.log_likelihood(alone.task(theta), bare) - jm.log_likelihood(TASK, bare))
     assert ours == pytest.approx(theirs, abs=1e-6)
-    assert float(both(theta)) == pytest.approx(float(problem.log_likelihood(theta) + problem.log_prior(theta)), abs=1e-9)
-    slope, step = np.asarray(jax.grad(problem.log_density)(theta)), 1e-5 * np.eye(len(theta))
-    differences = [(float(both(theta + e)) - float(both(theta - e))) / 2e-5 for e in step]
-    np.testing.assert_allclose(slope, differences, rtol=1e-4, atol=1e-5)  # second-order differences of a smooth function
+    steps = 1e-5 * np.concatenate([np.eye(len(theta)), -np.eye(len(theta)), np.zeros((1, len(theta)))])
+    around = np.asarray(at_once(lambda points: jax.lax.map(problem.log_density, points), theta + steps))
+    assert around[-1] == pytest.approx(float(problem.log_likelihood(theta) + problem.log_prior(theta)), abs=1e-9)
+    slope, (ahead, behind) = np.asarray(at_once(jax.grad(problem.log_density), theta)), np.split(around[:-1], 2)
+    # Second-order differences of a smooth function.
+    np.testing.assert_allclose(slope, (ahead - behind) / 2e-5, rtol=1e-4, atol=1e-5)
 
 
 @pytest.mark.slow
@@ -105,9 +107,12 @@ def test_the_log_density_has_second_derivatives():
     """Against differences of the slope, in a step so small that the ripple along the frequency does not show."""
     problem = jm.problem(TASK, TARGET, free=("c_w", "noise_K_w", "harmonic_frequency"))
     theta, step = problem.theta({"c_w": 90.0, "harmonic_frequency": 7.0}), 1e-6 * np.eye(3)
-    slope = jax.jit(jax.grad(problem.log_density))
-    found = np.asarray(jax.jit(jax.hessian(problem.log_density))(theta))
-    differences = np.stack([(np.asarray(slope(theta + e)) - np.asarray(slope(theta - e))) / 2e-6 for e in step])
+    found = np.asarray(at_once(jax.hessian(problem.log_density), theta))
+    slopes = at_once(
+        lambda points: jax.lax.map(jax.grad(problem.log_density), points), theta + np.concatenate([step, -step])
+    )
+    ahead, behind = np.split(np.asarray(slopes), 2)
+    differences = (ahead - behind) / 2e-6
     np.testing.assert_allclose(found, differences, rtol=1e-4)  # a slope of 300 is rounded by 1e-12, divided by the step
     np.testing.assert_allclose(found, found.T, rtol=1e-8)
 

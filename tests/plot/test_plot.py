@@ -934,6 +934,7 @@ def test_several_profiles_share_a_figure_and_a_legend():
 # --- figures as files
 
 
+@pytest.mark.usefixtures("as_fine_as_shipped")
 def test_a_figure_is_written_in_the_formats_asked_for_the_same_each_time(tmp_path):
     def write(*formats):
         figure, ax = plt.subplots(figsize=(2, 1))

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from compiled import drawing
+from compiled import at_once, drawing
 
 import jaxmuscle as jm
 
@@ -45,12 +45,10 @@ def test_every_parameter_forward_reverse_and_by_differences(x64, name):
         return jnp.log(run.spectrum(window=(1.0, 4.0)).power)
 
     one = jnp.ones_like(scale)
-    forward = np.asarray(jax.jit(jax.jacfwd(log_power))(one))
-    reverse = np.asarray(jax.jit(jax.jacrev(log_power))(one))
+    forward, reverse = (np.asarray(at_once(slope(log_power), one)) for slope in (jax.jacfwd, jax.jacrev))
     h = 1e-5  # truncation h² f''' / 6 and rounding 1e-15 / h
-    ahead, behind = jnp.split(
-        jax.jit(jax.vmap(log_power))(one + h * jnp.concatenate([np.eye(one.size), -np.eye(one.size)])), 2
-    )
+    steps = h * np.concatenate([np.eye(one.size), -np.eye(one.size)])
+    ahead, behind = np.split(np.asarray(at_once(jax.vmap(log_power), one + steps)), 2)
     differences = np.asarray(ahead - behind).T / (2 * h)
 
     assert forward.shape == (12, len(names)) and np.all(np.isfinite(forward))

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import references
+from compiled import at_once
 
 import jaxmuscle as jm
 from jaxmuscle.model._noise import Realisation
@@ -29,12 +30,20 @@ def strong_errors(task, factors):
     """Root mean square over seeds of the final state's distance from that of the finest grid."""
     steps = int(FINE * SECONDS)
     keys, scale = jax.random.split(KEY, SEEDS), np.array([30.0, 1.0])  # displacement as velocity, eigenfrequency 30/s
-    fine = jax.vmap(lambda key: task.noise.realise(task.noise.draw(key, steps), 1 / FINE))(keys)
 
-    @eqx.filter_jit
-    def final(path, factor):
+    def drawn(key):
+        path = task.noise.realise(task.noise.draw(key, steps), 1 / FINE)
+        return path.values, path.slopes, path.increments
+
+    fine = at_once(jax.vmap(drawn), keys)
+
+    def final(fine, factor):
         grid = Grid(factor / FINE, steps // factor, steps // factor)
-        return jax.vmap(lambda p: respond(task, coarsened(p, factor), grid, "instant")[0][-1] * scale)(path)
+
+        def ended(path):
+            return respond(task, coarsened(Realisation(*path), factor), grid, "instant")[0][-1] * scale
+
+        return at_once(jax.vmap(ended), fine)
 
     reference = final(fine, 1)
     return [float(jnp.sqrt(jnp.mean(jnp.sum((final(fine, factor) - reference) ** 2, axis=-1)))) for factor in factors]

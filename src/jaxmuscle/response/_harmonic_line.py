@@ -109,7 +109,7 @@ def _table(
     # With ahead, behind = rows @ e^(±i angle m) and z the same of the real and of the imaginary rows, which takes no complex
     # product: Σ |ahead|² + |behind|² = 2 Σ |z|² and Σ ahead conj(behind) = Σ z².
     rows = bin_rows(settings)
-    rows = jnp.asarray(np.concatenate([rows.real, rows.imag], axis=1), angle.dtype)
+    rows = jnp.asarray(np.concatenate([np.real(rows), np.imag(rows)], axis=1), angle.dtype)
     spin = angle * np.arange(settings.length, dtype=angle.dtype)
     z = jax.lax.complex(rows @ jnp.cos(spin), rows @ jnp.sin(spin))
     through = gain * _low_pass(settings, turn)
