@@ -459,6 +459,7 @@ def trial(folder):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("as_fine_as_shipped")
 def test_command(tmp_path):
     path, out = trial(tmp_path), tmp_path / "out"
     done = run(path, "--column", "force", "--window", "4:16", "--out", out, "--save-target", tmp_path / "held.toml")
