@@ -12,6 +12,7 @@ import jax
 import numpy as np
 
 OPTIMISATION = "xla_backend_optimization_level"
+UNREAD = {".pyc", ".png"}  # no test computes from such a file
 _calls: Counter[str] = Counter()
 
 
@@ -25,26 +26,26 @@ def drawing(function: Callable[..., Any]) -> Any:
 def at_once(function: Callable[..., Any], *given: Any) -> Any:
     """`jax.jit(function)(*given)`, of arrays; the next run of the tests loads the program, and neither traces nor lowers it.
 
-    It stands under the name of the test and the number of the call within it. What a test compiles follows from these, if
-    the code of the package and of the tests and the versions of all libraries are the same: they are part of the name.
+    It is found by the name of the test, the number of the call within it, and a digest of all files that a test can be made
+    of. If one of these files has changed, the program is made anew.
     """
     from jaxmuscle._common import programs
 
+    folder = programs.program_folder()
+    if folder is None:
+        return jax.jit(function)(*given)
     leaves, structure = jax.tree.flatten(given)
-    test = os.environ["PYTEST_CURRENT_TEST"]
+    test, tree = os.environ["PYTEST_CURRENT_TEST"], None
     _calls[test] += 1
     kinds = [(np.shape(leaf), str(leaf.dtype)) for leaf in leaves]
-    key = repr((_code(), test, _calls[test], kinds, programs._config(), programs._machine(), os.environ.get("XLA_FLAGS")))
-    folder, tree = programs.program_folder(), None
+    key = repr((test, _calls[test], kinds, programs._config(), programs._machine(), os.environ.get("XLA_FLAGS")))
+    place = folder / _code()[:16] / hashlib.sha256(key.encode()).hexdigest()
 
     def flat(*leaves: Any) -> list[Any]:
         nonlocal tree
         found, tree = jax.tree.flatten(function(*jax.tree.unflatten(structure, leaves)))
         return found
 
-    if folder is None:
-        return jax.jit(function)(*given)
-    place = folder / _code()[:16] / hashlib.sha256(key.encode()).hexdigest()
     compiled = None
     if (entry := programs._read(place)) is not None:
         compiled, tree = programs._load(folder / entry[0]), entry[1]
@@ -57,10 +58,11 @@ def at_once(function: Callable[..., Any], *given: Any) -> Any:
 
 @functools.cache
 def _code() -> str:
-    """Digest of the code of the package and of the tests, and of the versions of what they call."""
+    """Digest of what a test can be made of: the package with its data, tests, pages; and the versions of what they call."""
     from jaxmuscle._common import programs
 
-    digest = hashlib.sha256(programs._code().encode())
-    for path in sorted(Path(__file__).parent.rglob("*.py")):
-        digest.update(path.name.encode() + b"\0" + path.read_bytes())
+    digest, root = hashlib.sha256(programs._code().encode()), Path(__file__).parents[1]
+    files = [path for folder in ("src", "tests", "docs", "benchmarks", "fitting") for path in (root / folder).rglob("*")]
+    for path in sorted(path for path in files if path.is_file() and path.suffix not in UNREAD):
+        digest.update(path.relative_to(root).as_posix().encode() + b"\0" + path.read_bytes())
     return digest.hexdigest()

@@ -18,9 +18,7 @@ try:
 except ImportError:  # no public part of it
     _decorator = _sentinel = jaxtyped = None
 
-# Calls of a function that are checked in a test: so many, then one of so many. Of a function within one the first: it is
-# made anew, and its check with it, whenever that one is called.
-FIRST, WITHIN, EVERY = 2, 1, 128
+FIRST, EVERY = 4, 128  # calls of a function that are checked in a test: so many, then one of so many
 _calls: dict[int, int] = {}
 
 
@@ -43,13 +41,12 @@ def _sparingly(function: Any = _sentinel, *, typechecker: Any = _sentinel) -> An
     if hasattr(function, "sparingly"):  # inherited
         return function
     code, checked = id(function.__code__), None  # of a function within one the same at each of its calls
-    first = WITHIN if "<locals>" in function.__qualname__ else FIRST
 
     @functools.wraps(function)
     def wrapper(*args: Any, **kwargs: Any) -> Any:
         nonlocal checked
         _calls[code] = count = _calls.get(code, 0) + 1
-        if count > first and count % EVERY:
+        if count > FIRST and count % EVERY:
             return function(*args, **kwargs)
         if checked is None:
             checked = jaxtyped(function, typechecker=typechecker)
