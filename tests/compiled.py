@@ -9,9 +9,12 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 
 OPTIMISATION = "xla_backend_optimization_level"
+ARRAYS = (jax.Array, np.ndarray, np.generic)
 UNREAD = {".pyc", ".png"}  # no test computes from such a file
 _calls: Counter[str] = Counter()
 
@@ -29,31 +32,55 @@ def at_once(function: Callable[..., Any], *given: Any) -> Any:
     It is found by the name of the test, the number of the call within it, and a digest of all files that a test can be made
     of. If one of these files has changed, the program is made anew.
     """
+    return jit_at_once(function)(*given)
+
+
+def jit_at_once(function: Callable[..., Any], **options: Any) -> Callable[..., Any]:
+    """`jax.jit(function)`, its programs found as those of `at_once`; with options, or traced by JAX, just that."""
+    whole = jax.jit(function, **options)
+    test = os.environ["PYTEST_CURRENT_TEST"]
+    _calls[test] += 1
+    number, made = _calls[test], {}
+
+    def inside(*given: Any, **named: Any) -> Any:
+        from jaxmuscle._common import programs
+
+        leaves, structure = jax.tree.flatten(given)
+        leaves = [jnp.asarray(x) if isinstance(x, int | float) else x for x in leaves]
+        folder = programs.program_folder()
+        if options or named or folder is None or not all(map(_known, leaves)):
+            return whole(*given, **named)
+        known = (structure, tuple(map(programs._kind, leaves)), programs._config())
+        if known not in made:
+            made[known] = _program(function, leaves, structure, folder, (test, number, str(known[0]), *known[1:]))
+        compiled, tree = made[known]
+        return jax.tree.unflatten(tree, compiled(*leaves))
+
+    return inside
+
+
+def _known(leaf: Any) -> bool:
+    return isinstance(leaf, ARRAYS) and not isinstance(leaf, Tracer)
+
+
+def _program(function: Any, leaves: list[Any], structure: Any, folder: Path, name: tuple[Any, ...]) -> tuple[Any, Any]:
+    """A program of arrays, and the tree of what it returns."""
     from jaxmuscle._common import programs
 
-    folder = programs.program_folder()
-    if folder is None:
-        return jax.jit(function)(*given)
-    leaves, structure = jax.tree.flatten(given)
-    test, tree = os.environ["PYTEST_CURRENT_TEST"], None
-    _calls[test] += 1
-    kinds = [(np.shape(leaf), str(leaf.dtype)) for leaf in leaves]
-    key = repr((test, _calls[test], kinds, programs._config(), programs._machine(), os.environ.get("XLA_FLAGS")))
-    place = folder / _code()[:16] / hashlib.sha256(key.encode()).hexdigest()
+    tree = None
 
     def flat(*leaves: Any) -> list[Any]:
         nonlocal tree
         found, tree = jax.tree.flatten(function(*jax.tree.unflatten(structure, leaves)))
         return found
 
-    compiled = None
-    if (entry := programs._read(place)) is not None:
-        compiled, tree = programs._load(folder / entry[0]), entry[1]
-    if compiled is None:
-        flat.__name__ = "kept_in_test"
-        lowered = jax.jit(flat, keep_unused=True).lower(*leaves)
-        compiled = programs._compiled(lowered, {OPTIMISATION: 0}, place, tree)
-    return jax.tree.unflatten(tree, compiled(*leaves))
+    key = repr((name, programs._machine(), os.environ.get("XLA_FLAGS")))
+    place = folder / _code()[:16] / hashlib.sha256(key.encode()).hexdigest()
+    if (entry := programs._read(place)) is not None and (compiled := programs._load(folder / entry[0])) is not None:
+        return compiled, entry[1]
+    flat.__name__ = "kept_in_test"
+    lowered = jax.jit(flat, keep_unused=True).lower(*leaves)
+    return programs._compiled(lowered, {OPTIMISATION: 0}, place, tree), tree
 
 
 @functools.cache
