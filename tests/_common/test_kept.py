@@ -1,14 +1,14 @@
 """Compiled programs that outlive the process: loaded where nothing changed, made again where anything stands against it."""
 
 import os
-import subprocess
-import sys
 import threading
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from processes import ended, python, true_python
 
 import jaxmuscle as jm
 from jaxmuscle._common import programs
@@ -221,21 +221,15 @@ def test_between_processes(tmp_path):
 
     Without a cache there are no files.
     """
-    environment = {**os.environ, "JAX_COMPILATION_CACHE_DIR": str(tmp_path / "jax"), "XLA_FLAGS": ""}
-
-    def process(**changes):
-        command = [sys.executable, "-c", SCRIPT]
-        return subprocess.Popen(command, env=environment | changes, stdout=subprocess.PIPE, text=True)
+    users: Any = {"JAX_COMPILATION_CACHE_DIR": str(tmp_path / "jax"), "XLA_FLAGS": ""}
 
     def printed(one):
-        out, _ = one.communicate(timeout=300)
-        assert one.returncode == 0
-        traces, power, heavy = out.split()
+        traces, power, heavy = ended(one)[0].split()
         return int(traces), power, int(heavy)
 
-    off = process(JAXMUSCLE_CACHE="off", JAX_COMPILATION_CACHE_DIR=str(tmp_path / "none"))
+    off = python(SCRIPT, **users | {"JAXMUSCLE_CACHE": "off", "JAX_COMPILATION_CACHE_DIR": str(tmp_path / "none")})
     assert printed(off)[0] == 1 and not (tmp_path / "none" / "jaxmuscle").exists()
-    first = [printed(one) for one in [process(), process()]]
-    traces, power, heavy = printed(process())
+    first = [printed(one) for one in [python(SCRIPT, **users), python(SCRIPT, **users)]]
+    traces, power, heavy = printed(true_python(SCRIPT, **users))
     assert traces == 0 and all(power == other for _, other, _ in first)
     assert heavy == 0  # what only traces and draws is not even imported

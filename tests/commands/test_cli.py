@@ -18,6 +18,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 import typer
+from processes import ended, python
 from test_result import assert_equal, failed_result, made_result
 from typer.testing import CliRunner
 
@@ -857,15 +858,12 @@ _cli_fit.told = loud
 main()
 """
     arguments = ["fit", str(csv_file(tmp_path)), "--free", "c_w,noise_K_w", "--starts", "4", "--seeds", "24"]
-    command = [sys.executable, "-c", code, *arguments, "--out", str(tmp_path / "out")]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
-        assert process.stdout is not None
-        for line in process.stdout:
-            if line.startswith("searching from"):
-                process.send_signal(signal.SIGINT)
-                break
-        _, errors = process.communicate(timeout=300)
-    assert process.returncode == 130, errors
+    process = python(code, *arguments, "--out", str(tmp_path / "out"))
+    for line in process.stdout:
+        if line.startswith("searching from"):
+            process.send_signal(signal.SIGINT)
+            break
+    _, errors = ended(process, 130)
     assert "Traceback" not in errors and "what had been reached" in errors
     result = jm.load_result(tmp_path / "out" / "fit.json")
     assert not result.success and "interrupted after" in result.message

@@ -1,20 +1,18 @@
 """Signals end a command soon, with their exit code and no traceback, and what was reached is kept."""
 
-import os
 import signal
-import subprocess
 import sys
 import time
-from pathlib import Path
 
 import jax
+import processes
 import pytest
+from processes import python, true_python
 
 import jaxmuscle as jm
 from jaxmuscle.ensembles._places import place_of
 from jaxmuscle.ensembles._tallies import read_tallies
 
-SRC = Path(__file__).parents[2] / "src"
 BEGIN = """
 import os, signal, socket, sys, time
 signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs ignore it
@@ -27,17 +25,14 @@ def send(number):
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="has no such signals")
 
 
-def begun(code, *arguments, cwd=None):
+def begun(code, *arguments, cwd=None, begin=python):
     """A process of that program, which can say when it wants a signal."""
-    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
-    environment = os.environ | {"PYTHONPATH": str(SRC)}
-    return subprocess.Popen([sys.executable, "-c", BEGIN + code, *arguments], env=environment, cwd=cwd, **pipes)
+    return begin(BEGIN + code, *arguments, cwd=cwd)
 
 
 def ended(process, code):
     """What a process said, which ended with that exit code and in order."""
-    out, errors = process.communicate(timeout=120)
-    assert process.returncode == code, errors
+    out, errors = processes.ended(process, code, 120)
     assert "Traceback" not in errors and "Exception ignored" not in errors
     return out + errors
 
@@ -119,7 +114,7 @@ class Now:
             send(signal.SIGINT)
 sys.meta_path.insert(0, Now())
 main()"""
-    process = begun(code, "fit", "vastus-lateralis-26mvc", "--out", "out", cwd=tmp_path)
+    process = begun(code, "fit", "vastus-lateralis-26mvc", "--out", "out", cwd=tmp_path, begin=true_python)
     assert ended(process, 130).strip().startswith("interrupted")
     assert not list(tmp_path.rglob("*.*"))
 

@@ -2,16 +2,13 @@
 
 import contextlib
 import json
-import os
 import random
 import shutil
 import signal
 import socket
 import subprocess
-import sys
 import threading
 import time
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -20,6 +17,7 @@ import numpy as np
 import pytest
 import scipy.signal
 import xarray
+from processes import command, ended, python, true_command
 from test_simulate import Integral
 from typer.testing import CliRunner
 
@@ -36,8 +34,6 @@ from jaxmuscle.simulation import _batch
 KEY = jax.random.key(5)
 TASK = jm.Isometric()
 SHORT = {"duration": 1.0, "chunk": 8}  # the force begins to rise at 0.5 s
-PYTHON = [sys.executable, "-c"]
-COMMAND = [sys.executable, "-m", "jaxmuscle"]
 
 
 class Brittle(Integral):
@@ -525,10 +521,6 @@ def test_threads_must_be_a_number():
         jm.ensemble(TASK, KEY, seeds=8, threads=0, **SHORT)
 
 
-def environment():
-    return os.environ | {"PYTHONPATH": str(Path(__file__).parents[2] / "src")}
-
-
 @pytest.mark.slow
 def test_seeds_are_shared_by_devices_and_need_not_divide(tmp_path):
     """Three devices: 20 seeds, 5 points, and a store begun with one device. As GPUs are, which are cores here."""
@@ -547,7 +539,7 @@ np.savez({str(tmp_path / "found.npz")!r}, runs=runs.output, sweep=np.stack([m.ou
 """
     with pytest.raises(Stop):
         jm.ensemble(TASK, KEY, seeds=45, store=tmp_path / "a.zarr", progress=stopped_after(2), **SHORT)
-    subprocess.run([*PYTHON, program], check=True, env=environment())
+    ended(python(program))
     found = np.load(tmp_path / "found.npz")
     close(found["runs"], jm.ensemble(TASK, KEY, seeds=20, duration=1.0).output)
     close(found["store"], jm.ensemble(TASK, KEY, seeds=45, duration=1.0).output)
@@ -564,13 +556,11 @@ def free_port():
             return port
 
 
-def started(count, arguments, folder):
+def started(count, arguments, folder, begin=command):
     """Several processes of `jaxmuscle ensemble` on the loopback."""
-    port = free_port()
-    common = [*COMMAND, "ensemble", "zagrodny-slifkin", *arguments, "--coordinator", f"127.0.0.1:{port}"]
-    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
+    common = ["ensemble", "zagrodny-slifkin", *arguments, "--coordinator", f"127.0.0.1:{free_port()}"]
     each = [[*common, "--processes", str(count), "--process-id", str(i)] for i in range(count)]
-    return [subprocess.Popen(command, env=environment(), cwd=folder, **pipes) for command in each]
+    return [begin(*one, cwd=folder, merged=True) for one in each]
 
 
 @pytest.mark.slow
@@ -578,8 +568,7 @@ def test_several_processes_give_the_numbers_of_one(tmp_path):
     """Three, reduced; two write trajectories in the test of one that dies."""
     arguments = ["--seeds", "60", "--duration", "1", "--chunk", "8", "--reduce", "--out", "runs.zarr"]
     workers = started(3, arguments, tmp_path)
-    told = [worker.communicate(timeout=300)[0] for worker in workers]
-    assert [worker.returncode for worker in workers] == [0, 0, 0], told
+    told = [ended(worker)[0] for worker in workers]
     assert ["Written" in text for text in told] == [True, False, False]
     found = xarray.open_zarr(tmp_path / "runs.zarr")
     assert found.attrs["complete"]
@@ -605,10 +594,8 @@ if rank == 0:
 def test_one_of_several_processes_simulates_alone_in_memory():
     """Only a store is shared: who has none must not wait for the others."""
     port = str(free_port())
-    workers = [subprocess.Popen([*PYTHON, ALONE, str(rank), port], env=environment(), stdout=subprocess.PIPE, text=True)
-               for rank in range(2)]  # fmt: skip
-    told = [worker.communicate(timeout=300)[0].strip() for worker in workers]
-    assert told == ["(12, 101)", ""] and [worker.returncode for worker in workers] == [0, 0]
+    workers = [python(ALONE, str(rank), port) for rank in range(2)]
+    assert [ended(worker)[0].strip() for worker in workers] == ["(12, 101)", ""]
 
 
 def wait_for(condition, seconds=120.0):
@@ -625,42 +612,29 @@ def test_a_process_that_dies_stops_the_others_and_loses_nothing(tmp_path):
     path = tmp_path / "runs.zarr"
     wait_for((path / "progress" / "chunk-00000001.json").exists)  # process 1 has the odd chunks
     workers[1].kill()
-    told = workers[0].communicate(timeout=300)[0]
-    workers[1].communicate()
-    assert workers[0].returncode == 1, told
+    told, _ = ended(workers[0], 1)
+    ended(workers[1], -signal.SIGKILL)
     assert "another process of this run died or stopped" in told and "--resume" in told
     assert xarray.open_zarr(path).attrs["complete"] is False
-    done = subprocess.run(
-        [*COMMAND, "ensemble", "zagrodny-slifkin", *arguments, "--resume"], env=environment(), cwd=tmp_path
-    )
-    assert done.returncode == 0
+    ended(command("ensemble", "zagrodny-slifkin", *arguments, "--resume", cwd=tmp_path))
     whole = jm.ensemble(jm.load_preset("zagrodny-slifkin"), jax.random.key(0), seeds=1600, duration=1.0, control=False)
     close(xarray.open_zarr(path)["P_w"], whole.output)
 
 
 @pytest.mark.slow
 def test_processes_fail_together(tmp_path):
-    """What process 0 finds wrong is said by all, in one line."""
+    """What process 0 finds wrong is said by all, in one line. These processes are no forks."""
     (tmp_path / "runs.zarr").write_text("a file")
-    workers = started(2, ["--seeds", "8", "--duration", "1", "--out", "runs.zarr"], tmp_path)
-    told = [worker.communicate(timeout=300)[0] for worker in workers]
-    assert [worker.returncode for worker in workers] == [2, 2], told
+    workers = started(2, ["--seeds", "8", "--duration", "1", "--out", "runs.zarr"], tmp_path, true_command)
+    told = [ended(worker, 2)[0] for worker in workers]
     assert all("error: runs.zarr: exists already" in text for text in told)
 
 
-RUNS = """
-import os, sys, diffrax, jax, xarray, zarr
-import jaxmuscle as jm, jaxmuscle.ensembles._run as run
+RUN = """
+import sys, jax, jaxmuscle as jm, jaxmuscle.ensembles._run as run
 run.KEEP_EVERY = run.KEEP_SHARE = 0
-Task, ensemble = jm.Isometric, jm.ensemble  # imported once; without a device so far, so that each run can be a fork
-for _ in sys.stdin:
-    pid = os.fork()
-    if pid == 0:
-        ensemble(Task(), jax.random.key(5), seeds=12000, duration=1.0, chunk=8, store=sys.argv[1], resume=True,
-                 **({"reduce": True} if sys.argv[2] == "reduced" else {}))
-        os._exit(0)
-    print(pid, flush=True)
-    print(os.waitpid(pid, 0)[1], flush=True)
+jm.ensemble(jm.Isometric(), jax.random.key(5), seeds=12000, duration=1.0, chunk=8, store=sys.argv[1], resume=True,
+            **({"reduce": True} if sys.argv[2] == "reduced" else {}))
 """
 
 
@@ -668,30 +642,18 @@ for _ in sys.stdin:
 @pytest.mark.parametrize("kind", ["trajectories", "reduced"])
 def test_kill_9_six_times(tmp_path, kind):
     """Each time at a random moment after the store is there; the end is that of an uninterrupted run."""
-    path, rng = tmp_path / "runs.zarr", random.Random(kind)
-    pipes: Any = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True, "bufsize": 1}
-    with subprocess.Popen([*PYTHON, RUNS, str(path), kind], env=environment(), **pipes) as runs:
-
-        def begun():
-            runs.stdin.write("run\n")
-            return int(runs.stdout.readline())
-
-        def ended():
-            return int(runs.stdout.readline())
-
-        kills = 0
-        while kills < 4:
-            before, pid = amount(path), begun()
-            wait_for(lambda before=before: amount(path) != before)
-            time.sleep(rng.uniform(0, 0.4))
-            with contextlib.suppress(ProcessLookupError):
-                os.kill(pid, signal.SIGKILL)
-            if ended() == 0 or xarray.open_zarr(path).attrs["complete"]:
-                break
-            kills += 1
-        assert kills >= 3, "too fast to be interrupted: the test shows nothing"
-        begun()
-        assert ended() == 0
+    path, rng, kills = tmp_path / "runs.zarr", random.Random(kind), 0
+    while kills < 4:
+        before, run = amount(path), python(RUN, str(path), kind)
+        wait_for(lambda before=before: amount(path) != before)
+        time.sleep(rng.uniform(0, 0.4))
+        run.kill()
+        run.communicate()
+        if run.returncode == 0 or xarray.open_zarr(path).attrs["complete"]:
+            break
+        kills += 1
+    assert kills >= 3, "too fast to be interrupted: the test shows nothing"
+    ended(python(RUN, str(path), kind))
     found = xarray.open_zarr(path)
     assert found.attrs["complete"] is True
     if kind == "trajectories":
@@ -726,8 +688,7 @@ print(before, peak_memory())
 
 @pytest.mark.slow
 def test_memory_does_not_grow_with_the_seeds():
-    done = subprocess.run([*PYTHON, MEMORY], capture_output=True, text=True, check=True, env=environment())
-    before, after = map(int, done.stdout.split())
+    before, after = map(int, ended(python(MEMORY))[0].split())
     assert 0 < after < 1.1 * before  # 16 times as many seeds
 
 
@@ -784,9 +745,7 @@ def test_the_command_refuses_bad_input(tmp_path, arguments, message):
 
 @pytest.mark.slow
 def test_the_speed_of_this_machine():
-    done = subprocess.run([*COMMAND, "speed", "--seeds", "16", "--duration", "0.2", "--json"], env=environment(),
-                          capture_output=True, text=True, check=True)  # fmt: skip
-    found = json.loads(done.stdout)
+    found = json.loads(ended(command("speed", "--seeds", "16", "--duration", "0.2", "--json"))[0])
     assert found["compile_s"] > 0 and found["seeds_per_s"] > 0
     assert found["million_steps_per_s"] == pytest.approx(found["seeds_per_s"] * 200 * found["substeps"] / 1e6)
     assert found["real_time_factor"] == pytest.approx(found["seeds_per_s"] * 0.2)

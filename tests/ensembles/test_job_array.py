@@ -2,8 +2,6 @@
 
 import json
 import random
-import subprocess
-import sys
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -14,7 +12,8 @@ import jax
 import numpy as np
 import pytest
 import xarray
-from test_ensemble import BRITTLE, COMMAND, KEY, RUNNER, SHORT, TASK, Stop, close, environment, stopped_after
+from processes import command, ended, environment
+from test_ensemble import BRITTLE, KEY, RUNNER, SHORT, TASK, Stop, close, stopped_after
 
 import jaxmuscle as jm
 from jaxmuscle.commands.main import app
@@ -264,16 +263,9 @@ def test_parts_killed_at_random_end_as_one_run(tmp_path, monkeypatch, reduce):
     assert any(early for _, early in trials), "nothing was interrupted: the test shows nothing"
 
 
-def started(part, out, *more):
+def started(part, out):
     arguments = ["--seeds", "60", "--duration", "1", "--chunk", "8", "--threads", "1", "--out", out, "--part", part]
-    pipes: Any = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
-    return subprocess.Popen([*COMMAND, "ensemble", "zagrodny-slifkin", *arguments, *more], env=environment(), **pipes)
-
-
-def ended(processes, code=0):
-    told = [process.communicate(timeout=300)[0] for process in processes]
-    assert [process.returncode for process in processes] == [code] * len(processes), told
-    return told
+    return command("ensemble", "zagrodny-slifkin", *arguments, merged=True)
 
 
 @pytest.mark.slow
@@ -281,9 +273,9 @@ def test_commands_that_begin_together(tmp_path):
     """In a folder all at once; in what plays an object store, whose files are not replaced in one step, after the first."""
     whole = jm.ensemble(jm.load_preset("zagrodny-slifkin"), jax.random.key(0), seeds=60, duration=1.0, control=False)
     for out, first in ((str(tmp_path / "a.zarr"), []), (f"local://{tmp_path}/b.zarr", ["2/3"])):
-        told = ended([started(part, out) for part in first])
-        told += ended([started(part, out) for part in ("1/3", "2/3", "3/3") if part not in first])
-        assert all(f"jaxmuscle merge {out}" in text for text in told)
+        told = [ended(started(part, out)) for part in first]
+        told += map(ended, [started(part, out) for part in ("1/3", "2/3", "3/3") if part not in first])
+        assert all(f"jaxmuscle merge {out}" in text for text, _ in told)
         done = RUNNER.invoke(app, ["merge", out])
         assert done.exit_code == 0 and f"Merged: {out}" in done.stdout, done.output
         np.testing.assert_array_equal(jm.ensembles.merge(out)["P_w"], whole.output)
