@@ -205,10 +205,33 @@ def test_threads_make_one_result(x64, folder):
         np.testing.assert_allclose(np.asarray(result["x"], float), np.linalg.solve(MATRIX, MATRIX[0]), rtol=1e-5)
 
 
-SCRIPT = """
+SOLVED = """
+import jax, jax.numpy as jnp, numpy as np, jaxmuscle as jm
+from jaxmuscle._common.arrays import as_arrays
+from jaxmuscle._common.programs import Kept
+jax.config.update("jax_enable_x64", True)
+program = Kept(lambda task, matrix: (jnp.linalg.solve(matrix, matrix[0]), task.muscle.base()))
+found = program(as_arrays(jm.Isometric(), np.float64), np.array([[2.0, 1.0], [0.5, 3.0]]))
+print(program.traces, *(np.asarray(x).tobytes().hex() for x in found), sep="-")
+"""
+
+
+@pytest.mark.slow
+def test_between_processes(tmp_path):
+    """Two at once, then one more, which traces nothing. Without a cache there are no files."""
+    users: Any = {"JAX_COMPILATION_CACHE_DIR": str(tmp_path / "jax"), "XLA_FLAGS": ""}
+    off = users | {"JAXMUSCLE_CACHE": "off", "JAX_COMPILATION_CACHE_DIR": str(tmp_path / "none")}
+    alone, *both = [ended(one)[0].partition("-") for one in [python(SOLVED, **given) for given in (off, users, users)]]
+    assert alone[0] == "1" and not (tmp_path / "none" / "jaxmuscle").exists()
+    last = ended(python(SOLVED, **users))[0].partition("-")
+    assert last[0] == "0" and all(found[2] == last[2] for found in (alone, *both))
+
+
+LOADED = """
 import sys, jax, numpy as np, jaxmuscle as jm
 from jaxmuscle.response import _expected
 jax.config.update("jax_enable_x64", True)
+jax.config.update("jax_numpy_dtype_promotion", "strict")  # as the tests
 power = np.asarray(jm.expected_spectrum(jm.Isometric()).power)
 heavy = {"diffrax", "optimistix", "scipy.signal", "scipy.stats", "matplotlib", "rich"} & set(sys.modules)
 print(_expected._compiled_response.traces, power.tobytes().hex(), len(heavy))
@@ -216,20 +239,7 @@ print(_expected._compiled_response.traces, power.tobytes().hex(), len(heavy))
 
 
 @pytest.mark.slow
-def test_between_processes(tmp_path):
-    """Two at once, then one more; the last traces nothing, and imports nothing that only tracing needs.
-
-    Without a cache there are no files.
-    """
-    users: Any = {"JAX_COMPILATION_CACHE_DIR": str(tmp_path / "jax"), "XLA_FLAGS": ""}
-
-    def printed(one):
-        traces, power, heavy = ended(one)[0].split()
-        return int(traces), power, int(heavy)
-
-    off = python(SCRIPT, **users | {"JAXMUSCLE_CACHE": "off", "JAX_COMPILATION_CACHE_DIR": str(tmp_path / "none")})
-    assert printed(off)[0] == 1 and not (tmp_path / "none" / "jaxmuscle").exists()
-    first = [printed(one) for one in [python(SCRIPT, **users), python(SCRIPT, **users)]]
-    traces, power, heavy = printed(true_python(SCRIPT, **users))
-    assert traces == 0 and all(power == other for _, other, _ in first)
-    assert heavy == 0  # what only traces and draws is not even imported
+def test_another_process_loads_what_this_one_made(x64):
+    """It traces nothing, and imports nothing that only tracing and drawing need."""
+    power = np.asarray(jm.expected_spectrum(jm.Isometric()).power)
+    assert ended(true_python(LOADED))[0].split() == ["0", power.tobytes().hex(), "0"]
