@@ -30,6 +30,7 @@ from jaxmuscle.ensembles._processes import join
 from jaxmuscle.ensembles._running_moments import CELLS, add, count_cells, empty, merged, moments, quantiles, set_cells
 from jaxmuscle.ensembles._store import differences
 from jaxmuscle.simulation import _batch
+from jaxmuscle.simulation._simulate import schedule
 
 KEY = jax.random.key(5)
 TASK = jm.Isometric()
@@ -95,7 +96,7 @@ def test_a_quantile_beyond_the_cells_is_not_made_up():
 
 @pytest.mark.slow
 def test_a_reduced_ensemble_has_the_moments_of_the_whole_one():
-    runs = jm.ensemble(TASK, KEY, seeds=30)
+    runs = jm.ensemble(TASK, KEY, seeds=30, chunk=8)
     output = np.asarray(runs.output, float)
     for chunk in (8, 64):  # seeds of the point in pieces, or together
         found = jm.ensemble(TASK, KEY, seeds=30, reduce=(0.1, 0.5), chunk=chunk)
@@ -152,8 +153,7 @@ def test_what_breaks_is_left_out_and_named():
 
 @pytest.mark.slow
 def test_where_nothing_is_left_nothing_is_said():
-    limit = {"amplitude": 50.0, "relative": False}
-    broken = Brittle(noise=jm.BandLimitedNoise(**limit), harmonic=jm.Harmonic(0.0))
+    broken = Brittle(noise=jm.OrnsteinUhlenbeckNoise(50.0, 0.01, relative=False), harmonic=jm.Harmonic(0.0))
     with pytest.raises(jm.errors.SimulationError, match="none of the first seeds of point 0 stayed finite"):
         jm.ensemble(broken, KEY, seeds=40, reduce=True, **SHORT)
     whole = jm.ensemble(broken, KEY, seeds=8, reduce=True, **SHORT)
@@ -186,7 +186,7 @@ def test_a_reduced_sweep_has_the_moments_of_every_point(seeds, chunk):
     found = jm.ensemble(sweep, KEY, seeds=seeds, reduce=True, duration=1.0, chunk=chunk)
     assert found.mean.shape == (5, 101) and found.quantile.shape == (5, 5, 101)
     for point in (0, 4):
-        output = np.asarray(jm.ensemble(sweep[point], KEY, seeds=seeds, duration=1.0).output, float)
+        output = np.asarray(jm.ensemble(sweep[point], KEY, seeds=seeds, **SHORT).output, float)
         close(found.mean[point], output.mean(axis=0))
     np.testing.assert_array_equal(found.to_xarray()["k_w"], sweep.labels["k_w"])
     table = found.to_dataframe()
@@ -201,7 +201,7 @@ def test_persons_differ_in_numbers_only():
     assert set(persons.labels) == {"name", "m_w", "c_w"}
     stiff = [TASK, TASK.replace(c_w=400.0)]  # the faster one asks for sub-steps
     runs = jm.ensemble(stiff, KEY, seeds=2, duration=1.0)
-    assert runs[0].substeps == runs[1].substeps == jm.simulate(stiff[1], KEY, duration=1.0).substeps
+    assert runs[0].substeps == runs[1].substeps == schedule(stiff[1], 1.0, 1e-3, None, None, None).grid.substeps > 1
     with pytest.raises(ValueError, match=r"task 1 of the sweep differs from task 0 in more than numbers.*PinkNoise"):
         jm.Sweep.of([TASK, jm.Isometric(noise=jm.PinkNoise())])
 
@@ -269,7 +269,7 @@ def test_a_store_of_a_sweep_has_points(tmp_path):
     for name, seeds in (("few", 2), ("many", 20)):
         dataset = jm.ensemble(sweep, KEY, seeds=seeds, store=tmp_path / name, **SHORT)
         assert dict(dataset.sizes) == {"point": 3, "seed": seeds, "time": 101}
-        close(dataset["F_ext"][1], jm.ensemble(sweep[1], KEY, seeds=seeds, duration=1.0).output)
+        close(dataset["F_ext"][1], jm.ensemble(sweep[1], KEY, seeds=seeds, **SHORT).output)
         np.testing.assert_array_equal(dataset.coords["k_w"], [4e5, 5e5, 6e5])
 
 
@@ -445,7 +445,7 @@ def test_a_full_disk(small_disk, monkeypatch, reduce):
     ballast.unlink()
     subprocess.run(["mount", "-o", "remount,size=64m", str(small_disk)], check=True)
     found = jm.ensemble(TASK, KEY, **given, resume=True)
-    whole = np.asarray(jm.ensemble(TASK, KEY, seeds=200, duration=5.0, control=False).output, float)
+    whole = np.asarray(jm.ensemble(TASK, KEY, seeds=200, duration=5.0, chunk=16, control=False).output, float)
     close(found.mean if reduce else found["F_ext"], whole.mean(axis=0) if reduce else whole)
 
 
@@ -541,9 +541,10 @@ np.savez({str(tmp_path / "found.npz")!r}, runs=runs.output, sweep=np.stack([m.ou
         jm.ensemble(TASK, KEY, seeds=45, store=tmp_path / "a.zarr", progress=stopped_after(2), **SHORT)
     ended(python(program))
     found = np.load(tmp_path / "found.npz")
-    close(found["runs"], jm.ensemble(TASK, KEY, seeds=20, duration=1.0).output)
-    close(found["store"], jm.ensemble(TASK, KEY, seeds=45, duration=1.0).output)
-    sweep = jm.ensemble(jm.Sweep.grid(TASK, k_w=[4e5, 5e5, 6e5, 7e5, 8e5]), KEY, seeds=2, duration=1.0)
+    whole = jm.ensemble(TASK, KEY, seeds=45, **SHORT).output
+    close(found["runs"], whole[:20])
+    close(found["store"], whole)
+    sweep = [jm.ensemble(TASK.replace(k_w=k_w), KEY, seeds=2, **SHORT) for k_w in (4e5, 5e5, 6e5, 7e5, 8e5)]
     close(found["sweep"], np.stack([np.asarray(member.output) for member in sweep]))
 
 
@@ -617,7 +618,7 @@ def test_a_process_that_dies_stops_the_others_and_loses_nothing(tmp_path):
     assert "another process of this run died or stopped" in told and "--resume" in told
     assert xarray.open_zarr(path).attrs["complete"] is False
     ended(command("ensemble", "zagrodny-slifkin", *arguments, "--resume", cwd=tmp_path))
-    whole = jm.ensemble(jm.load_preset("zagrodny-slifkin"), jax.random.key(0), seeds=1600, duration=1.0, control=False)
+    whole = jm.ensemble(jm.load_preset("zagrodny-slifkin"), jax.random.key(0), seeds=1600, control=False, **SHORT)
     close(xarray.open_zarr(path)["P_w"], whole.output)
 
 
@@ -633,7 +634,7 @@ def test_processes_fail_together(tmp_path):
 RUN = """
 import sys, jax, jaxmuscle as jm, jaxmuscle.ensembles._run as run
 run.KEEP_EVERY = run.KEEP_SHARE = 0
-jm.ensemble(jm.Isometric(), jax.random.key(5), seeds=12000, duration=1.0, chunk=8, store=sys.argv[1], resume=True,
+jm.ensemble(jm.Isometric(), jax.random.key(5), seeds=4000, duration=1.0, chunk=8, store=sys.argv[1], resume=True,
             **({"reduce": True} if sys.argv[2] == "reduced" else {}))
 """
 
@@ -641,12 +642,12 @@ jm.ensemble(jm.Isometric(), jax.random.key(5), seeds=12000, duration=1.0, chunk=
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["trajectories", "reduced"])
 def test_kill_9_six_times(tmp_path, kind):
-    """Each time at a random moment after the store is there; the end is that of an uninterrupted run."""
+    """Each time at a random moment after it goes on; the end is that of an uninterrupted run."""
     path, rng, kills = tmp_path / "runs.zarr", random.Random(kind), 0
     while kills < 4:
         before, run = amount(path), python(RUN, str(path), kind)
         wait_for(lambda before=before: amount(path) != before)
-        time.sleep(rng.uniform(0, 0.4))
+        time.sleep(rng.uniform(0, 0.1))  # of chunks of a few milliseconds
         run.kill()
         run.communicate()
         if run.returncode == 0 or xarray.open_zarr(path).attrs["complete"]:
@@ -657,10 +658,10 @@ def test_kill_9_six_times(tmp_path, kind):
     found = xarray.open_zarr(path)
     assert found.attrs["complete"] is True
     if kind == "trajectories":
-        output = jm.ensemble(TASK, KEY, seeds=12000, duration=1.0, chunk=8, control=False).output
+        output = jm.ensemble(TASK, KEY, seeds=4000, duration=1.0, chunk=8, control=False).output
         np.testing.assert_array_equal(found["F_ext"], output)
         return
-    whole = jm.ensemble(TASK, KEY, seeds=12000, duration=1.0, chunk=8, reduce=True)
+    whole = jm.ensemble(TASK, KEY, seeds=4000, duration=1.0, chunk=8, reduce=True)
     np.testing.assert_allclose(found["mean"], whole.mean, rtol=1e-12)
     np.testing.assert_allclose(found["variance"], whole.variance, rtol=1e-9)
     np.testing.assert_array_equal(found["quantiles"], whole.quantile)

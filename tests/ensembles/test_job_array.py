@@ -271,7 +271,7 @@ def started(part, out):
 @pytest.mark.slow
 def test_commands_that_begin_together(tmp_path):
     """In a folder all at once; in what plays an object store, whose files are not replaced in one step, after the first."""
-    whole = jm.ensemble(jm.load_preset("zagrodny-slifkin"), jax.random.key(0), seeds=60, duration=1.0, control=False)
+    whole = jm.ensemble(jm.load_preset("zagrodny-slifkin"), jax.random.key(0), seeds=60, control=False, **SHORT)
     for out, first in ((str(tmp_path / "a.zarr"), []), (f"local://{tmp_path}/b.zarr", ["2/3"])):
         told = [ended(started(part, out)) for part in first]
         told += map(ended, [started(part, out) for part in ("1/3", "2/3", "3/3") if part not in first])
