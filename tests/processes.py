@@ -70,6 +70,31 @@ def ended(process: Any, code: int = 0, seconds: float = 300) -> tuple[str, str]:
     return told
 
 
+KILLS = f"""
+import json, sys
+sys.path.append({str(SRC.parent / "benchmarks")!r})
+import kills
+kills.run(*json.loads(sys.argv[1]))
+"""
+
+
+class Run:
+    """What `begun` of benchmarks/kills.py gives, as a fork."""
+
+    def __init__(self, store: Path, reduce: bool, key: int, given: dict[str, Any]) -> None:
+        self.process = python(KILLS, json.dumps([str(store), reduce, key, given]))
+        self.kill = self.process.kill
+
+    @property
+    def exitcode(self) -> int | None:
+        return self.process.poll()
+
+    def join(self, timeout: float | None = None) -> None:
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            self.process.wait(timeout)
+            self.process.close()
+
+
 def _begun(program: str | None, arguments: tuple[str, ...], cwd: Any, merged: bool, changes: dict[str, str]) -> Any:
     if FORKS:
         request = {"program": program, "arguments": arguments, "cwd": str(cwd or Path.cwd()), "env": environment(**changes)}

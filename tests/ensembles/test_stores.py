@@ -13,7 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import xarray
-from test_ensemble import KEY, SHORT, TASK, Brittle, Stop, environment, stopped_after
+from processes import Run
+from test_ensemble import KEY, SHORT, TASK, Brittle, Stop, stopped_after
 
 import jaxmuscle as jm
 from jaxmuscle.commands.main import app
@@ -412,9 +413,9 @@ def test_a_file_system_without_locks(tmp_path, monkeypatch, caplog):
 def test_two_writers_never_give_wrong_numbers(tmp_path, monkeypatch):
     """A few of the trials of benchmarks/kills.py, which has fifty; the second process comes within a second."""
     monkeypatch.syspath_prepend(str(Path(__file__).parents[2] / "benchmarks"))
-    monkeypatch.setenv("PYTHONPATH", environment()["PYTHONPATH"])
     import kills
 
+    monkeypatch.setattr(kills, "begun", lambda store, reduce, key=5, **given: Run(store, reduce, key, kills.OPTIONS | given))
     ones, rng = {key: kills.whole(True, key) for key in (5, 6)}, random.Random(4)
     for number in range(4):
         found, key, _ = kills.writers(tmp_path / f"{number}.zarr", rng, 1.0)
