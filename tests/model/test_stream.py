@@ -10,8 +10,10 @@ import pytest
 import references
 import scipy.special
 import scipy.stats
+from compiled import at_once
 
 import jaxmuscle as jm
+from jaxmuscle._common.arrays import as_arrays
 from jaxmuscle.model._stream import APART, START, Draws, Stream, _normal, _weak
 from jaxmuscle.simulation._batch import respond
 from jaxmuscle.simulation._grid import Grid
@@ -247,16 +249,15 @@ def test_threefry_makes_other_numbers_of_the_same_law(normals):
 
 
 BAND = jm.BandLimitedNoise()
-FAST, SLOW = (), pytest.mark.slow
 NOISES = {
-    "white": (jm.WhiteNoise(), False, FAST),
-    "band-limited": (BAND, False, FAST),
-    "sum, active": (BAND + jm.ResonantNoise(), True, FAST),
-    "white, active": (jm.WhiteNoise(), True, SLOW),
-    "Ornstein-Uhlenbeck": (jm.OrnsteinUhlenbeckNoise(), False, SLOW),
-    "pink": (jm.PinkNoise(), False, SLOW),
-    "shared": (jm.BandLimitedNoise(0.1, shared=True), False, SLOW),
-    "drive": (jm.OrnsteinUhlenbeckNoise({"K_w": 0.1, "P_w": 0.05}), True, SLOW),
+    "white": (jm.WhiteNoise(), False),
+    "band-limited": (BAND, False),
+    "sum, active": (BAND + jm.ResonantNoise(), True),
+    "white, active": (jm.WhiteNoise(), True),
+    "Ornstein-Uhlenbeck": (jm.OrnsteinUhlenbeckNoise(), False),
+    "pink": (jm.PinkNoise(), False),
+    "shared": (jm.BandLimitedNoise(0.1, shared=True), False),
+    "drive": (jm.OrnsteinUhlenbeckNoise({"K_w": 0.1, "P_w": 0.05}), True),
 }
 
 
@@ -266,22 +267,29 @@ def largest(ours, given):
     return np.max(np.abs(ours - given).max(axis=0) / np.abs(given).max(axis=0))
 
 
+def assert_drawn_on_the_way(noise, active):
+    task = as_arrays(jm.PrescribedForce(noise=noise, activation=jm.Activation() if active else None))
+    grid = Grid(1e-3, 600, 5)
+
+    def both(task, key):
+        path = task.noise.realise(task.noise.draw(key, grid.steps), grid.dt)
+        return [respond(task, source, grid, "instant") for source in (Stream.of(key), path)]
+
+    drawn, given = at_once(both, task, KEY)
+    tolerance = 200 * float(jnp.finfo(drawn[1].dtype).eps)
+    assert largest(drawn[0], given[0]) < tolerance and largest(drawn[1], given[1]) < tolerance
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("double", [False, True], ids=["float32", "float64"])
-@pytest.mark.parametrize("noise, active", [pytest.param(n, a, id=k, marks=m) for k, (n, a, m) in NOISES.items()])
-def test_what_is_drawn_on_the_way_is_the_path_that_draw_and_realise_give(noise, active, double):
-    with jax.enable_x64(double):
-        task = jm.PrescribedForce(noise=noise, activation=jm.Activation() if active else None)
-        grid = Grid(1e-3, 600, 5)
+@pytest.mark.parametrize("name", NOISES)
+def test_what_is_drawn_on_the_way_is_the_path_that_draw_and_realise_give(x64, name):
+    assert_drawn_on_the_way(*NOISES[name])
 
-        @eqx.filter_jit
-        def both(task, key):
-            path = task.noise.realise(task.noise.draw(key, grid.steps), grid.dt)
-            return [respond(task, source, grid, "instant") for source in (Stream.of(key), path)]
 
-        drawn, given = both(task, KEY)
-        tolerance = 200 * float(jnp.finfo(drawn[1].dtype).eps)
-        assert largest(drawn[0], given[0]) < tolerance and largest(drawn[1], given[1]) < tolerance
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["white, active", "sum, active", "pink"])
+def test_what_is_drawn_on_the_way_is_the_path_in_single_precision_too(name):
+    assert_drawn_on_the_way(*NOISES[name])
 
 
 @pytest.mark.slow

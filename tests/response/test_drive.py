@@ -68,7 +68,6 @@ def test_spectrum_line_mean_and_variance_are_the_quadrature(x64, name):
 
 
 ENVELOPES = {
-    "steady": (jm.Isometric, (5.0, 0.003), jm.Harmonic(1e-5, 4.25, 0.7)),
     "changing": (jm.Isometric, (5.0, 0.003), jm.Harmonic(1e-5, 4.25, 0.7, Decay(1.0, 0.2, 5.0, 3.0))),
     "motion": (jm.PrescribedMotion, (0.004, 6.0), jm.Harmonic(1e-5, 2.1, 0.7, RampHold(1.0, 6.0, 4.0, 0.5, 0.1))),
 }
@@ -79,9 +78,10 @@ ENVELOPES = {
 def test_the_harmonic_through_the_activation_is_that_of_a_noise_free_simulation(x64, name):
     kind, inputs, harmonic = ENVELOPES[name]
     task = references.quiet(kind(*inputs, harmonic=harmonic, activation=TWITCH))
-    power = np.asarray(jm.simulate(jm.settled(task), KEY, dt=5e-4).spectrum().power)
+    power = np.asarray(jm.simulate(jm.settled(task), KEY, dt=5e-4, substeps=1).spectrum().power)
     # As without activation: Heun's (|λ| dt)² / 6, the envelope joined by lines; here the sine, too, (ω dt)² / 6 = 3e-5.
-    np.testing.assert_allclose(jm.expected_spectrum(task).power, power, rtol=6e-4, atol=1e-6 * power.max())
+    expected = linear_spectrum(task, task.settings).power
+    np.testing.assert_allclose(expected, power, rtol=6e-4, atol=1e-6 * power.max())
 
 
 ALL = (0.3, 0.2, 0.4, 0.1, 0.5)
@@ -189,10 +189,10 @@ def test_a_drive_that_multiplies(x64, kind):
 @pytest.mark.parametrize("name", ["drive", pytest.param("activation", marks=pytest.mark.slow)])
 def test_what_is_off_changes_no_spectrum(x64, name):
     task = TASKS[name]
-    power = jm.expected_spectrum(task).power
+    power = linear_spectrum(task, task.settings).power
     alone, silent = NoiseSum((task.noise,)), task.noise + jm.ResonantNoise(0.0)
     for noise in (alone, silent):
-        np.testing.assert_allclose(jm.expected_spectrum(task.with_parts(noise=noise)).power, power, rtol=1e-11)
+        np.testing.assert_allclose(linear_spectrum(task.with_parts(noise=noise), task.settings).power, power, rtol=1e-11)
 
 
 def added(task):

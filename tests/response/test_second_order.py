@@ -22,7 +22,7 @@ MOVING = {
 
 def simulated(task: jm.Isometric, seeds: int = 256) -> np.ndarray:
     """What the nonlinear model has more than the linear response, over that (at least a thousandth of its mean)."""
-    runs = jm.ensemble(jm.settled(task), jax.random.key(3), seeds=seeds)
+    runs = jm.ensemble(jm.settled(task), jax.random.key(3), seeds=seeds, chunk=32)
     first = np.asarray(linear_spectrum(task, task.settings).power)
     return (np.asarray(runs.mean_spectrum().power) - first) / np.maximum(first, FAINT * first.mean())
 
@@ -67,7 +67,7 @@ def test_nothing_is_said_where_simulation_and_linear_response_agree(task, x64):
 def test_the_mean_of_a_squared_gaussian(x64):
     """A displacement that the stiffness K(x) = k (x_ref² + x²) answers: the mean shift against a simulation's."""
     task = jm.PrescribedForce(F_ext=3.0).replace(harmonic_amplitude=0.1)
-    runs = jm.ensemble(jm.settled(task), jax.random.key(5), seeds=64)
+    runs = jm.ensemble(jm.settled(task), jax.random.key(5), seeds=64, chunk=32)
     rest = float(np.asarray(runs.output)[0, 0])
     shift = (float(np.mean(np.asarray(runs.output)[:, 500:])) - rest) / abs(rest)
     assert second_order(task).mean == pytest.approx(shift, rel=0.5)

@@ -9,6 +9,7 @@ from compiled import at_once
 import jaxmuscle as jm
 from jaxmuscle.model import NoiseSum
 from jaxmuscle.model._noise import Realisation
+from jaxmuscle.response._expected import linear_spectrum
 from jaxmuscle.simulation._batch import respond
 from jaxmuscle.simulation._grid import Grid
 
@@ -17,7 +18,6 @@ HUMAN = {"K_w": 0.15, "K_z": 0.005, "C_w": 1e-4, "C_z": 1e-4}
 TREMOR, SLOW = jm.ResonantNoise(0.005, 9.0, 2.0), jm.ResonantNoise(0.005, 3.5, 1.0)
 SLOWED = {"activation": jm.Activation(0.06)}
 RUNGS = {
-    "base": jm.Isometric(5.0, 0.003, noise=jm.BandLimitedNoise(HUMAN)),
     "activation": jm.Isometric(5.0, 0.003, noise=jm.BandLimitedNoise(HUMAN), **SLOWED),
     "tremor": jm.Isometric(5.0, 0.003, noise=jm.OrnsteinUhlenbeckNoise(HUMAN) + TREMOR, **SLOWED),
     "two": jm.Isometric(5.0, 0.003, noise=jm.BandLimitedNoise(HUMAN) + TREMOR + SLOW, **SLOWED),
@@ -30,16 +30,17 @@ RUNGS = {
 
 @pytest.mark.slow
 def test_plain_monte_carlo_agrees_on_every_rung(x64):
-    """As without activation: 500 seeds of three segments leave 3 % per bin, the step's bias a fraction of that.
+    """As without activation (test_control.py): 500 seeds of three segments leave 3 % per bin, the step's bias less.
 
     The force of a prescribed motion holds second derivatives, and at 1.25 ms a bias of 5 to 10 %: a step of 0.5 ms there.
     """
     window, z = (1.0, 6.12), []
     for i, (name, rung) in enumerate(RUNGS.items()):
-        task, dt = jm.settled(rung), 5e-4 if name == "motion" else 1.25e-3
-        runs = jm.ensemble(task, jax.random.fold_in(KEY, i), seeds=500, duration=window[1], dt=dt, control=False)
+        task, options = jm.settled(rung), {"duration": window[1], "substeps": 1, "control": False}
+        options["dt"] = 5e-4 if name == "motion" else 1.25e-3
+        runs = jm.ensemble(task, jax.random.fold_in(KEY, i), seeds=500, **options)
         power = np.asarray(runs.spectrum(window=window).power)
-        expected = np.asarray(jm.expected_spectrum(task, window=window).power)
+        expected = np.asarray(linear_spectrum(task, task.settings, window).power)
         z.append((power.mean(axis=0) - expected) / (power.std(axis=0, ddof=1) / np.sqrt(len(power))))
         print(name, f"largest {np.abs(z[-1]).max():.2f}, mean square {np.mean(z[-1] ** 2):.2f}")
     references.assert_standard_normal(z, every=3)
@@ -65,9 +66,9 @@ def halved(path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", [name for name in RUNGS if name != "base"])
+@pytest.mark.parametrize("name", [name for name in RUNGS if name != "activation"])
 def test_half_the_step_gives_the_same_spectrum(x64, name):
-    """Of the same 32 paths at 0.5 and 1 ms."""
+    """Of the same 32 paths at 0.5 and 1 ms; the rung "two" has all that "activation" has."""
     task, steps = jm.settled(RUNGS[name]), 12_240
 
     def spectra(key):
@@ -81,24 +82,26 @@ def test_half_the_step_gives_the_same_spectrum(x64, name):
     assert 4 / 3 * np.abs(coarse / fine - 1).max() < 0.3 * 0.03
 
 
+def path(noise=jm.BandLimitedNoise(HUMAN), activation=None):  # noqa: B008
+    task = jm.settled(jm.Isometric(5.0, 0.003, noise=noise, activation=activation))
+    return np.asarray(jm.simulate(task, KEY, duration=1.0, dt=1e-4, substeps=1).output)
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("activation", [jm.Activation(), pytest.param(None, marks=pytest.mark.slow)], ids=["slowed", "none"])
-def test_what_is_off_changes_no_path(x64, activation):
-    task = jm.settled(jm.Isometric(5.0, 0.003, noise=jm.BandLimitedNoise(HUMAN), activation=activation))
-    output = jm.simulate(task, KEY, duration=1.0).output
-    for noise in (NoiseSum((task.noise,)), task.noise + jm.ResonantNoise(0.0)):
-        other = jm.simulate(task.with_parts(noise=noise), KEY, duration=1.0).output
-        np.testing.assert_allclose(other, output, rtol=1e-12, atol=1e-12 * np.abs(output).max())
-    loud = jm.simulate(task.with_parts(noise=task.noise + jm.ResonantNoise(0.01)), KEY, duration=1.0).output
-    assert np.abs(loud - output).max() > 1e-4 * np.abs(output).max()
+def test_what_is_off_changes_no_path(x64):
+    """A sum of one, and a resonance of no size on the drive: behind an activation, and without one."""
+    noise = jm.BandLimitedNoise(HUMAN)
+    output = path()
+    for activation in (None, SLOWED["activation"]):
+        alone = path(activation=activation)
+        other = path(noise + jm.ResonantNoise(0.0), activation)
+        np.testing.assert_allclose(other, alone, rtol=1e-12, atol=1e-12 * np.abs(alone).max())
+    np.testing.assert_allclose(path(NoiseSum((noise,))), output, rtol=1e-12, atol=1e-12 * np.abs(output).max())
+    assert np.abs(path(noise + jm.ResonantNoise(0.01)) - output).max() > 1e-4 * np.abs(output).max()
 
 
 @pytest.mark.slow
 def test_a_fast_activation_is_none(x64):
     """The delay 2T of 0.4 ms is a hundredth of that of the other."""
-    task = jm.settled(RUNGS["base"])
-    quick, slowed, none = (
-        jm.simulate(task.with_parts(activation=a), KEY, duration=1.0, dt=1e-4).output
-        for a in (jm.Activation(2e-4), jm.Activation(0.02), None)
-    )
+    quick, slowed, none = (path(activation=a) for a in (jm.Activation(2e-4), jm.Activation(0.02), None))
     assert np.abs(quick - none).max() < 0.1 * np.abs(slowed - none).max()

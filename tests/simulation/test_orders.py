@@ -59,7 +59,7 @@ def moving(noise):
     return task.replace(c_w=8.0, c_z=1.0)
 
 
-FACTORS = np.array([4, 8, 16])  # 0.25 ms to 1 ms
+FACTORS = np.array([4, 16])  # 0.25 ms to 1 ms; what is between adds nothing to a slope over equal distances
 
 
 @pytest.mark.slow
@@ -74,9 +74,8 @@ FACTORS = np.array([4, 8, 16])  # 0.25 ms to 1 ms
         (jm.OrnsteinUhlenbeckNoise({"K_w": 0.6, "C_w": 0.3}, 0.05), 1.0),
         # Differentiable and exact on the grid: √steps times step^{5/2}, as Heun's own.
         (jm.BandLimitedNoise({"K_w": 3.0, "C_w": 0.5}, cutoff=20.0), 2.0),
-        (jm.BandLimitedNoise(0.0), 2.0),
-    ],
-    ids=["white stiffness", "white damping", "ornstein-uhlenbeck", "band-limited", "none"],
+    ],  # without noise: test_without_noise_the_result_is_scipys_to_second_order
+    ids=["white stiffness", "white damping", "ornstein-uhlenbeck", "band-limited"],
 )
 def test_strong_order(x64, noise, order):
     errors = strong_errors(moving(noise), [int(factor) for factor in FACTORS])
@@ -107,7 +106,7 @@ def test_what_task_1_asks_for_moves_task_2_the_same_way(x64, amplitude, lowest, 
     seconds, fine = 2.0, 8000
     path = noise.realise(noise.draw(KEY, int(seconds * fine)), 1 / fine)
     errors, dts = [], []
-    for factor in (16, 8, 4):
+    for factor in (16, 4):
         dt, steps = factor / fine, int(seconds * fine) // factor
         grid, here = Grid(dt, steps, 1), coarsened(path, factor)
         force = np.asarray(eqx.filter_jit(seen)(forward, here, grid))

@@ -77,8 +77,7 @@ def test_moments_of_a_linear_task_are_exact(x64, increments):
 
 LARGE = {"K_w": 0.15, "K_z": 0.005, "C_w": 1e-4, "C_z": 1e-4}
 NONLINEAR = {
-    "isometric, band-limited": jm.Isometric(5.0, 0.003, noise=jm.BandLimitedNoise(LARGE)),
-    "force, Ornstein-Uhlenbeck": jm.PrescribedForce(5.0, 1.0, noise=jm.OrnsteinUhlenbeckNoise(LARGE)),
+    "isometric, two noises": jm.Isometric(5.0, 0.003, noise=jm.BandLimitedNoise(LARGE) + jm.OrnsteinUhlenbeckNoise(LARGE)),
     "force, white": jm.PrescribedForce(5.0, 1.0, noise=jm.WhiteNoise(LARGE)),
 }
 
