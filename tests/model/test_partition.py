@@ -1,10 +1,13 @@
 """A task taken apart into arrays by name and put together again: what `jax.grad` and optimisers work on."""
 
+import functools
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from compiled import at_once
 
 import jaxmuscle as jm
 
@@ -18,6 +21,12 @@ def loss(task):
     """Unevenly weighted log powers, so that no slope is zero by symmetry."""
     power = jnp.log(jm.expected_spectrum(task).power)
     return jnp.sum(jnp.arange(1.0, power.size + 1.0) * power)
+
+
+@functools.cache
+def by_name():
+    values, rebuild = jm.model.partition(TASK, NAMES)
+    return values, rebuild, at_once(jax.grad(lambda v: loss(rebuild(v))), values)
 
 
 @pytest.mark.parametrize(
@@ -44,11 +53,10 @@ def test_precision_is_the_callers():
 
 @pytest.mark.slow
 def test_slopes_by_name_against_differences_and_against_replace(x64):
-    values, rebuild = jm.model.partition(TASK, NAMES)
-    slopes = jax.jit(jax.grad(lambda v: loss(rebuild(v))))(values)
+    values, rebuild, slopes = by_name()
     assert set(slopes) == set(NAMES)
-    direct = jax.jit(jax.jacfwd(lambda v: loss(TASK.replace(**dict(zip(NAMES, v, strict=True))))))
-    together = direct(jnp.stack([values[name] for name in NAMES]))
+    direct = jax.jacfwd(lambda v: loss(TASK.replace(**dict(zip(NAMES, v, strict=True)))))
+    together = at_once(direct, jnp.stack([values[name] for name in NAMES]))
     np.testing.assert_allclose([slopes[name] for name in NAMES], together, rtol=1e-9)
     for name in NAMES:
         h = STEP * float(values[name])
@@ -61,9 +69,8 @@ def test_slopes_by_name_against_differences_and_against_replace(x64):
 def test_what_filter_grad_says_of_numbers_and_of_arrays(x64):
     """The reason for `partition`: None for a Python number, and the slope where all numbers have become arrays."""
     assert eqx.filter_grad(loss)(TASK).muscle.stiffness_w.k is None
-    values, rebuild = jm.model.partition(TASK, NAMES)
-    whole = eqx.filter_jit(eqx.filter_grad(loss))(jax.tree.map(jnp.asarray, TASK))
-    slopes = jax.jit(jax.grad(lambda v: loss(rebuild(v))))(values)
+    whole = at_once(eqx.filter_grad(loss), jax.tree.map(jnp.asarray, TASK))
+    _, _, slopes = by_name()
     np.testing.assert_allclose(whole.muscle.stiffness_w.k, slopes["k_w"], rtol=1e-9)
     np.testing.assert_allclose(whole.noise.amplitude[0], slopes["noise_K_w"], rtol=1e-9)
     np.testing.assert_allclose(whole.P_w.level, slopes["P_w"], rtol=1e-9)

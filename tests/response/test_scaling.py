@@ -4,10 +4,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from compiled import at_once
 
 import jaxmuscle as jm
 from jaxmuscle._common.arrays import as_arrays
-from jaxmuscle.response._expected import expected_moments
+from jaxmuscle.response._expected import expected_moments, linear_spectrum
 from jaxmuscle.response._scaling import at_level, relative_variation, scaled
 from jaxmuscle.spectra._settings import WINDOW
 
@@ -191,14 +192,14 @@ def test_derivatives_and_batches_go_through(x64):
         task = scaled(at_level(jm.Isometric(), level), size)
         return task["noise_K_w"] * task["k_w"]
 
-    slopes = jax.jit(jax.jacfwd(change, argnums=(0, 1)))(0.6, 1.2)
+    slopes = at_once(jax.jacfwd(change, argnums=(0, 1)), jnp.asarray(0.6), jnp.asarray(1.2))
     step = 1e-5
     for i, slope in enumerate(slopes):
         up, down = ([0.6, 1.2] for _ in range(2))
         up[i], down[i] = up[i] + step, down[i] - step
         assert slope == pytest.approx(float(change(*up) - change(*down)) / (2 * step), rel=1e-5)
     levels = jnp.asarray([0.1, 0.3, 0.9])
-    several = jax.jit(jax.vmap(lambda level: at_level(jm.Isometric(), level)["noise_K_w"]))(levels)
+    several = at_once(jax.vmap(lambda level: at_level(jm.Isometric(), level)["noise_K_w"]), levels)
     np.testing.assert_allclose(several, [at_level(jm.Isometric(), float(level))["noise_K_w"] for level in levels], rtol=1e-8)
 
 
@@ -287,7 +288,7 @@ def test_the_only_maximum_of_100_simulated_seeds_is_bin_1(hamilton, capsys):
 @pytest.mark.slow
 def test_the_preset_is_smoother_and_its_amplitude_falls(x64, hamilton):
     beside = jm.load_preset("zagrodny-slifkin")
-    smooth, rough = (np.asarray(jm.expected_spectrum(t).proportional) for t in (hamilton, beside))
+    smooth, rough = (np.asarray(linear_spectrum(t, t.settings).proportional) for t in (hamilton, beside))
     assert smooth[5:].sum() < 0.2 * rough[5:].sum()  # power above 2.2 Hz
     force = np.asarray(jm.ensemble(hamilton, jax.random.key(5), seeds=64).output, dtype=float)
     # Three cycles of 0.391 Hz at either end of the analysed window.

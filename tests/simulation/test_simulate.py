@@ -201,10 +201,12 @@ def test_a_seed_is_the_same_whatever_the_batch(task, precision):
         np.testing.assert_array_equal(reference.seeds, np.arange(10))
         assert np.unique(np.asarray(reference.output)[:, -1]).size == 10  # and no seed is another's
         bound = 1e-6 * np.abs(reference.output).max()
-        others = jm.ensemble(task, KEY, seeds=10, duration=0.8, chunk=3)
-        np.testing.assert_allclose(others.output, reference.output, rtol=1e-6, atol=bound)
         chosen = jm.ensemble(task, KEY, seeds=np.array([9, 2]), duration=0.8)
         np.testing.assert_allclose(chosen.output, np.asarray(reference.output)[[9, 2]], rtol=1e-6, atol=bound)
+        if task is not TASKS[0]:  # each further size is a program of its own: of one task
+            return
+        others = jm.ensemble(task, KEY, seeds=10, duration=0.8, chunk=3)
+        np.testing.assert_allclose(others.output, reference.output, rtol=1e-6, atol=bound)
         for seed in (0, 9):
             single = jm.simulate(task, KEY, seed=seed, duration=0.8)
             np.testing.assert_allclose(single.output, reference.output[seed], rtol=1e-6, atol=bound)
