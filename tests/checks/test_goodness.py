@@ -1,5 +1,6 @@
 """Is it right: p-values are uniform where the model is true and small where it is not; stated errors against refits."""
 
+import contextlib
 import functools
 import json
 
@@ -19,6 +20,7 @@ from jaxmuscle.checks._goodness import numbers_of, p_values, residuals_of
 from jaxmuscle.checks._recovery import Recovery
 from jaxmuscle.checks._refits import Drawn, refitted
 from jaxmuscle.data._target import Target
+from jaxmuscle.fits._adequacy import Endpoint
 from jaxmuscle.fits._reopened import reopened
 from jaxmuscle.fits._search import search_together
 from jaxmuscle.objective._arguments import FitOptions, planned
@@ -29,6 +31,14 @@ from jaxmuscle.spectra._bin_law import welch_law
 FREE = ("c_w", "noise_K_z")
 SURE = 1e-3  # two-sided probability outside the bounds of every statistical test
 CASES = 20
+
+
+@contextlib.contextmanager
+def without_intervals():
+    """Fits whose 95 % intervals nobody reads: these take most of a refit's time."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Endpoint, "intervals", lambda ended, names: {})
+        yield
 
 
 def task():
@@ -70,7 +80,8 @@ def drawn_fits():
         problem = reopened(result)
         (moments,) = repeated(problem, (task(),), CASES)
         powers = drawn_spectra(Likelihood.of(problem).bins[0], result.target, moments, jax.random.key(5))
-    return fits(list(powers))
+    with without_intervals():
+        return fits(list(powers))
 
 
 def test_three_numbers_of_known_residuals():
@@ -177,7 +188,8 @@ def test_refits_reach_the_minima_of_a_full_search(x64):
     (moments,), (part,) = repeated(problem, (base,), 12), problem.parts
     drawn = drawn_spectra(Likelihood.of(problem).bins[0], part.target, moments, jax.random.key(3))
     found = refitted(problem, problem.theta_of((base,)), Drawn((drawn,), (power / power.sum(),), *((None,),) * 3))
-    full = fits(list(drawn), free=free, base=base)
+    with without_intervals():
+        full = fits(list(drawn), free=free, base=base)
     mine = numbers_of(residuals_of(drawn, found.expected[0], part.target, found.share[0]))["chi2_per_bin"]
     theirs = np.array([result.chi2_per_bin for result in full])
     assert np.sum(np.abs(mine - theirs) < 0.02 * theirs + 1e-3) >= 11
@@ -250,7 +262,9 @@ def test_bootstrap_refuses():
 
 @functools.cache
 def bootstrapped():
-    return jm.bootstrap(fits([expected()], segments=(20, 12))[0], replicates=40, key=3)
+    result = fits([expected()], segments=(20, 12))[0]
+    with without_intervals():
+        return jm.bootstrap(result, replicates=40, key=3)
 
 
 def bounds(q):
@@ -288,12 +302,13 @@ def test_bootstrap_is_told_saved_and_drawn(tmp_path):
 @pytest.mark.slow
 def test_bootstrap_of_a_sigma_draws_from_the_gaussian_law():
     result = fits([expected()], segments=None, sigma=0.2 * expected())[0]
-    found = jm.bootstrap(result, replicates=20, key=1)
+    with without_intervals():
+        found = jm.bootstrap(result, replicates=20, key=1)
+        a, b, c = (jm.bootstrap(result, replicates=2, key=key).quantities["c_w"].values for key in (1, 1, 2))
     assert "not simulated" in str(found).replace("\n  ", " ")
     for q in found.quantities.values():
         low, high, least = bounds(q)
         assert low < q.ratio < high and q.inside[0] >= least, (q.name, q.ratio, q.inside)
-    a, b, c = (jm.bootstrap(result, replicates=2, key=key).quantities["c_w"].values for key in (1, 1, 2))
     np.testing.assert_array_equal(a, b)
     assert np.all(a != c)
 

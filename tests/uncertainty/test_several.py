@@ -1,15 +1,18 @@
 """Profile, posterior, identifiability, goodness and bootstrap of fits of several targets, against those of one."""
 
+import contextlib
 import dataclasses
 import functools
 
 import equinox as eqx
-import jax.numpy as jnp
+import jax
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
+from compiled import at_once
 
 import jaxmuscle as jm
+from jaxmuscle.fits._adequacy import Endpoint
 from jaxmuscle.fits._reopened import reopened
 from jaxmuscle.objective._consequences import expand
 from jaxmuscle.objective._likelihood import Likelihood
@@ -31,9 +34,18 @@ def targets():
     return {name: jm.Target(name, power, segments=24, coefficient_of_variation=0.02) for name, power in powers.items()}
 
 
+@contextlib.contextmanager
+def without_intervals():
+    """Fits whose 95 % intervals nobody reads: these take most of a fit's time."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Endpoint, "intervals", lambda ended, names: {})
+        yield
+
+
 @functools.cache
 def both(free=FREE, separate=()):
-    return jm.fit_joint(targets(), tasks=TASKS, free=free, separate=separate, **QUICK)
+    with without_intervals():
+        return jm.fit_joint(targets(), tasks=TASKS, free=free, separate=separate, **QUICK)
 
 
 @functools.cache
@@ -67,7 +79,8 @@ def test_a_fit_taken_up_again_is_at_the_same_point(x64, separate):
 def test_proportional_parameters_are_taken_up_with_their_ratio(x64):
     names = ("k_w", "k_z", "c_w", "c_z", "noise_K_w", "noise_K_z", "noise_C_w", "noise_C_z", "harmonic_amplitude")
     tasks = {"low": jm.at_level(TRUTH, 0.15), "high": jm.at_level(TRUTH, 0.6)}
-    joint = jm.fit_joint(targets(), tasks=tasks, free=("k_w", "c_w"), proportional=names, **QUICK)
+    with without_intervals():
+        joint = jm.fit_joint(targets(), tasks=tasks, free=("k_w", "c_w"), proportional=names, **QUICK)
     problem = reopened(joint)
     for part, task in zip(problem.parts, tasks.values(), strict=True):
         np.testing.assert_allclose(part.coordinates.centre, [float(task[n]) for n in ("k_w", "c_w")], rtol=1e-12)
@@ -138,27 +151,27 @@ def test_densities_of_separate_parameters_add_up(x64):
     assert len(whole.levels) == 2 and whole.size == 6 + 2
     single = []
     for name in TASKS:
-        result = alone(name, free)
+        with without_intervals():
+            result = alone(name, free)
         own = reopened(result)
         single.append(density_about(own, Likelihood.of(own), own.theta_of((result.task,)))[0])
 
-    log_density = eqx.filter_jit(lambda density, white: density.log_density(white))  # one program for both single fits
-
-    def at(density, both):
-        return float(log_density(density, jnp.linalg.solve(density.scale, both - density.centre)))
-
-    def apart(density, both):
-        return at(density, both) - at(density, density.centre)
-
     rng = np.random.default_rng(0)
-    for _ in range(4):
-        step = 0.3 * rng.standard_normal(8)
-        # Coordinates of the joint density: three of each target, then the offsets.
-        parts = [step[[0, 1, 2, 6]], step[[3, 4, 5, 7]]]
-        found = apart(whole, whole.centre + step)
-        centres = [whole.centre[[0, 1, 2, 6]], whole.centre[[3, 4, 5, 7]]]
-        wanted = [at(d, c + p) - at(d, c) for d, c, p in zip(single, centres, parts, strict=True)]
-        assert found == pytest.approx(sum(wanted), rel=0.02, abs=0.02)
+    steps = 0.3 * rng.standard_normal((4, 8))
+    # Coordinates of the joint density: three of each target, then the offsets.
+    own = [[0, 1, 2, 6], [3, 4, 5, 7]]
+    found = rises(whole, whole.centre, steps)
+    wanted = [rises(density, whole.centre[part], steps[:, part]) for density, part in zip(single, own, strict=True)]
+    np.testing.assert_allclose(found, sum(wanted), rtol=0.02, atol=0.02)
+
+
+def rises(density, centre, steps):
+    """By how much the log density differs from that at a centre."""
+    points = np.concatenate([[centre], centre + steps])
+    white = np.linalg.solve(np.asarray(density.scale), (points - density.centre).T).T
+    arrays, fixed = eqx.partition(density, lambda x: isinstance(x, jax.Array | np.ndarray | np.generic))
+    log_density = at_once(lambda arrays, white: jax.lax.map(eqx.combine(arrays, fixed).log_density, white), arrays, white)
+    return np.asarray(log_density)[1:] - np.asarray(log_density)[0]
 
 
 @pytest.mark.slow
@@ -194,7 +207,9 @@ def test_goodness_of_two_targets():
     odd = targets()["high"].proportional_power.copy()
     odd[15] *= 8.0
     pair = {"low": targets()["low"], "high": jm.Target("high", odd, segments=24, coefficient_of_variation=0.02)}
-    found = jm.goodness(jm.fit_joint(pair, tasks=TASKS, free=FREE, **QUICK), replicates=99)
+    with without_intervals():
+        result = jm.fit_joint(pair, tasks=TASKS, free=FREE, **QUICK)
+    found = jm.goodness(result, replicates=99)
     assert found.parts["high"].p_values["largest"] <= 0.02 < found.parts["low"].p_values["largest"]
     assert found.p_value <= 0.05
     assert "high: compared with 99 spectra" in str(found) and "all targets together: p = " in str(found)
@@ -204,7 +219,8 @@ def test_goodness_of_two_targets():
 
 @pytest.mark.slow
 def test_bootstrap_of_two_targets():
-    found = jm.bootstrap(both(), replicates=12, key=2)
+    with without_intervals():
+        found = jm.bootstrap(both(), replicates=12, key=2)
     assert {"c_w", "noise_K_w", "corner_frequency@low", "corner_frequency@high"} <= set(found.quantities)
     assert found.target == "low, high" and set(found.tasks) == set(TASKS)
     # The spread over the stated error of 12 refits scatters by 0.21.
