@@ -1,5 +1,6 @@
 """Posterior and profile: against known densities, one another, and what must be refused."""
 
+import contextlib
 import dataclasses
 import functools
 import importlib.util
@@ -15,10 +16,12 @@ import pytest
 import scipy.integrate
 import scipy.stats
 import xarray
+from compiled import at_once
 from typer.testing import CliRunner
 
 import jaxmuscle as jm
 from jaxmuscle.commands.main import app
+from jaxmuscle.fits._adequacy import Endpoint
 from jaxmuscle.fits._reopened import reopened
 from jaxmuscle.model._parameters import PARAMETERS
 from jaxmuscle.objective._likelihood import Likelihood
@@ -114,6 +117,14 @@ def test_modes_are_told_apart():
     assert len(modes_of(np.exp(rng.normal(size=4000)))) == 1
 
 
+@contextlib.contextmanager
+def without_intervals():
+    """Fits whose 95 % intervals nobody reads: these take most of a fit's time."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Endpoint, "intervals", lambda ended, names: {})
+        yield
+
+
 @functools.cache
 def well_known():
     """Sixty recordings averaged: a strong rhythm, three more parameters, the rest fixed at the truth."""
@@ -121,7 +132,8 @@ def well_known():
     runs = jm.ensemble(jm.settled(truth), jax.random.key(2), seeds=60, control=False)
     power = np.asarray(runs.spectrum().proportional).mean(axis=0)
     target = jm.Target("well known", power, segments=(6,) * 60)
-    return truth, jm.fit(jm.Isometric(), target, free=FREE, starts=24, check_seeds=32)
+    with without_intervals():
+        return truth, jm.fit(jm.Isometric(), target, free=FREE, starts=24, check_seeds=0)
 
 
 @functools.cache
@@ -213,7 +225,8 @@ def test_chains_without_a_summary():
 @functools.cache
 def sloppy():
     target = jm.load_target("vastus-lateralis-26mvc")
-    return jm.fit(jm.task_for(target), target, starts=24, check_seeds=32, rungs=0)
+    with without_intervals():
+        return jm.fit(jm.task_for(target), target, starts=24, check_seeds=0, rungs=0)
 
 
 @pytest.mark.slow
@@ -230,42 +243,42 @@ def test_what_the_data_leave_open_has_an_open_profile():
 
 @pytest.mark.slow
 def test_density_is_summed_over_the_frequency():
-    """Against adaptive quadrature of the likelihood over the frequency at a point of the other coordinates."""
+    """Against fine quadrature of the likelihood over the frequency at a point of the other coordinates."""
     with jax.enable_x64(True):
         problem = reopened(sloppy())
         likelihood = Likelihood.of(problem)
         density, _, _ = density_about(problem, likelihood, problem.theta_of((sloppy().task,)))
 
         (band,) = density.bands
+        point = np.full(density.size, 0.2)
 
-        @jax.jit
         def summed(white):
             s, offset = density.split(white)
             return s, offset, jax.nn.logsumexp(density.heights(band, s, offset, {}))
 
-        s, offset, found = summed(jnp.full(density.size, 0.2))
+        s, offset, found = at_once(summed, point)
         column = problem.coordinates.names.index("harmonic_frequency")
-        theta = np.array(problem.coordinates.theta(np.asarray(s)))
+        # Smooth on the scale of a bin, of which there are 30: 2049 points err by far less than what is compared.
+        f = np.geomspace(band.frequency[0], band.frequency[-1], 2049)
+        theta = np.tile(problem.coordinates.theta(np.asarray(s)), (len(f), 1))
+        theta[:, column] = problem.coordinates.theta_of("harmonic_frequency", f)
         (part,) = likelihood.objective.parts
-        likelihood_at = jax.jit(lambda theta: likelihood.at((part.moments(theta),), offset))
-
-        def integrand(f):
-            theta[column] = problem.coordinates.theta_of("harmonic_frequency", f)
-            return np.exp(float(likelihood_at(jnp.asarray(theta))) - 0.5 * theta[column] ** 2 - np.log(f) - found)
-
-        edges = (band.frequency[0], band.frequency[-1])
-        whole, _ = scipy.integrate.quad(integrand, *edges, limit=200, epsrel=1e-4, points=[1.0, 4.0, 7.0, 12.0])
-        assert whole == pytest.approx(1.0, abs=0.02)
+        height = at_once(
+            lambda theta: jax.lax.map(lambda row: likelihood.at((part.moments(row),), offset), theta, batch_size=64), theta
+        )
+        integrand = np.exp(np.asarray(height) - 0.5 * theta[:, column] ** 2 - float(found))  # over ln f
+        assert scipy.integrate.simpson(integrand, np.log(f)) == pytest.approx(1.0, abs=0.02)
         # The cells of the grid are of single precision: slopes are those of differences of the same in double precision.
         whole = tuple(table._replace(level=table.level.astype(float)) for table in band.tables)
         double = dataclasses.replace(density, bands=(dataclasses.replace(band, tables=whole),))
-        point = jnp.full(density.size, 0.2)
-        value, slope = jax.jit(jax.value_and_grad(lambda white: density.log_density(white)))(point)
-        step, log_density = 1e-5, jax.jit(lambda white: double.log_density(white))
-        assert float(value) == pytest.approx(float(log_density(point)), abs=1e-3)
-        for i in range(density.size):
-            sides = [float(log_density(0.2 + d * np.eye(density.size)[i])) for d in (-step, step)]
-            assert float(slope[i]) == pytest.approx((sides[1] - sides[0]) / (2 * step), rel=1e-4, abs=1e-4)
+        value, slope = at_once(jax.value_and_grad(density.log_density), point)
+        step = 1e-5
+        steps = step * np.eye(density.size)
+        points = np.concatenate([[point], point + steps, point - steps])
+        here, *beside = np.asarray(at_once(lambda points: jax.lax.map(double.log_density, points), points))
+        assert float(value) == pytest.approx(here, abs=1e-3)
+        ahead, behind = np.split(np.array(beside), 2)
+        np.testing.assert_allclose(slope, (ahead - behind) / (2 * step), rtol=1e-4, atol=1e-4)
 
 
 @pytest.mark.slow
@@ -278,7 +291,6 @@ def test_the_common_scale_is_counted_from_the_coefficient_of_variation():
         plain = dataclasses.replace(density, levels=())
         columns = list(density.columns)
 
-        @jax.jit
         def both(white):
             s, offset = density.split(white)
             sampled = jnp.append(s[jnp.asarray(columns)], offset)
@@ -286,13 +298,17 @@ def test_the_common_scale_is_counted_from_the_coefficient_of_variation():
             return density.log_density(white), plain.log_density(same)
 
         points = 0.5 * np.random.default_rng(0).normal(size=(12, density.size))
-        found = np.array([both(jnp.asarray(point)) for point in points])
-        assert np.ptp(found[:, 0]) > 3  # else there is nothing to compare
-        np.testing.assert_allclose(np.diff(found[:, 0]), np.diff(found[:, 1]), atol=1e-6)
-        s = jnp.asarray(density.point)
-        moved = [float(density.log_variation(density.levelled(s.at[level.column].add(d))[0], 0, level.weight)[0])
-                 for d in (0.0, 0.1)]  # fmt: skip
-        assert moved[1] - moved[0] == pytest.approx(0.1 * level.sd, rel=1e-3)  # noise on damping is fixed, but tiny
+        ours, theirs = map(np.asarray, at_once(lambda points: jax.lax.map(both, points), points))
+        assert np.ptp(ours) > 3  # else there is nothing to compare
+        np.testing.assert_allclose(np.diff(ours), np.diff(theirs), atol=1e-6)
+
+        def variation(s):
+            return density.log_variation(density.levelled(s)[0], 0, level.weight)[0]
+
+        places = np.tile(np.asarray(density.point), (2, 1))
+        places[1, level.column] += 0.1
+        here, moved = np.asarray(at_once(lambda places: jax.lax.map(variation, places), places))
+        assert moved - here == pytest.approx(0.1 * level.sd, rel=1e-3)  # noise on damping is fixed, but tiny
 
 
 def bare():
