@@ -155,8 +155,9 @@ def test_goodness_finds_the_point_that_is_off():
     plt.close(figure)
 
 
-def moved(folder, seconds=40.0):
-    """A file of both channels of the simulated muscle."""
+def moved(folder, seconds=52.0):
+    """A file of both channels of the simulated muscle. So long, its response has 47 points, as that of
+    test_perturbed_fit.py: the fits of both are one program."""
     rng, rate = np.random.default_rng(3), 100
     time = np.arange(round((seconds + 8) * rate) + 1) / rate
     lines = np.arange(5, round(5 * seconds)) / seconds

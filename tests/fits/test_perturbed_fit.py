@@ -8,6 +8,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 import scipy.signal
+from compiled import at_once
 from scipy.interpolate import make_interp_spline
 from scipy.optimize import brentq
 
@@ -16,12 +17,15 @@ from jaxmuscle.fits._adequacy import Endpoint
 from jaxmuscle.fits._perturbed import alike, seen_with, without_rhythm
 from jaxmuscle.objective._arguments import FitOptions
 from jaxmuscle.objective._consequences import expand
+from jaxmuscle.uncertainty import _posterior
+from jaxmuscle.uncertainty._chains import Chains
 from jaxmuscle.uncertainty._identifiability import fitted_problem
 
 # The bundled knee extension as fitted, with masses of 0.5 kg.
 TRUE = {"k_w": 4.6e5, "k_z": 7.8e5, "c_w": 114.0, "c_z": 1.8, "P_w": 5.0, "m_w": 0.5, "m_z": 0.5}
 NOISE = {"K_w": 0.27, "K_z": 0.002}
 X_REF, RATE, SECONDS = 0.02, 500, 64
+POINTS = 17  # of a published response; as many as in test_moved.py, so that the fits of both are one program
 WHOLE = {"K_w0": TRUE["k_w"] * X_REF**2, "K_z0": TRUE["k_z"] * X_REF**2, "C_w0": TRUE["c_w"], "C_z0": TRUE["c_z"]}
 
 
@@ -158,8 +162,24 @@ def test_further_questions_take_it(result):
 
 
 @pytest.mark.slow
-def test_the_posterior_is_as_wide_as_stated(result):
-    found = jm.posterior(result, key=3, chains=2, draws=300, warmup=300)
+def test_the_posterior_is_as_wide_as_stated(result, monkeypatch):
+    """Its density falls by a half within one standard deviation, in every direction. Normal draws of this width, in the
+    place of chains (which tests/uncertainty/test_posterior.py has), give numbers that scatter as the fit states."""
+    falls = []
+
+    def drawn(density, _key, chains, draws, _warmup, _tell):
+        one = np.eye(density.size)
+        around = np.concatenate([one, -one, np.zeros((1, density.size))])
+        height = np.asarray(at_once(lambda white: jax.lax.map(density.log_density, white), around))
+        falls.extend(height[-1] - height[:-1].reshape(2, -1).mean(axis=0))
+        white = np.random.default_rng(3).standard_normal((chains, *draws, density.size))
+        shape = white.shape[:2]
+        made = np.ones(shape), np.ones(shape, dtype=int), np.zeros(shape, dtype=bool), 0.5
+        yield Chains(density.centre + white @ density.scale.T, -0.5 * np.sum(white**2, axis=-1), *made), density
+
+    monkeypatch.setattr(_posterior, "sample", drawn)
+    found = jm.posterior(result, key=3, chains=2, draws=120)
+    np.testing.assert_allclose(falls, 0.5, atol=0.15)  # it is not quite normal
     for name, true in WHOLE.items():
         draws = found.quantities[name]
         assert 0.67 < np.std(draws) / result[name].stderr < 1.5, name
@@ -283,14 +303,14 @@ def test_a_target_keeps_its_stiffness(minute, tmp_path):
 @pytest.fixture(scope="module")
 def published():
     """A figure of gain, phase and coherence, from 40 averages, of the true muscle."""
-    f = np.geomspace(0.1, 10.0, 25)
+    f = np.geomspace(0.1, 10.0, POINTS)
     task = jm.PrescribedLength().replace(**TRUE)
     with jax.enable_x64(True):
         true = np.asarray(jm.response.dynamic_stiffness(task, f))
     generator, averages = np.random.default_rng(2), 40
-    coherence = np.full(25, 0.95)
+    coherence = np.full(POINTS, 0.95)
     sd = np.abs(true) * np.sqrt((1 - coherence) / (2 * averages * coherence))
-    seen = true + sd * (generator.normal(size=25) + 1j * generator.normal(size=25))
+    seen = true + sd * (generator.normal(size=POINTS) + 1j * generator.normal(size=POINTS))
     phase = np.degrees(np.angle(seen))
     return jm.FrequencyResponse.from_gain(f, np.abs(seen), phase, coherence=coherence, segments=averages, name="published")
 

@@ -26,7 +26,8 @@ def recording():
 def test_a_minute_gives_its_corner_frequency(recording, tmp_path):
     target = recording.target(settings="slow")
     task = TRUTH.replace(k_w=5e5, c_w=60.0)
-    result = jm.fit(task, target, free=("c_w", "noise_K_w", "noise_K_z"), starts=4, seeds=4, check_seeds=8, rungs=0)
+    quick = {"starts": 4, "seeds": 8, "check_seeds": 8, "rungs": 0}  # as many seeds each: one program
+    result = jm.fit(task, target, free=("c_w", "noise_K_w", "noise_K_z"), **quick)
     corner, true = result.derived["corner_frequency"], float(slowest_rate(TRUTH)) / (2 * np.pi)
     assert result.success and result.adequate
     assert abs(corner.value - true) < 4 * corner.stderr < 4 * true

@@ -25,7 +25,7 @@ def target() -> jm.Target:
 @functools.cache
 def result() -> jm.fits.FitResult:
     task = jm.on_rung(jm.task_for(target()), 2)
-    return jm.fit(task, target(), starts=16, seeds=8, check_seeds=16)
+    return jm.fit(task, target(), starts=16, seeds=16, check_seeds=16)  # as many each: one program
 
 
 @pytest.mark.slow
