@@ -2,7 +2,8 @@
 
 One process for all tests of a worker imports them once, and starts no device. Each process that a test asks for is a fork
 of it: with its own environment, folder and pipes it runs as `python -c PROGRAM` or `python -m jaxmuscle` would, and ends as
-they end. On other systems than Linux it is exactly these.
+they end. On other systems than Linux it is exactly these, and also where the imports start a thread, which a fork would not
+have.
 
 What the imports themselves do is tested with true processes: the installed package (test_package.py), the console script
 and the listings (test_cli.py), signals during imports (test_signals.py), processes that fail together (test_ensemble.py).
@@ -96,9 +97,9 @@ class Run:
 
 
 def _begun(program: str | None, arguments: tuple[str, ...], cwd: Any, merged: bool, changes: dict[str, str]) -> Any:
-    if FORKS:
+    if FORKS and (line := _server()) is not None:
         request = {"program": program, "arguments": arguments, "cwd": str(cwd or Path.cwd()), "env": environment(**changes)}
-        return Process(request, merged)
+        return Process(line, request, merged)
     return _true(program, arguments, cwd, merged, changes)
 
 
@@ -114,10 +115,10 @@ def _true(program: str | None, arguments: tuple[str, ...], cwd: Any, merged: boo
 class Process:
     """A fork; what tests use of `subprocess.Popen`."""
 
-    def __init__(self, request: dict[str, Any], merged: bool) -> None:
+    def __init__(self, line: socket.socket, request: dict[str, Any], merged: bool) -> None:
         (said, out), (failed, errors), (told, tell) = pipes = [os.pipe() for _ in range(3)]
         try:
-            socket.send_fds(_server(), [json.dumps(request).encode()], [out, out if merged else errors, tell])
+            socket.send_fds(line, [json.dumps(request).encode()], [out, out if merged else errors, tell])
         finally:
             for _, end in pipes:
                 os.close(end)
@@ -177,8 +178,8 @@ TAKEN: list[float] = []  # seconds of the processor, of each fork that has ended
 
 
 @functools.cache
-def _server() -> socket.socket:
-    """A line to the process that forks, which ends when the line does."""
+def _server() -> socket.socket | None:
+    """A line to the process that forks, which ends when the line does; None where it cannot."""
     mine, its = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     with its:
         # Its imports are those of a command, which sets this before them.
@@ -191,23 +192,22 @@ def _server() -> socket.socket:
         server.wait()
 
     atexit.register(end)
-    return mine
+    return mine if mine.recv(1) else None
 
 
 # Of the process that forks
 
 
-def imported() -> None:
-    """What programs and commands need; no device, and no thread, which a fork would not have."""
+def imported() -> bool:
+    """What programs and commands need; no device. Whether there is no thread, which a fork would not have."""
     for name in IMPORTED:
         importlib.import_module(name)
     for name in LAZY:
         module = importlib.import_module(name)
         for public in module.__all__:
             getattr(module, public)
-    tasks = os.listdir("/proc/self/task")
-    assert len(tasks) == 1, f"the imports have started {len(tasks) - 1} threads, or a device"
     gc.freeze()
+    return len(os.listdir("/proc/self/task")) == 1
 
 
 def forked(line: socket.socket) -> dict[str, Any]:
@@ -256,9 +256,11 @@ def become(request: dict[str, Any], begun: dict[str, str]) -> None:
 
 
 def main(line: socket.socket) -> None:
-    """Only forks return from here."""
+    """Only forks return from here, and what cannot fork."""
     begun, interrupted = dict(os.environ), signal.getsignal(signal.SIGINT)
-    imported()
+    if not imported():
+        return
+    line.send(b"1")
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the tests
     request = forked(line)
     signal.signal(signal.SIGINT, interrupted)

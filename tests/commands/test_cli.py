@@ -907,6 +907,7 @@ def test_the_console_script_is_the_command():
     assert wrong.returncode == 2 and "tragets" in wrong.stderr
 
 
+@pytest.mark.usefixtures("as_fine_as_shipped")
 @pytest.mark.slow
 def test_steadiness_of_trials(tmp_path):
     """The last one is too short."""
@@ -943,6 +944,7 @@ def test_steadiness_of_trials(tmp_path):
         assert wrong.exit_code == 2 and message in wrong.stderr
 
 
+@pytest.mark.usefixtures("as_fine_as_shipped")
 @pytest.mark.slow
 def test_a_designed_motion(tmp_path):
     preset = tmp_path / "muscle.toml"

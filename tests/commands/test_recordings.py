@@ -53,6 +53,7 @@ def paths(folder, count=5):
     return [folder / f"trial{number}.csv" for number in range(count)]
 
 
+@pytest.mark.usefixtures("as_fine_as_shipped")
 @pytest.mark.slow
 def test_trials_are_analysed_together(folder, tmp_path):
     found = run("analyse", *paths(folder), "--out", tmp_path, "--save-target", tmp_path / "anna.toml", "--mvc", 300)

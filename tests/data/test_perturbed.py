@@ -467,6 +467,7 @@ def test_mistakes_at_the_command_line(arguments, words, file, tmp_path):
     assert words in text
 
 
+@pytest.mark.usefixtures("as_fine_as_shipped")
 @pytest.mark.slow
 def test_the_page(file, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
