@@ -3,6 +3,8 @@
 import functools
 import hashlib
 import os
+import sys
+import threading
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
@@ -14,6 +16,9 @@ import numpy as np
 from jax.core import Tracer
 
 OPTIMISATION = "xla_backend_optimization_level"
+ROOT = Path(__file__).resolve().parents[1]
+FOLDERS = ("src", "tests", "docs", "notebooks", "benchmarks", "fitting")
+PAGE = "page "  # begins the name of the module that a page's blocks are
 ARRAYS = (jax.Array, np.ndarray, np.generic)
 UNREAD = {".pyc", ".png"}  # no test computes from such a file
 _calls: Counter[str] = Counter()
@@ -83,13 +88,44 @@ def _program(function: Any, leaves: list[Any], structure: Any, folder: Path, nam
     return programs._compiled(lowered, {OPTIMISATION: 0}, place, tree), tree
 
 
+def keep_own_classes() -> None:
+    """The package keeps no program of an own class, whose code may change without a sign. Of those in tests and pages all
+    code is known: their programs are found by the digest of all files.
+    """
+    from jaxmuscle._common import programs
+
+    place, lock = programs._place, threading.Lock()
+
+    def placed(folder: Path, function: Any, signature: Any) -> Path | None:
+        with lock:
+            if (found := place(folder, function, signature)) is not None:
+                return found
+            known, code = programs._known, programs._code
+            programs._known, programs._code = (lambda kind: known(kind) or _is_ours(kind)), _code
+            try:
+                return place(folder, function, signature)
+            finally:
+                programs._known, programs._code = known, code
+
+    programs._place = placed
+
+
+def _is_ours(kind: type) -> bool:
+    """Whether a class stands in a test or on a page; not within a function, which might make it otherwise each time."""
+    if "<locals>" in kind.__qualname__ or kind.__module__ == "test_kept":
+        return False
+    file = getattr(sys.modules.get(kind.__module__), "__file__", None)
+    places = [ROOT / "tests", ROOT / "docs"]
+    return kind.__module__.startswith(PAGE) or (file is not None and any(map(Path(file).is_relative_to, places)))
+
+
 @functools.cache
 def _code() -> str:
     """Digest of what a test can be made of: the package with its data, tests, pages; and the versions of what they call."""
     from jaxmuscle._common import programs
 
-    digest, root = hashlib.sha256(programs._code().encode()), Path(__file__).parents[1]
-    files = [path for folder in ("src", "tests", "docs", "benchmarks", "fitting") for path in (root / folder).rglob("*")]
+    digest = hashlib.sha256(repr(programs._versions()).encode())
+    files = [ROOT / "README.md", *(path for folder in FOLDERS for path in (ROOT / folder).rglob("*"))]
     for path in sorted(path for path in files if path.is_file() and path.suffix not in UNREAD):
-        digest.update(path.relative_to(root).as_posix().encode() + b"\0" + path.read_bytes())
+        digest.update(path.relative_to(ROOT).as_posix().encode() + b"\0" + path.read_bytes())
     return digest.hexdigest()

@@ -16,7 +16,7 @@ import jaxlib
 import pytest
 import shapes
 import timing
-from compiled import OPTIMISATION
+from compiled import OPTIMISATION, keep_own_classes
 
 shapes.check("jaxmuscle")  # before anything of the package is imported
 
@@ -157,6 +157,7 @@ gc.set_threshold(50_000, 20, 10)
 _keep_compiled_programs(OUT / "jax-cache")
 _compile_quickly(OUT / "compiler.txt")
 _optimise_only_what_runs_often()
+keep_own_classes()
 _draw_coarsely()
 
 

@@ -12,7 +12,7 @@ from typing import Any
 import jax
 import nbformat
 import numpy as np
-from compiled import jit_at_once
+from compiled import PAGE, jit_at_once
 
 ROOT = Path(__file__).resolve().parents[1]
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
@@ -41,14 +41,14 @@ def run(name: str, names: Mapping[str, Any] | None = None, smaller: Mapping[str,
 def run_cells(path: Path, smaller: Mapping[str, str] | None = None) -> dict[str, Any]:
     """Runs the code cells of a notebook as `run` does the blocks of a page."""
     cells = [cell.source for cell in nbformat.read(path, as_version=4).cells if cell.cell_type == "code"]
-    return _executed(path.name, cells, {"__name__": path.stem}, smaller or {})
+    return _executed(path.name, cells, {}, smaller or {})
 
 
 def _executed(name: str, blocks: list[str], namespace: dict[str, Any], smaller: Mapping[str, str]) -> dict[str, Any]:
     for old, new in smaller.items():
         assert any(old in code for code in blocks), f"{name} says no longer {old}"
         blocks = [code.replace(old, new) for code in blocks]
-    namespace["jit_at_once"] = jit_at_once
+    namespace |= {"__name__": f"{PAGE}{name}", "jit_at_once": jit_at_once}
     for number, code in enumerate(blocks, 1):
         # What a page compiles itself is kept for the next run of the tests.
         code = re.sub(r"\bjax\.jit\b", "jit_at_once", code)

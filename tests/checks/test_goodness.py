@@ -1,6 +1,5 @@
 """Is it right: p-values are uniform where the model is true and small where it is not; stated errors against refits."""
 
-import contextlib
 import functools
 import json
 
@@ -11,6 +10,7 @@ import numpy as np
 import pytest
 import scipy.special
 import scipy.stats
+from refits import without_intervals
 
 import jaxmuscle as jm
 from jaxmuscle._common.errors import SimulationError
@@ -20,7 +20,6 @@ from jaxmuscle.checks._goodness import numbers_of, p_values, residuals_of
 from jaxmuscle.checks._recovery import Recovery
 from jaxmuscle.checks._refits import Drawn, refitted
 from jaxmuscle.data._target import Target
-from jaxmuscle.fits._adequacy import Endpoint
 from jaxmuscle.fits._reopened import reopened
 from jaxmuscle.fits._search import search_together
 from jaxmuscle.objective._arguments import FitOptions, planned
@@ -31,14 +30,6 @@ from jaxmuscle.spectra._bin_law import welch_law
 FREE = ("c_w", "noise_K_z")
 SURE = 1e-3  # two-sided probability outside the bounds of every statistical test
 CASES = 20
-
-
-@contextlib.contextmanager
-def without_intervals():
-    """Fits whose 95 % intervals nobody reads: these take most of a refit's time."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Endpoint, "intervals", lambda ended, names: {})
-        yield
 
 
 def task():

@@ -1,6 +1,5 @@
 """Posterior and profile: against known densities, one another, and what must be refused."""
 
-import contextlib
 import dataclasses
 import functools
 import importlib.util
@@ -17,11 +16,11 @@ import scipy.integrate
 import scipy.stats
 import xarray
 from compiled import at_once
+from refits import without_intervals
 from typer.testing import CliRunner
 
 import jaxmuscle as jm
 from jaxmuscle.commands.main import app
-from jaxmuscle.fits._adequacy import Endpoint
 from jaxmuscle.fits._reopened import reopened
 from jaxmuscle.model._parameters import PARAMETERS
 from jaxmuscle.objective._likelihood import Likelihood
@@ -115,14 +114,6 @@ def test_modes_are_told_apart():
     assert first[1] == pytest.approx(2.0, rel=0.02) and second[1] == pytest.approx(8.0, rel=0.02)
     assert (first[3], second[3]) == (0.75, 0.25)
     assert len(modes_of(np.exp(rng.normal(size=4000)))) == 1
-
-
-@contextlib.contextmanager
-def without_intervals():
-    """Fits whose 95 % intervals nobody reads: these take most of a fit's time."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Endpoint, "intervals", lambda ended, names: {})
-        yield
 
 
 @functools.cache

@@ -1,6 +1,5 @@
 """Profile, posterior, identifiability, goodness and bootstrap of fits of several targets, against those of one."""
 
-import contextlib
 import dataclasses
 import functools
 
@@ -10,9 +9,9 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 from compiled import at_once
+from refits import without_intervals
 
 import jaxmuscle as jm
-from jaxmuscle.fits._adequacy import Endpoint
 from jaxmuscle.fits._reopened import reopened
 from jaxmuscle.objective._consequences import expand
 from jaxmuscle.objective._likelihood import Likelihood
@@ -32,14 +31,6 @@ def targets():
     powers = {name: np.asarray(jm.expected_spectrum(task).proportional) * np.exp(0.2 * rng.standard_normal(30))
               for name, task in TASKS.items()}  # fmt: skip
     return {name: jm.Target(name, power, segments=24, coefficient_of_variation=0.02) for name, power in powers.items()}
-
-
-@contextlib.contextmanager
-def without_intervals():
-    """Fits whose 95 % intervals nobody reads: these take most of a fit's time."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Endpoint, "intervals", lambda ended, names: {})
-        yield
 
 
 @functools.cache

@@ -10,10 +10,9 @@ import pages
 import pytest
 import references
 import scipy.optimize
-from compiled import _code, at_once
+from compiled import at_once
 
 import jaxmuscle as jm
-from jaxmuscle._common import programs
 from jaxmuscle.model import SmoothStep
 
 DOCS = Path(__file__).parents[2] / "docs"
@@ -23,24 +22,6 @@ STILL = np.zeros(5)
 
 hill = pages.module(DOCS / "hill_muscle.py")
 HillMuscle = hill.HillMuscle
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _kept_for_the_next_run():
-    """The package keeps no program of an own class, whose code may change. Here all code is part of where one is kept."""
-    place, code = programs._place, _code()
-
-    def placed(folder, function, signature):
-        if (found := place(folder, function, signature)) is not None:
-            return found
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(programs, "KNOWN", (*programs.KNOWN, hill.__name__))
-            patch.setattr(programs, "_code", lambda: code)
-            return place(folder, function, signature)
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(programs, "_place", placed)
-        yield
 
 
 # --- the same muscle in NumPy, from the equations of docs/own-muscle.md with angles instead of cosines
