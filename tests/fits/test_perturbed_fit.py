@@ -383,13 +383,12 @@ def test_two_minutes_know_more(minute, result):
 
 
 @pytest.mark.slow
-def test_a_muscle_with_a_tremor_takes_its_own_response_off():
-    """Strong, bent by 8 mm, moved in two bands. The response of a base model's muscle, which the search begins with, leaves
-    a third more variance: this test fails with it (`_search.RENEWALS` = 0)."""
+def test_a_muscle_of_a_richer_model_takes_its_own_response_off():
+    """Strong, with activation, bent by 8 mm, moved in two bands. The response of a base model's muscle, which the search
+    begins with, leaves two thirds more variance: this test fails with it (`_search.RENEWALS` = 0)."""
     true = {"k_w": 1.61e7, "k_z": 1.61e7, "c_w": 1360.0, "c_z": 168.0, "P_w": 141.0, "noise_K_w": 0.27, "noise_K_z": 0.0013,
-            "m_w": 0.5, "m_z": 0.5, "activation_time": 0.05, "resonance_amplitude": 0.14, "resonance_frequency": 9.6,
-            "resonance_width": 1.6}  # fmt: skip
-    muscle = jm.on_rung(jm.PrescribedLength(), 2).replace(**true)
+            "m_w": 0.5, "m_z": 0.5, "activation_time": 0.05}  # fmt: skip
+    muscle = jm.on_rung(jm.PrescribedLength(harmonic=jm.Harmonic(amplitude=0.0)), 1).replace(**true)
     rate, time = 100, np.arange(90 * 100 + 1) / 100
     rng = np.random.default_rng(2)
     lines = np.concatenate([np.arange(28, 36), np.arange(170, 200)]) / 60
@@ -398,14 +397,14 @@ def test_a_muscle_with_a_tremor_takes_its_own_response_off():
     moved = jm.settled(muscle).with_parts(x_z=jm.model.Sampled.through(time, -length))
     force = np.asarray(jm.simulate(moved, 11, duration=90.0, rate=float(rate)).output)
     record = jm.PerturbedRecording.from_array(force, length, rate).steady((30.0, 90.0))
-    fit = jm.fit(jm.PrescribedLength(), record, rungs=2, starts=16, seeds=0, check_seeds=0)
-    assert fit.adequate and [rung.number for rung in fit.ladder if rung.chosen] == [2]
+    fit = jm.fit(jm.PrescribedLength(), record, rungs=1, starts=16, seeds=0, check_seeds=0)
+    assert fit.adequate and [rung.number for rung in fit.ladder if rung.chosen] == [1]
     with jax.enable_x64(True):
         again = seen_with(fit.task, (record,))
     assert alike(fit.target, again)
     with jax.enable_x64(True):
         resting = float(jm.response.expected_variation(jm.settled(muscle)))
-    # Of 60 s a coefficient of variation has an error of 4 %; the base model's muscle left 12 to 16 % more.
+    # Of 60 s a coefficient of variation has an error of 4 %; the base model's muscle left 70 % more.
     assert abs(float(np.mean(fit.target.coefficient_of_variation)) / resting - 1) < 0.1
     for name in ("K_z0", "C_z0", "noise_K_w"):
         value = true["k_z"] * X_REF**2 if name == "K_z0" else true["c_z"] if name == "C_z0" else true[name]
