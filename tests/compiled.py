@@ -25,10 +25,10 @@ _calls: Counter[str] = Counter()
 
 
 def drawing(function: Callable[..., Any]) -> Any:
-    """As `jax.jit`, but optimised as the package's own programs that draw: normals have single precision, and are rounded
-    alike. Where the compiler does not know the option (conftest.py has tried it), exactly `jax.jit`.
+    """As `jit_at_once`, but optimised as the package's own programs that draw: normals have single precision, and are
+    rounded alike. Where the compiler does not know the option (conftest.py has tried it), they all are compiled alike.
     """
-    return jax.jit(function, compiler_options={OPTIMISATION: 1} if OPTIMISATION in os.environ.get("XLA_FLAGS", "") else None)
+    return jit_at_once(function, level=1)
 
 
 def at_once(function: Callable[..., Any], *given: Any) -> Any:
@@ -40,9 +40,10 @@ def at_once(function: Callable[..., Any], *given: Any) -> Any:
     return jit_at_once(function)(*given)
 
 
-def jit_at_once(function: Callable[..., Any], **options: Any) -> Callable[..., Any]:
+def jit_at_once(function: Callable[..., Any], *, level: int = 0, **options: Any) -> Callable[..., Any]:
     """`jax.jit(function)`, its programs found as those of `at_once`; with options, or traced by JAX, just that."""
-    whole = jax.jit(function, **options)
+    asked = {OPTIMISATION: level} if level and OPTIMISATION in os.environ.get("XLA_FLAGS", "") else None
+    whole = jax.jit(function, compiler_options=asked, **options)
     test = os.environ["PYTEST_CURRENT_TEST"]
     _calls[test] += 1
     number, made = _calls[test], {}
@@ -57,7 +58,8 @@ def jit_at_once(function: Callable[..., Any], **options: Any) -> Callable[..., A
             return whole(*given, **named)
         known = (structure, tuple(map(programs._kind, leaves)), programs._config())
         if known not in made:
-            made[known] = _program(function, leaves, structure, folder, (test, number, str(known[0]), *known[1:]))
+            name = test, number, level, str(structure), *known[1:]
+            made[known] = _program(function, leaves, structure, folder, name)
         compiled, tree = made[known]
         return jax.tree.unflatten(tree, compiled(*leaves))
 
@@ -69,7 +71,7 @@ def _known(leaf: Any) -> bool:
 
 
 def _program(function: Any, leaves: list[Any], structure: Any, folder: Path, name: tuple[Any, ...]) -> tuple[Any, Any]:
-    """A program of arrays, and the tree of what it returns."""
+    """A program of arrays, and the tree of what it returns. `name`: of the test, the number of the program, its level."""
     from jaxmuscle._common import programs
 
     tree = None
@@ -85,7 +87,7 @@ def _program(function: Any, leaves: list[Any], structure: Any, folder: Path, nam
         return compiled, entry[1]
     flat.__name__ = "kept_in_test"
     lowered = jax.jit(flat, keep_unused=True).lower(*leaves)
-    return programs._compiled(lowered, {OPTIMISATION: 0}, place, tree), tree
+    return programs._compiled(lowered, {OPTIMISATION: name[2]}, place, tree), tree
 
 
 def keep_own_classes() -> None:
