@@ -121,9 +121,10 @@ def test_the_nonlinear_part_of_large_noise_is_seen(x64):
 
 
 @pytest.mark.slow
-def test_the_controlled_estimate_has_no_linear_time_step_error(x64):
+@pytest.mark.parametrize("kind", [jm.Isometric, jm.PrescribedForce])
+def test_the_controlled_estimate_has_no_linear_time_step_error(x64, kind):
     """Steps of 5 and 2.5 ms on the same paths, which band-limited noise has exactly on each grid."""
-    task = as_arrays(made(jm.Isometric, "band-limited", "human"))
+    task = as_arrays(made(kind, "band-limited", "human"))
     linear, steps, seeds = linearised(task), 6000, 64
 
     def spectra(path):
