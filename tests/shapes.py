@@ -10,6 +10,7 @@ import inspect
 from typing import Any
 
 import jaxtyping
+from beartype.roar import BeartypeCallHintViolation
 from jaxtyping import install_import_hook
 
 try:
@@ -34,6 +35,21 @@ def begin_anew() -> None:
     _calls.clear()
 
 
+def _of_types(function: Any, typechecker: Any) -> Any:
+    """Checked without sizes; switched off and told as jaxtyping does."""
+    checked = typechecker(function)
+
+    def wrapper(*args: Any, **kwargs: Any) -> Any:
+        if jaxtyping.config.jaxtyping_disable:
+            return function(*args, **kwargs)
+        try:
+            return checked(*args, **kwargs)
+        except BeartypeCallHintViolation as error:
+            raise jaxtyping.TypeCheckError(str(error)) from error
+
+    return wrapper
+
+
 def _names_arrays(function: Any) -> bool:
     """Whether sizes are to be compared. Types alone are checked in a tenth of the time."""
     kinds = function.__annotations__.values()
@@ -55,7 +71,8 @@ def _sparingly(function: Any = _sentinel, *, typechecker: Any = _sentinel) -> An
         if count > FIRST and count % EVERY:
             return function(*args, **kwargs)
         if checked is None:
-            checked = jaxtyped(function, typechecker=typechecker) if _names_arrays(function) else typechecker(function)
+            arrays = _names_arrays(function)
+            checked = jaxtyped(function, typechecker=typechecker) if arrays else _of_types(function, typechecker)
         return checked(*args, **kwargs)
 
     wrapper.sparingly = True  # pyright: ignore[reportAttributeAccessIssue]
