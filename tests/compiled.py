@@ -21,7 +21,7 @@ FOLDERS = ("src", "tests", "docs", "notebooks", "benchmarks", "fitting")
 PAGE = "page "  # begins the name of the module that a page's blocks are
 ARRAYS = (jax.Array, np.ndarray, np.generic)
 UNREAD = {".pyc", ".png"}  # no test computes from such a file
-_calls: Counter[str] = Counter()
+_calls: Counter[tuple[str, str, int]] = Counter()
 
 
 def drawing(function: Callable[..., Any]) -> Any:
@@ -34,8 +34,9 @@ def drawing(function: Callable[..., Any]) -> Any:
 def at_once(function: Callable[..., Any], *given: Any) -> Any:
     """`jax.jit(function)(*given)`, of arrays; the next run of the tests loads the program, and neither traces nor lowers it.
 
-    It is found by the name of the test, the number of the call within it, and a digest of all files that a test can be made
-    of. If one of these files has changed, the program is made anew.
+    It is found by the test, the line that calls this (and how often the test has called it there), and a digest of all files
+    that a test can be made of. If one of these files has changed, the program is made anew. It returns arrays, or tuples,
+    lists and dictionaries of them: the tree of another class does not survive in a file.
     """
     return jit_at_once(function)(*given)
 
@@ -44,9 +45,9 @@ def jit_at_once(function: Callable[..., Any], *, level: int = 0, **options: Any)
     """`jax.jit(function)`, its programs found as those of `at_once`; with options, or traced by JAX, just that."""
     asked = {OPTIMISATION: level} if level and OPTIMISATION in os.environ.get("XLA_FLAGS", "") else None
     whole = jax.jit(function, compiler_options=asked, **options)
-    test = os.environ["PYTEST_CURRENT_TEST"]
-    _calls[test] += 1
-    number, made = _calls[test], {}
+    place = os.environ["PYTEST_CURRENT_TEST"], *_line()
+    _calls[place] += 1
+    number, made = _calls[place], {}
 
     def inside(*given: Any, **named: Any) -> Any:
         from jaxmuscle._common import programs
@@ -58,8 +59,8 @@ def jit_at_once(function: Callable[..., Any], *, level: int = 0, **options: Any)
             return whole(*given, **named)
         known = (structure, tuple(map(programs._kind, leaves)), programs._config())
         if known not in made:
-            name = test, number, level, str(structure), *known[1:]
-            made[known] = _program(function, leaves, structure, folder, name)
+            name = *place, number, str(structure), *known[1:]
+            made[known] = _program(function, leaves, structure, folder, level, name)
         compiled, tree = made[known]
         return jax.tree.unflatten(tree, compiled(*leaves))
 
@@ -70,8 +71,18 @@ def _known(leaf: Any) -> bool:
     return isinstance(leaf, ARRAYS) and not isinstance(leaf, Tracer)
 
 
-def _program(function: Any, leaves: list[Any], structure: Any, folder: Path, name: tuple[Any, ...]) -> tuple[Any, Any]:
-    """A program of arrays, and the tree of what it returns. `name`: of the test, the number of the program, its level."""
+def _line() -> tuple[str, int]:
+    """File and line outside this module that called it."""
+    frame = sys._getframe()
+    while frame.f_back is not None and frame.f_code.co_filename == __file__:
+        frame = frame.f_back
+    return Path(frame.f_code.co_filename).name, frame.f_lineno
+
+
+def _program(
+    function: Any, leaves: list[Any], structure: Any, folder: Path, level: int, name: tuple[Any, ...]
+) -> tuple[Any, Any]:
+    """A program of arrays, and the tree of what it returns."""
     from jaxmuscle._common import programs
 
     tree = None
@@ -81,13 +92,13 @@ def _program(function: Any, leaves: list[Any], structure: Any, folder: Path, nam
         found, tree = jax.tree.flatten(function(*jax.tree.unflatten(structure, leaves)))
         return found
 
-    key = repr((name, programs._machine(), os.environ.get("XLA_FLAGS")))
+    key = repr((name, level, programs._machine(), os.environ.get("XLA_FLAGS")))
     place = folder / _code()[:16] / hashlib.sha256(key.encode()).hexdigest()
     if (entry := programs._read(place)) is not None and (compiled := programs._load(folder / entry[0])) is not None:
         return compiled, entry[1]
     flat.__name__ = "kept_in_test"
     lowered = jax.jit(flat, keep_unused=True).lower(*leaves)
-    return programs._compiled(lowered, {OPTIMISATION: name[2]}, place, tree), tree
+    return programs._compiled(lowered, {OPTIMISATION: level}, place, tree), tree
 
 
 def keep_own_classes() -> None:

@@ -15,6 +15,7 @@ import scipy.signal
 from compiled import at_once
 
 import jaxmuscle as jm
+from jaxmuscle._common import programs
 from jaxmuscle._common.arrays import as_arrays
 from jaxmuscle.model import Constant, Decay, RampHold
 from jaxmuscle.objective._problem import target_variation
@@ -608,7 +609,8 @@ class Crossbridge(jm.AbstractMuscle):
 
 
 @pytest.mark.slow
-def test_one_trace_per_structure(x64):
+def test_one_trace_per_structure(x64, monkeypatch):
+    monkeypatch.setattr(programs, "program_folder", lambda: None)  # nothing is loaded
     looks, settings = Crossbridge.looks, Settings(last_bin=29)
     task, before = jm.Isometric(5.0, 0.002, muscle=Crossbridge(m_w=0.3)), len(Crossbridge.looks)
     jm.expected_spectrum(task, settings)
