@@ -25,10 +25,10 @@ _calls: Counter[tuple[str, str, int]] = Counter()
 
 
 def drawing(function: Callable[..., Any]) -> Any:
-    """As `jit_at_once`, but optimised as the package's own programs that draw: normals have single precision, and are
+    """As `kept_jit`, but optimised as the package's own programs that draw: normals have single precision, and are
     rounded alike. Where the compiler does not know the option (conftest.py has tried it), they all are compiled alike.
     """
-    return jit_at_once(function, level=1)
+    return kept_jit(function, level=1)
 
 
 def at_once(function: Callable[..., Any], *given: Any) -> Any:
@@ -38,10 +38,10 @@ def at_once(function: Callable[..., Any], *given: Any) -> Any:
     that a test can be made of. If one of these files has changed, the program is made anew. It returns arrays, or tuples,
     lists and dictionaries of them: the tree of another class does not survive in a file.
     """
-    return jit_at_once(function)(*given)
+    return kept_jit(function)(*given)
 
 
-def jit_at_once(function: Callable[..., Any], *, level: int = 0, **options: Any) -> Callable[..., Any]:
+def kept_jit(function: Callable[..., Any], *, level: int = 0, **options: Any) -> Callable[..., Any]:
     """`jax.jit(function)`, its programs found as those of `at_once`; with options, or traced by JAX, just that."""
     asked = {OPTIMISATION: level} if level and OPTIMISATION in os.environ.get("XLA_FLAGS", "") else None
     whole = jax.jit(function, compiler_options=asked, **options)
@@ -55,7 +55,7 @@ def jit_at_once(function: Callable[..., Any], *, level: int = 0, **options: Any)
         leaves, structure = jax.tree.flatten(given)
         leaves = [jnp.asarray(x) if isinstance(x, int | float) else x for x in leaves]
         folder = programs.program_folder()
-        if options or named or folder is None or not all(map(_known, leaves)):
+        if options or named or folder is None or not all(map(_is_concrete, leaves)):
             return whole(*given, **named)
         known = (structure, tuple(map(programs._kind, leaves)), programs._config())
         if known not in made:
@@ -67,7 +67,7 @@ def jit_at_once(function: Callable[..., Any], *, level: int = 0, **options: Any)
     return inside
 
 
-def _known(leaf: Any) -> bool:
+def _is_concrete(leaf: Any) -> bool:
     return isinstance(leaf, ARRAYS) and not isinstance(leaf, Tracer)
 
 
@@ -125,7 +125,7 @@ def keep_own_classes() -> None:
 
 def _is_ours(kind: type) -> bool:
     """Whether a class stands in a test or on a page; not within a function, which might make it otherwise each time."""
-    if "<locals>" in kind.__qualname__ or kind.__module__ == "test_kept":
+    if "<locals>" in kind.__qualname__:
         return False
     file = getattr(sys.modules.get(kind.__module__), "__file__", None)
     places = [ROOT / "tests", ROOT / "docs"]

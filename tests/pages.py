@@ -12,7 +12,7 @@ from typing import Any
 import jax
 import nbformat
 import numpy as np
-from compiled import PAGE, jit_at_once
+from compiled import PAGE, kept_jit
 
 ROOT = Path(__file__).resolve().parents[1]
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
@@ -48,10 +48,10 @@ def _executed(name: str, blocks: list[str], namespace: dict[str, Any], smaller: 
     for old, new in smaller.items():
         assert any(old in code for code in blocks), f"{name} says no longer {old}"
         blocks = [code.replace(old, new) for code in blocks]
-    namespace |= {"__name__": f"{PAGE}{name}", "jit_at_once": jit_at_once}
+    namespace |= {"__name__": f"{PAGE}{name}", "kept_jit": kept_jit}
     for number, code in enumerate(blocks, 1):
         # What a page compiles itself is kept for the next run of the tests.
-        code = re.sub(r"\bjax\.jit\b", "jit_at_once", code)
+        code = re.sub(r"\bjax\.jit\b", "kept_jit", code)
         exec(compile(code, f"{name}, block {number}", "exec"), namespace)
     return namespace
 

@@ -126,11 +126,10 @@ def test_what_nobody_uses_is_removed_when_the_code_changes(x64, folder, monkeypa
     assert beside.exists() and not unused.exists() and sum(path.exists() for path in old) == 1
 
 
-class Own(Muscle):
-    """Somebody else's muscle, whose code may change without a sign."""
-
-
 def test_what_holds_an_own_class_is_not_kept(x64, tmp_path, monkeypatch):
+    class Own(Muscle):
+        """Somebody else's muscle, whose code may change without a sign. The tests keep what stands in a file, not this."""
+
     monkeypatch.setattr(programs, "program_folder", lambda: tmp_path)
     task = TASK.with_parts(muscle=Own())
     assert_right(Kept(solved)(task, MATRIX))
