@@ -15,6 +15,7 @@ import jax
 import jaxlib
 import pytest
 import shapes
+import threadpoolctl
 import timing
 from compiled import OPTIMISATION, keep_own_classes
 
@@ -150,7 +151,7 @@ def as_fine_as_shipped(monkeypatch):
 
 
 # Of a process: what it forgets, which takes seconds, it traces and loads again.
-MOST_MAPS, MOST_MEMORY, SHARE = 45_000, 8 * 2**30, 0.3
+MOST_MAPS, MOST_MEMORY, SHARE = 45_000, 8 * 2**30, 0.34
 # Tracing makes objects by the million, few of them in circles: looking for these at Python's own pace takes a tenth of it.
 gc.set_threshold(50_000, 20, 10)
 
@@ -168,12 +169,16 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 def _keep_to_own_cores(worker: dict[str, Any]) -> None:
-    """One of several workers keeps off the others' cores: threads of XLA that wait for one another cost a fifth more."""
+    """One of several workers keeps off the others' cores: threads of XLA that wait for one another cost a fifth more.
+
+    So do those of NumPy's linear algebra, which counted the cores before.
+    """
     if worker and hasattr(os, "sched_setaffinity"):
         cores, count = sorted(os.sched_getaffinity(0)), worker["workercount"]
         own = cores[int(worker["workerid"].removeprefix("gw")) % count :: count]
         if own:
             os.sched_setaffinity(0, own)
+            threadpoolctl.threadpool_limits(len(own), user_api="blas")
 
 
 def _begin_without_optimisation() -> None:

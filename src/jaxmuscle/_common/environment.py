@@ -81,11 +81,9 @@ class _OneThread:
         self.limits: Any = None
 
     def __enter__(self) -> None:
-        from threadpoolctl import threadpool_limits
-
         with self.lock:
             if not self.inside:
-                self.limits = threadpool_limits(1, user_api="blas")
+                self.limits = _linear_algebra().limit(limits=1, user_api="blas")
             self.inside += 1
 
     def __exit__(self, *_: object) -> None:
@@ -95,7 +93,16 @@ class _OneThread:
                 self.limits.restore_original_limits()
 
 
-_ONE_THREAD = _OneThread()
+@functools.cache
+def _linear_algebra() -> Any:
+    """The libraries of NumPy and SciPy. To look for them takes a hundred times longer than to set their threads."""
+    import scipy.linalg  # noqa: F401  # brings a library of its own
+    from threadpoolctl import ThreadpoolController
+
+    return ThreadpoolController()
+
+
+one_thread = _OneThread()
 
 
 @contextlib.contextmanager
@@ -106,5 +113,5 @@ def fitting() -> Iterator[None]:
     """
     import jax
 
-    with _ONE_THREAD, jax.enable_x64(True):
+    with one_thread, jax.enable_x64(True):
         yield

@@ -9,7 +9,7 @@ import numpy as np
 import scipy
 from jaxtyping import Array, Float, Int
 
-from jaxmuscle._common.arrays import as_arrays
+from jaxmuscle._common.arrays import all_concrete, as_arrays
 from jaxmuscle._common.programs import kept
 from jaxmuscle._common.types import Scalar
 from jaxmuscle.model._resonant_noise import ResonantNoise
@@ -19,8 +19,9 @@ from jaxmuscle.spectra._settings import LONGEST, WINDOW, SpectrumSettings, sampl
 from jaxmuscle.spectra._welch import Spectrum
 
 from ._autocovariance import autocovariances, covariances
+from ._equilibrium import mechanics
 from ._harmonic_line import harmonic_line
-from ._linearised import Linearisation, linearise
+from ._linearised import Linearisation, LinearTask, linearisation, linearise
 
 TAIL = 1e-13
 ROUNDING = 1e-20  # of any unit of the output: fluctuations that are smaller are none
@@ -143,9 +144,16 @@ def expected_moments(
     window: tuple[float, float],
     samples: Int[Array | np.ndarray, ""] | int | None = None,
 ) -> tuple[Moments, Linearisation]:
-    """`response`, compiled once for all numbers of samples."""
-    samples = samples_in(window, settings) if samples is None else samples
-    return _compiled_response(as_arrays(task), settings, window, as_arrays(samples, int))
+    """`response`, compiled once for all numbers of samples.
+
+    Outside a transformation by two programs: that of the linearisation serves all settings, and what follows from it all
+    tasks with as many states.
+    """
+    samples = as_arrays(samples_in(window, settings) if samples is None else samples, int)
+    if all_concrete((task, samples)):
+        bare = mechanics(task)
+        task = LinearTask.of(bare, linearisation(bare))
+    return _compiled_response(as_arrays(task), settings, window, samples)
 
 
 def log_variation_sd(task: AbstractTask, settings: SpectrumSettings, samples: int) -> Float[Array, ""]:

@@ -35,7 +35,12 @@ class Linearisation(NamedTuple):
 
 
 def linearise(task: AbstractTask, time: float = HOLD) -> Linearisation:
-    """Jacobians of the task's own vector field and output at its equilibrium under the inputs at `time` [s]."""
+    """Jacobians of the task's own vector field and output at its equilibrium under the inputs at `time` [s].
+
+    Of a `LinearTask` what it was made of.
+    """
+    if isinstance(task, LinearTask):
+        return task.system
     point = equilibrium(task, time)
     n, t, still = point.shape[0], jnp.asarray(time, point.dtype), jnp.zeros(5, point.dtype)
 
@@ -91,7 +96,7 @@ def settled(task: AbstractTask, time: float = HOLD) -> AbstractTask:
     Its simulation has no rise and no transient of the mean: what the linear response describes.
     """
     traced = not all(is_concrete(leaf) for leaf in jax.tree.leaves(task))
-    point = equilibrium(task, time) if traced else np.asarray(linearised(task, time).system.point).tolist()
+    point = equilibrium(task, time) if traced else np.asarray(linearisation(mechanics(task), time).point).tolist()
     levels = _inputs(_signals(as_arrays(task)), np.array([time]))
     held = {name: Constant(level[0] if traced else float(np.asarray(level)[0])) for name, level in levels.items()}
     found = task.with_parts(**held, initial=tuple(point))
@@ -112,12 +117,12 @@ def _signals(task: AbstractTask) -> dict[str, AbstractSignal]:
     return {name: value for name, value in found.items() if isinstance(value, AbstractSignal)}
 
 
-_compiled = kept(linearise)
+linearisation = kept(linearise)  # of what `mechanics` gives: one program for tasks of any settings
 
 
 def linearised(task: AbstractTask, time: float = HOLD) -> LinearTask:
     """`LinearTask.of`, compiled."""
-    return LinearTask.of(as_arrays(task), _compiled(mechanics(task), time))
+    return LinearTask.of(as_arrays(task), linearisation(mechanics(task), time))
 
 
 def check_equilibrium(task: Any, point: np.ndarray, A: np.ndarray) -> float:
@@ -168,7 +173,7 @@ def check_inputs(task: AbstractTask, window: tuple[float, float] = WINDOW) -> No
 def has_response(task: AbstractTask, *, required: bool) -> bool:
     """Whether a task has a stable, damped equilibrium under held inputs; with `required`, why not is an error."""
     with jax.enable_x64(True):
-        system = linearised(task).system
+        system = linearisation(mechanics(task))
         try:
             check_equilibrium(task, np.asarray(system.point), np.asarray(system.A))
             check_inputs(task)

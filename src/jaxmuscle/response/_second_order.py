@@ -11,6 +11,7 @@ from scipy.linalg import expm, solve_continuous_lyapunov
 from scipy.special import ndtr
 
 from jaxmuscle._common.arrays import as_doubles
+from jaxmuscle._common.environment import one_thread
 from jaxmuscle._common.errors import FirstOrderWarning
 from jaxmuscle._common.programs import kept
 from jaxmuscle.model._activation import ACTIVE
@@ -22,7 +23,7 @@ from jaxmuscle.spectra._settings import WINDOW, SpectrumSettings
 
 from ._equilibrium import HOLD, mechanics
 from ._expected import Moments, covariance_operator, expected_moments
-from ._linearised import Linearisation, linearised
+from ._linearised import Linearisation, linearisation
 
 NOTICED = 0.1
 NEGATIVE = 0.01
@@ -136,10 +137,27 @@ def _inputs_of(parts: _Parts, sources: tuple[_Source, ...], states: int) -> tupl
     return matrix, white, inputs
 
 
+class _Looked(NamedTuple):
+    """A task in double precision, without its settings, and its noises as numbers."""
+
+    task: AbstractTask
+    parts: _Parts
+
+    @classmethod
+    def at(cls, task: AbstractTask) -> "_Looked":
+        arrays = as_doubles(task)
+        with jax.enable_x64(True):
+            bare = mechanics(arrays)
+            return cls(bare, jax.tree.map(np.asarray, _parts(bare)))
+
+
 def negative_coefficients(task: AbstractTask) -> tuple[str, ...]:
     """Sentences about coefficients that noise and harmonic make negative for more than 1 % of the time."""
-    with jax.enable_x64(True):
-        parts = jax.tree.map(np.asarray, _parts(mechanics(as_doubles(task))))
+    with one_thread:
+        return _negative(_Looked.at(task).parts)
+
+
+def _negative(parts: _Parts) -> tuple[str, ...]:
     matrix, white, inputs = _inputs_of(parts, parts.noises, 0)
     rows = inputs[: len(CHANNELS)]
     covariance = solve_continuous_lyapunov(matrix, -white)
@@ -171,13 +189,16 @@ def second_order(
 
     **Returns:** a `SecondOrder`. **Raises:** as `expected_spectrum` does.
     """
-    settings = task.settings if settings is None else settings
-    arrays = as_doubles(task)
+    with one_thread:
+        return _second_order(_Looked.at(task), task.settings if settings is None else settings, moments)
+
+
+def _second_order(looked: _Looked, settings: SpectrumSettings, moments: Moments | None) -> SecondOrder:
+    task, parts = looked
     with jax.enable_x64(True):
-        system = linearised(arrays).system
-        moments = expected_moments(arrays, settings, WINDOW)[0] if moments is None else moments
-        bare = mechanics(arrays)
-        hessians, parts, system = jax.tree.map(np.asarray, (_hessians(bare, system), _parts(bare), system))
+        system = linearisation(task)
+        moments = expected_moments(task, settings, WINDOW)[0] if moments is None else moments
+        hessians, system = jax.tree.map(np.asarray, (_hessians(task, system), system))
     n = len(system.A)
     matrix, white, inputs = _inputs_of(parts, (*parts.noises, parts.harmonic), n)
     matrix[:n, :n] = system.A
@@ -227,5 +248,9 @@ def _added(
 
 def warn_beyond(task: AbstractTask, settings: SpectrumSettings | None = None, moments: Moments | None = None) -> None:
     """Warn (`FirstOrderWarning`) where the linear numbers of a task are not the model's; arguments of `second_order`."""
-    for notice in (*second_order(task, settings, moments).notices, *negative_coefficients(task)):
+    with one_thread:
+        looked = _Looked.at(task)
+        found = _second_order(looked, task.settings if settings is None else settings, moments)
+        notices = (*found.notices, *_negative(looked.parts))
+    for notice in notices:
         warnings.warn(f"{type(task).__name__}: {notice}", FirstOrderWarning, stacklevel=3)
