@@ -14,6 +14,7 @@ import hypothesis
 import jax
 import jaxlib
 import pytest
+import scipy.linalg  # noqa: F401  # brings a library of its own, see `_keep_to_own_cores`
 import shapes
 import threadpoolctl
 import timing
