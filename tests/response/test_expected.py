@@ -20,10 +20,11 @@ from jaxmuscle._common.arrays import as_arrays
 from jaxmuscle.model import Constant, Decay, RampHold
 from jaxmuscle.objective._problem import target_variation
 from jaxmuscle.response._autocovariance import Autocovariance
-from jaxmuscle.response._expected import covariance_operator, expected_moments, linear_spectrum
-from jaxmuscle.response._harmonic_line import line_table
+from jaxmuscle.response._expected import covariance_operator, expected_moments, expected_powers, lags_of, linear_spectrum
+from jaxmuscle.response._harmonic_line import _ordinates, line_table
 from jaxmuscle.response._linearised import has_response, linearised
 from jaxmuscle.response._transfer import system_of, transfer
+from jaxmuscle.spectra._bin_law import bin_rows
 from jaxmuscle.spectra._decimation import FINER
 
 KEY = jax.random.key(31)
@@ -464,6 +465,22 @@ def test_covariance_operator_is_scipys_expectation(changes, covariance):
     # That the covariance has decayed at the last lag: in 75 and 100 samples it has, to 2 %, over n².
     variance = columns[edge:-edge].var(axis=0).sum()
     np.testing.assert_allclose(passed - of_mean + lowered / n**2, variance, rtol=1e-8 if n > 200 else 1e-4)
+
+
+@pytest.mark.parametrize("window", ["boxcar", "hann", "dpss"])
+@pytest.mark.parametrize("detrend", ["none", "constant", "linear"])
+def test_transforms_of_long_segments_are_the_matrices(x64, window, detrend):
+    changes: dict = {"tapers": 3} if window == "dpss" else {}
+    settings = Settings().replace(length=1100, first_bin=0, last_bin=550, window=window, detrend=detrend, **changes)
+    operator = covariance_operator(settings)
+    assert lags_of(settings) == operator.shape[1]
+    r = RINGING[: operator.shape[1]]
+    power, expected = expected_powers(settings, r), operator @ r
+    # Of bins above the low-pass, and of those that detrending removes, nothing is left but rounding.
+    np.testing.assert_allclose(power, expected, rtol=1e-10, atol=1e-12 * expected[:-2].max())
+    x = np.cumsum(RINGING[:1100])
+    found = bin_rows(settings) @ x
+    np.testing.assert_allclose(_ordinates(settings, jnp.asarray(x)), found, rtol=1e-10, atol=1e-12 * np.abs(found).max())
 
 
 @pytest.mark.slow

@@ -129,15 +129,17 @@ class Autocovariance(NamedTuple):
 
     def lagged(self, lags: int) -> Float[Array, " lags"]:
         """r at lags 0, Δ, 2Δ ...: from few steps to the right and few long ones to the left, which meet in one product."""
-        short = (lags.bit_length() + 1) // 2
-        columns, rows = self.next[:, :, None], self.rows[:, None]
+        short, (channels, n) = (lags.bit_length() + 1) // 2, self.next.shape
+        columns, rows = self.next.T[:, None], self.rows[None]
         for power in self.powers[:short]:
-            columns = jnp.concatenate([columns, power @ columns], axis=2)
+            later = (power @ columns.reshape(n, -1)).reshape(columns.shape)
+            columns = jnp.concatenate([columns, later], axis=1)
         for power in self.powers[short:]:
-            if rows.shape[1] * columns.shape[2] >= lags - 1:
+            if rows.shape[0] * columns.shape[1] >= lags - 1:
                 break
-            rows = jnp.concatenate([rows, rows @ power], axis=1)
-        return jnp.concatenate([self.head, jnp.sum(rows @ columns, axis=0).reshape(-1)])[:lags]
+            rows = jnp.concatenate([rows, (rows.reshape(-1, n) @ power).reshape(rows.shape)])
+        later = rows.reshape(-1, channels * n) @ columns.transpose(2, 0, 1).reshape(channels * n, -1)
+        return jnp.concatenate([self.head, later.reshape(-1)])[:lags]
 
     def mean_variance(self, samples: Int[Array | np.ndarray, ""] | int) -> Float[Array, ""]:
         """Variance of the mean of that many successive samples, `Σ_l 2 (n - l) / n² r(lΔ) + r(0) / n`, l = 1 ... n - 1.

@@ -15,12 +15,12 @@ from jaxmuscle._common.types import Scalar
 from jaxmuscle.model._resonant_noise import ResonantNoise
 from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.spectra._bin_law import bin_rows
-from jaxmuscle.spectra._settings import LONGEST, WINDOW, SpectrumSettings, samples_in
+from jaxmuscle.spectra._settings import LONGEST, WINDOW, SpectrumSettings, samples_in, tapers_of
 from jaxmuscle.spectra._welch import Spectrum
 
 from ._autocovariance import autocovariances, covariances
 from ._equilibrium import mechanics
-from ._harmonic_line import harmonic_line
+from ._harmonic_line import LONG, harmonic_line, removed, sides_of, transformed
 from ._linearised import Linearisation, LinearTask, linearisation, linearise
 
 TAIL = 1e-13
@@ -86,24 +86,62 @@ def covariance_operator(settings: SpectrumSettings) -> Float[np.ndarray, "bins_a
     lagged = np.concatenate([lagged, np.eye(1, lagged.shape[1], lagged.shape[1] // 2)])
     full = np.array([scipy.signal.convolve(row, spread, method="fft") for row in lagged])
     centre, reach = full.shape[1] // 2, len(spread) // 2
-    lag = np.arange(-2 * reach, 2 * reach + 1)
-    lowered = np.convolve(np.abs(lag), spread, mode="valid") - np.abs(lag[reach : lag.size - reach])
-    full = np.concatenate([full, np.pad(lowered, centre - reach)[None]])
+    full = np.concatenate([full, np.pad(_lowered(spread), centre - reach)[None]])
     folded = full[:, centre:].copy()
     folded[:, 1:] += full[:, centre - 1 :: -1]
     return folded
+
+
+def lags_of(settings: SpectrumSettings) -> int:
+    """How many lags of the autocovariance a Welch spectrum depends on."""
+    return settings.length + len(low_pass_spread(settings)) // 2
+
+
+def expected_powers(settings: SpectrumSettings, r: Float[Array | np.ndarray, " lags"]) -> Float[Array, " bins_and_two"]:
+    """`covariance_operator(settings) @ r`; of long segments by Fourier transforms, without that matrix.
+
+    With R = r * ρ, T the matrix of its values R(|m - n|), w a taper, c its autocorrelation, q the orthonormal directions
+    that detrending removes and F the transform at the bins (docs/model.md, *Long segments*):
+
+        E_k ∝ Σ_w [F(c R) of both signs of l - 2 Re Σ_q F(w T q)* F(w q) + Σ_pq F(w p)* F(w q) pᵀ T q]_k
+    """
+    r = jnp.asarray(r)
+    if settings.length <= LONG:
+        return jnp.asarray(covariance_operator(settings), r.dtype) @ r
+    n, spread = settings.length, low_pass_spread(settings)
+    reach, tapers, away = len(spread) // 2, tapers_of(settings, n), removed(settings)
+    convolved = jax.scipy.signal.fftconvolve
+    R = convolved(jnp.concatenate([r[reach:0:-1], r[: n + reach]]), jnp.asarray(spread, r.dtype), mode="valid")
+    own = np.sum([scipy.signal.correlate(w, w, method="fft")[n - 1 :] for w in tapers], axis=0)
+    power = 2 * jnp.real(transformed(settings, jnp.asarray(own, r.dtype) * R)) - own[0] * R[0]
+    moved = [convolved(jnp.concatenate([R[:0:-1], R]), jnp.asarray(q, r.dtype), mode="valid") for q in away]
+    for w in tapers:
+        seen = [transformed(settings, jnp.asarray(w * q, r.dtype)) for q in away]
+        for q, (here, Tq) in enumerate(zip(seen, moved, strict=True)):
+            power -= 2 * jnp.real(jnp.conj(transformed(settings, jnp.asarray(w, r.dtype) * Tq)) * here)
+            for p, there in enumerate(seen):
+                power += jnp.real(jnp.conj(there) * here) * (jnp.asarray(away[p], r.dtype) @ moved[q])
+    lowered = _lowered(spread)[reach:] * np.append(1.0, np.full(reach, 2.0))
+    further = jnp.stack([R[0], jnp.asarray(lowered, r.dtype) @ r[: reach + 1]])
+    return jnp.concatenate([power * jnp.asarray(sides_of(settings), r.dtype), further])
+
+
+def _lowered(spread: Float[np.ndarray, " lags"]) -> Float[np.ndarray, " lags"]:
+    """`(|·| * ρ)(l) - |l|` at the lags of ρ."""
+    reach = len(spread) // 2
+    lag = np.arange(-2 * reach, 2 * reach + 1)
+    return np.convolve(np.abs(lag), spread, mode="valid") - np.abs(lag[reach : lag.size - reach])
 
 
 def noise_response(
     task: AbstractTask, system: Linearisation, settings: SpectrumSettings, samples: Int[Array | np.ndarray, ""] | int
 ) -> tuple[Float[Array, "components bins"], Float[Array, ""]]:
     """Expected Welch power of each component of the noise, and variance of so many low-passed samples about their mean."""
-    operator = covariance_operator(settings)
-    lags = operator.shape[1]
+    lags = lags_of(settings)
     each, of = autocovariances(task, system, settings, max(lags, LONGEST))
     belongs = np.equal.outer(np.arange(len(task.noise.components)), of).astype(system.A.dtype)
     r = belongs @ jax.vmap(lambda own: own.lagged(lags))(each)
-    found = jnp.stack([jnp.asarray(operator, system.A.dtype) @ own for own in r])
+    found = jnp.stack([expected_powers(settings, own) for own in r])
     slow = jnp.sum(jax.vmap(lambda own: own.mean_variance(samples))(each))
     whole = jnp.sum(found, axis=0)
     return found[:, :-2], whole[-2] - slow + whole[-1] / jnp.asarray(samples, found.dtype) ** 2

@@ -13,11 +13,38 @@ from jaxmuscle.model._signals import Constant
 from jaxmuscle.model._tasks import AbstractTask
 from jaxmuscle.spectra._bin_law import bin_rows
 from jaxmuscle.spectra._decimation import FINER, anti_alias
-from jaxmuscle.spectra._settings import WINDOW, SpectrumSettings
+from jaxmuscle.spectra._settings import WINDOW, SpectrumSettings, tapers_of
 from jaxmuscle.spectra._welch import lowpass, spectrum_of
 
 from ._linearised import Linearisation, linearise
 from ._transfer import harmonic_system, times_i, transfer, turn_of
+
+LONG = 1024  # samples of a segment: beyond, a fast Fourier transform takes the place of matrices, whose size is its square
+
+
+def transformed(settings: SpectrumSettings, x: Float[Array, "*some samples"]) -> Complex[Array, "*some bins"]:
+    """Fourier transform of segments, at the bins."""
+    return jnp.fft.rfft(x)[..., settings.first_bin : settings.last_bin + 1]
+
+
+def sides_of(settings: SpectrumSettings) -> Float[np.ndarray, " bins"]:
+    """How often a bin counts, once or for both signs of its frequency, over the rate [1/Hz]."""
+    k = np.arange(settings.first_bin, settings.last_bin + 1)
+    return np.where((k == 0) | (2 * k == settings.length), 1.0, 2.0) / settings.rate
+
+
+def removed(settings: SpectrumSettings) -> Float[np.ndarray, "directions samples"]:
+    """What detrending removes of a segment: orthonormal directions."""
+    m = np.arange(settings.length) - (settings.length - 1) / 2
+    rows = {"none": [], "constant": [np.ones_like(m)], "linear": [np.ones_like(m), m]}[settings.detrend]
+    return np.array([row / np.linalg.norm(row) for row in rows]).reshape(-1, settings.length)
+
+
+def _ordinates(settings: SpectrumSettings, x: Float[Array, " samples"]) -> Complex[Array, "bins tapers"]:
+    """`bin_rows(settings) @ x` of a long segment."""
+    away, tapers = (jnp.asarray(a, x.dtype) for a in (removed(settings), tapers_of(settings, settings.length)))
+    found = transformed(settings, tapers * (x - away.T @ (away @ x))).T
+    return found * jnp.asarray(np.sqrt(sides_of(settings))[:, None], found.dtype)
 
 
 def _low_pass(settings: SpectrumSettings, turn: Complex[Array, ""]) -> Complex[Array, ""]:
@@ -108,10 +135,15 @@ def _table(
     begins = start + settings.step * np.arange(settings.segments(stop - start))
     # With ahead, behind = rows @ e^(±i angle m) and z the same of the real and of the imaginary rows, which takes no complex
     # product: Σ |ahead|² + |behind|² = 2 Σ |z|² and Σ ahead conj(behind) = Σ z².
-    rows = bin_rows(settings)
-    rows = jnp.asarray(np.concatenate([np.real(rows), np.imag(rows)], axis=1), angle.dtype)
     spin = angle * np.arange(settings.length, dtype=angle.dtype)
-    z = jax.lax.complex(rows @ jnp.cos(spin), rows @ jnp.sin(spin))
+    if settings.length > LONG:
+        cos, sin = (_ordinates(settings, wave(spin)) for wave in (jnp.cos, jnp.sin))
+        parts = [(jnp.real(x), jnp.imag(x)) for x in (cos, sin)]
+        z = jax.lax.complex(*(jnp.concatenate(own, axis=1) for own in parts))
+    else:
+        rows = bin_rows(settings)
+        rows = jnp.asarray(np.concatenate([np.real(rows), np.imag(rows)], axis=1), angle.dtype)
+        z = jax.lax.complex(rows @ jnp.cos(spin), rows @ jnp.sin(spin))
     through = gain * _low_pass(settings, turn)
     level = 0.5 * jnp.abs(through) ** 2 * jnp.sum(jnp.abs(z) ** 2, axis=1)
     both = jnp.sum(z**2, axis=1)

@@ -22,7 +22,8 @@ from jaxmuscle.model._white_noise import BandLimitedNoise, WhiteNoise
 from jaxmuscle.spectra._settings import WINDOW, SpectrumSettings
 
 from ._equilibrium import HOLD, mechanics
-from ._expected import Moments, covariance_operator, expected_moments
+from ._expected import Moments, covariance_operator, expected_moments, expected_powers, lags_of
+from ._harmonic_line import LONG
 from ._linearised import Linearisation, linearisation
 
 NOTICED = 0.1
@@ -217,13 +218,17 @@ def _operator(settings: SpectrumSettings) -> Float[Array, "bins lags"]:
     return jnp.asarray(covariance_operator(settings)[:-2])
 
 
+_powers = kept(expected_powers)
+
+
 def _added(
     forms: np.ndarray, matrix: np.ndarray, stationary: np.ndarray, system: Any, settings: SpectrumSettings
 ) -> tuple[np.ndarray, float]:
     """Welch power and mean of z₂."""
     with jax.enable_x64(True):
-        operator = np.asarray(_operator(settings))
-    count, interval = max(SAMPLES, 1 << int(np.ceil(np.log2(2 * operator.shape[1])))), 1 / settings.rate
+        operator = None if settings.length > LONG else np.asarray(_operator(settings))
+    lags = lags_of(settings) if operator is None else operator.shape[1]
+    count, interval = max(SAMPLES, 1 << int(np.ceil(np.log2(2 * lags)))), 1 / settings.rate
     step = expm(matrix * interval)
     each = np.empty((count // 2, *matrix.shape))
     each[0] = stationary
@@ -240,10 +245,13 @@ def _added(
     row = np.linalg.solve((1j * omega[:, None, None] * np.eye(n) - system.A).swapaxes(1, 2), system.C[:, None])[..., 0]
     row = np.concatenate([row, np.ones((len(row), 1))], axis=1)
     seen = (row[:, None] @ density @ row.conj()[..., None])[:, 0, 0].real
-    autocovariance = np.fft.irfft(seen, count)[: operator.shape[1]] / interval
+    autocovariance = np.fft.irfft(seen, count)[:lags] / interval
     forced = np.einsum("aij,ij->a", forms, stationary)
     mean = float(forced[-1] - system.C @ np.linalg.solve(system.A, forced[:-1]))
-    return operator @ autocovariance, mean
+    if operator is not None:
+        return operator @ autocovariance, mean
+    with jax.enable_x64(True):
+        return np.asarray(_powers(settings, autocovariance))[:-2], mean
 
 
 def warn_beyond(task: AbstractTask, settings: SpectrumSettings | None = None, moments: Moments | None = None) -> None:
