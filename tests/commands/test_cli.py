@@ -1,6 +1,8 @@
 """The command: what it writes, its exit codes, and one line instead of a traceback for a user's mistake."""
 
 import csv
+import dataclasses
+import functools
 import gc
 import importlib
 import inspect
@@ -944,52 +946,65 @@ def test_steadiness_of_trials(tmp_path):
         assert wrong.exit_code == 2 and message in wrong.stderr
 
 
-@pytest.mark.usefixtures("as_fine_as_shipped")
-@pytest.mark.slow
-def test_a_designed_motion(tmp_path):
+ASKED = ("--quantity", "K_w0,C_w0", "--rms", "0.5", "--peak", "0.9", "--band", "0.2:4", "--seconds", "20", "--rate",
+         "50")  # fmt: skip
+
+
+@functools.cache
+def designed():
+    """What these options ask for."""
+    return jm.design_input(
+        jm.Isometric(), ("K_w0", "C_w0"), rms=5e-4, peak=9e-4, band=(0.2, 4.0), seconds=20.0, rate=50.0, error=0.1
+    )
+
+
+@pytest.fixture
+def muscle(tmp_path):
     preset = tmp_path / "muscle.toml"
     jm.save_preset(preset, jm.Isometric())
-    asked = (
-        "--quantity",
-        "K_w0,C_w0",
-        "--rms",
-        "0.5",
-        "--peak",
-        "0.9",
-        "--band",
-        "0.2:4",
-        "--seconds",
-        "20",
-        "--rate",
-        "50",
-    )
-    result = run("design", preset, *asked, "--durations", "20,40", "--error", "10", "--out", tmp_path / "out", "--json")
+    return preset
+
+
+@pytest.mark.usefixtures("as_fine_as_shipped")
+@pytest.mark.slow
+def test_a_designed_motion(muscle, tmp_path):
+    result = run("design", muscle, *ASKED, "--durations", "20,40", "--error", "10", "--out", tmp_path / "out", "--json")
     assert result.exit_code == 0
-    found = jm.design_input(jm.Isometric(), ("K_w0", "C_w0"), rms=5e-4, peak=9e-4, band=(0.2, 4.0), seconds=20.0, rate=50.0)
+    found = designed()
     table = json.loads(result.stdout)
     assert table == json.loads((tmp_path / "out" / "design.json").read_text())
     assert [row["seconds"] for row in table["by_seconds"]] == [20.0, 40.0] and table["needed"]["error"] == 0.1
+    assert table["needed"]["seconds"] == pytest.approx(found.needed[1])
     assert table["by_seconds"][0]["stderr"]["K_w0"] == pytest.approx(found.stderr["K_w0"])
     assert table["gain"] == pytest.approx(found.gain) and table["quantity"] == ["K_w0", "C_w0"]
     signal = np.loadtxt(tmp_path / "out" / "motor.csv", delimiter=",", skiprows=3)
     np.testing.assert_allclose(signal[:, 1], 1e3 * found.displacement, rtol=1e-6, atol=1e-9)
     assert (tmp_path / "out" / "design.png").stat().st_size > 10_000
-    said = run("design", preset, *asked, "--out", tmp_path / "out", "--force").stdout
-    assert "    jaxmuscle fit RECORD.csv --task prescribed-length --window 10:30 --out out/moved\n" in said
-    assert "    jaxmuscle fit RECORD.csv --hold HOLD.csv --window 10:30,auto --out out/both\n" in said
-    assert "Play the motion for 32 s: motor.csv holds one period of 20 s" in " ".join(said.split())
-    said = run("design", preset, *asked, "--error", "10", "--out", tmp_path / "out", "--force").stdout
-    end = 10 + 20 * np.ceil(table["needed"]["seconds"] / 20)
-    assert end > 30 and f"Play {end + 2:.3g} s and analyse 10 to {end:.3g} s" in " ".join(said.split())
-    assert f"--window 10:{end:g} --out out/moved\n" in said  # as long as is said above
     for arguments, message in (
         (("--out", tmp_path / "out"), "motor.csv: is there already; overwrite it with --force"),
         (("--band", "5", "--out", tmp_path / "new"), "--band 5: give lowest and highest frequency in Hz, as --band 0.5:5"),
         (("--quantity", "K", "--out", tmp_path / "new"), "quantity 'K' is unknown"),
         (("--durations", "30;60", "--out", tmp_path / "new"), "--durations 30;60: give lengths of the record in s, as"),
     ):
-        wrong = run("design", preset, *arguments)
+        wrong = run("design", muscle, *arguments)
         assert wrong.exit_code == 2 and message in wrong.stderr
+
+
+@pytest.mark.slow
+def test_how_to_play_and_fit_a_designed_motion_is_told(muscle, tmp_path, monkeypatch):
+    """Above is what was designed, found by the command itself."""
+    longer = designed()
+    once = dataclasses.replace(longer, needed=None)
+    found = iter([once, longer])
+    monkeypatch.setattr(jm, "design_input", lambda *_, **__: next(found))
+    said = run("design", muscle, *ASKED, "--out", tmp_path / "out").stdout
+    assert "    jaxmuscle fit RECORD.csv --task prescribed-length --window 10:30 --out out/moved\n" in said
+    assert "    jaxmuscle fit RECORD.csv --hold HOLD.csv --window 10:30,auto --out out/both\n" in said
+    assert "Play the motion for 32 s: motor.csv holds one period of 20 s" in " ".join(said.split())
+    said = run("design", muscle, *ASKED, "--error", "10", "--out", tmp_path / "out", "--force").stdout
+    end = 10 + 20 * np.ceil(longer.needed[1] / 20)
+    assert end > 30 and f"Play {end + 2:.3g} s and analyse 10 to {end:.3g} s" in " ".join(said.split())
+    assert f"--window 10:{end:g} --out out/moved\n" in said  # as long as is said above
 
 
 def test_a_motion_is_designed_for_a_fit_and_not_for_a_spectrum(tmp_path):

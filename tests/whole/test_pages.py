@@ -15,7 +15,9 @@ import typer
 
 import jaxmuscle as jm
 from jaxmuscle.commands.main import app
+from jaxmuscle.fits import _half_power
 from jaxmuscle.uncertainty import _posterior_checks as _mixing
+from jaxmuscle.uncertainty import _profile
 
 TRUTH = jm.Isometric().replace(harmonic_frequency=6.0, harmonic_amplitude=0.012)
 ELSEWHERE = {
@@ -30,29 +32,53 @@ RUN_HERE = {
     "docs/how-to/report-results.md", "docs/identifiability.md", "docs/index.md", "docs/python.md", "docs/recordings.md",
     "docs/reference/figures.md", "docs/scaling.md", "docs/tutorial.md", "docs/uncertainty.md",
 }  # fmt: skip
-FEWER_SEEDS = {"seeds=100_000": "seeds=1_000"}
 # Data with a rhythm are also tried with a tremor: two more programs of each fit, which fits/test_rungs.py has.
-NO_LADDER = {'"trial3.csv"])  # the trials': '"trial3.csv"], rungs=0)  # the trials'}
 FEW = "rungs=0, starts=16, seeds=16, check_seeds=16"
+OF_TRIALS = {'"trial3.csv"])  # the trials': f'"trial3.csv"], {FEW})  # the trials'}
+
+
+def jitted(*functions: str) -> dict[str, str]:
+    """What is called outside `jit` is traced anew each time: the gradient of the README alone is left so."""
+    return {f"{function}(": f"jax.jit({function})(" for function in functions}
+
+
+IN_PYTHON = {"seeds=100_000": "seeds=100", "seeds=1000)": "seeds=100)"} | jitted(
+    "jax.grad(variation)", "jax.grad(lambda v: jm.expected_spectrum(rebuild(v)).proportional[10])"
+)
 FULL = "starts=32, seeds=16, check_seeds=16"
 # What a notebook does as the README does is done as there. The ladder, tremor and all, is climbed in fits/test_rungs.py.
 IN_NOTEBOOKS = {
+    "01-first-fit": {"fix=held": f"fix=held, {FEW}"},
+    "02-monte-carlo-ensemble": {"seeds=1000": "seeds=100"},
     "04-from-recording-to-parameters": {"target, starts=40": f"target, {FEW}"},
     "05-uncertainty-and-noise-colour": {
         f"target, {FULL}": "target",
         'task, target, noises=("band-limited", "ornstein-uhlenbeck"), groups=3': "jm.Isometric(), target",
         f"jm.Isometric(), measured, {FULL}": f"person, measured, {FEW}",
     },
-    "07-your-own-muscle": {"starts=16": FEW},
-    "08-perturb-and-measure": {"rungs=0, check_seeds=0": "rungs=0, check_seeds=0, starts=16"},
+    "06-gradients-and-design": {
+        "jax.jvp(spread, (k_w,), (1.0,))": "jax.jit(lambda k: jax.jvp(spread, (k,), (1.0,)))(k_w)",
+        **jitted("jax.grad(spread)"),
+    },
+    "07-your-own-muscle": {
+        "starts=16": FEW,
+        **jitted(
+            "jax.vmap(variation, in_axes=(None, 0))",
+            "jax.grad(lambda damping: jm.expected_spectrum(mine.replace(damping=damping)).proportional[0])",
+        ),
+    },
+    "08-perturb-and-measure": {
+        "rungs=0, check_seeds=0": "rungs=0, check_seeds=0, starts=8",
+        "starts=16)": "starts=4, seeds=0, check_seeds=0)",
+    },
 }
 CALLED_OFTEN = ("fit", "fit_cohort", "ensemble", "profile", "posterior", "identifiability", "compare_noise", "goodness",
-                "bootstrap")  # fmt: skip
+                "bootstrap", "design_input")  # fmt: skip
 FEWER: dict[str, dict[str, Any]] = {
     "ensemble": {"chunk": 16},  # one program for any number of seeds
     "fit_cohort": {"starts": 8},
-    "goodness": {"replicates": 39},
-    "bootstrap": {"replicates": 6},
+    "goodness": {"replicates": 19},
+    "bootstrap": {"replicates": 4},
     "compare_noise": {"groups": 3, "noises": ("white", "band-limited", "ornstein-uhlenbeck")},
     "posterior": {"chains": 2, "draws": 150, "warmup": 200},
 }
@@ -107,6 +133,11 @@ def once():
         # Two chains of 150 draws: R-hat scatters by some 0.02 about 1. test_posterior.py draws chains that must mix.
         for name, bound in (("MIXED", 1.2), ("NEARLY", 1.4), ("EFFECTIVE", 5), ("DIVERGING", 0.05)):
             patch.setattr(_mixing, name, bound)
+        # Profiles of few points, along one of several maxima, and intervals of few steps. No page says what these end at:
+        # uncertainty/test_posterior.py and fits/test_intervals.py do.
+        for name, value in (("STEPS", np.array([1.2, 2.5])), ("FAR", np.log([30.0])), ("MODES", 1)):
+            patch.setattr(_profile, name, value)
+        patch.setattr(_half_power, "TURNS", 3)
         for name in CALLED_OFTEN:
             patch.setattr(jm, name, done.of(name, getattr(jm, name), **FEWER.get(name, {})))
         yield done
@@ -122,7 +153,7 @@ def readme(once, tmp_path_factory):
         for seed, name in enumerate("abc"):
             write_spectrum(f"{name}.csv", seed)
         with contextlib.redirect_stdout(io.StringIO()) as printed:
-            names = pages.run("docs/python.md", pages.run("README.md", {"printed": printed}, NO_LADDER), FEWER_SEEDS)
+            names = pages.run("docs/python.md", pages.run("README.md", {"printed": printed}, OF_TRIALS), IN_PYTHON)
     return names | {"returned": dict(once.last)}
 
 
@@ -148,7 +179,7 @@ def test_readme(readme):
 
 @pytest.mark.slow
 def test_ensembles(readme):
-    fewer = {"seeds=100_000": "seeds=200", "seeds=5_000": "seeds=50", "seeds=1000": "seeds=100"}
+    fewer = {"seeds=100_000": "seeds=64", "seeds=5_000": "seeds=48", "seeds=1000": "seeds=32"}
     pages.run("docs/ensembles.md", readme, fewer)
     assert Path("runs.zarr").exists() and Path("persons.zarr").exists()
 
@@ -162,9 +193,10 @@ def test_uncertainty(readme):
 @pytest.mark.slow
 def test_tutorial_and_front_page():
     # The target is the bundled one, written and read again.
-    names = pages.run("docs/tutorial.md", {}, {"jm.task_for(target), target)": f"jm.task_for(target), target, {FEW})"})
+    few = {"jm.task_for(target), target)": f"jm.task_for(target), target, {FEW})", "fix=known": f"fix=known, {FEW}"}
+    names = pages.run("docs/tutorial.md", {}, few)
     assert "harmonic_frequency" in names["sharper"].free and jm.load_result("mine.json").success
-    assert pages.run("docs/index.md")["result"].success
+    assert pages.run("docs/index.md", {}, {"seeds=1000)": "seeds=100)"})["result"].success
     reported = pages.run("docs/how-to/report-results.md")["determined"]
     assert {"corner_frequency", "coefficient_of_variation"} <= set(reported["quantity"]) and Path("table.csv").exists()
     few = {"mean_force=(40.5, 0.8)": f"mean_force=(40.5, 0.8), {FEW}"}
@@ -185,8 +217,9 @@ def test_force():
 def test_identifiability():
     write_spectrum("displacement.csv", task=TRUTH.as_task(jm.PrescribedForce, P_w=TRUTH.P_w, F_ext=2.93))
     # What tests/uncertainty/test_several.py runs on less.
-    fewer = {"jm.goodness(joint)": "jm.goodness(joint, replicates=19)", "jm.bootstrap(joint)": "",
-             "jm.posterior(joint, key=0)": ""}  # fmt: skip
+    fewer = {"(2.93, 0.06)},": "(2.93, 0.06)}, starts=16, seeds=16, check_seeds=16,",
+             'jm.profile(joint, "K_w0")': 'joint["K_w0"]', "jm.bootstrap(joint)": "", "jm.posterior(joint, key=0)": "",
+             "jm.goodness(joint)": "jm.goodness(joint, replicates=19)"}  # fmt: skip
     names = pages.run("docs/identifiability.md", {}, fewer)
     assert len(names["report"].designs) == 4 and jm.load_result("joint.json").success
 
@@ -194,14 +227,14 @@ def test_identifiability():
 @pytest.mark.slow
 def test_own_data():
     write_spectrum("mine.csv")
-    once = {"jm.task_for(target), target)": "jm.task_for(target), target, rungs=0)"}
+    once = {"jm.task_for(target), target)": f"jm.task_for(target), target, {FEW})"}
     assert pages.run("docs/fit-a-csv.md", {}, once)["target"].segments == (6,) * 10
     for number, name in enumerate(("trial.csv", "trial1.csv", "trial2.csv", "trial3.csv")):
         write_recording(name, 5 + number)
     write_tremor("tremor.csv")
     quick = {"jm.task_for(tremor), tremor": "jm.task_for(tremor), tremor, rungs=0, starts=8, seeds=0, check_seeds=0",
-             "held.target())\n": "held.target(), rungs=0)\n",
-             "target)  # the same": "target, rungs=0)  # the same"}  # fmt: skip
+             "held.target())\n": f"held.target(), {FEW})\n",
+             "target)  # the same": f"target, {FEW})  # the same"}  # fmt: skip
     names = pages.run("docs/recordings.md", {}, quick)
     assert names["result"].success and names["moving"].task.quantity == "acceleration"
     assert Path("trial.png").exists()
@@ -210,8 +243,9 @@ def test_own_data():
 @pytest.mark.slow
 def test_coming_from_elsewhere():
     pages.run("docs/coming-from-matlab.md")
+    whole = jitted("jax.jacfwd(last)", "jax.grad(last)", "jax.grad(lambda v: jnp.sum(misfit(v) ** 2))")
     with jax.numpy_dtype_promotion("standard"):  # optax mixes integers of two lengths
-        names = pages.run("docs/coming-from-diffrax.md")
+        names = pages.run("docs/coming-from-diffrax.md", {}, whole)
         first = float(names["loss"]((names["logs"], names["Sensor"](jax.numpy.asarray(-5.0)))))
     assert float(names["value"]) < 0.9 * first  # the loop of optax went downhill
     assert names["many"].shape == (8,) and np.all(np.isfinite(names["solution"].ys))
@@ -296,7 +330,8 @@ def test_the_gallery_shows_every_figure():
 
 
 def unlabelled(figure):
-    """Axes with numbers but no words at them."""
+    """Axes with numbers but no words at them. (Where they stand is no matter here: plot/test_plot.py has the layout.)"""
+    figure.set_layout_engine("none")
     figure.draw_without_rendering()
     for ax in figure.get_axes():
         for axis in (ax.xaxis, ax.yaxis) if ax.axison else ():
@@ -309,11 +344,11 @@ def unlabelled(figure):
 @pytest.mark.slow
 def test_the_gallery_is_drawn_by_its_code_with_units_and_in_given_axes(readme, monkeypatch):
     """The statements of the README's results are those of the gallery: what takes minutes is not done twice."""
-    for name in ("posterior", "identifiability", "compare_noise", "goodness", "bootstrap"):
+    for name in ("posterior", "identifiability", "compare_noise", "goodness", "bootstrap", "design_input"):
         monkeypatch.setattr(jm, name, lambda *_, found=readme["returned"][name], **__: found)
     names = dict(readme)
     for section in GALLERY.SECTIONS[:-2]:  # the paper's figures and a study, which fits/test_study.py does
-        exec(section.setup, names)
+        exec(section.setup.replace("seeds=2000", "seeds=100"), names)
         for figure in section.figures:
             made = eval(figure.code.replace(", minute)", f", minute, {FEW})"), names)
             whole = getattr(made[0] if isinstance(made, tuple) else made, "figure", made)
