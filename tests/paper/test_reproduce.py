@@ -6,6 +6,7 @@ from html.parser import HTMLParser
 from pathlib import Path
 from types import SimpleNamespace
 
+import conftest
 import jax
 import numpy as np
 import pages
@@ -90,7 +91,9 @@ EXPECTED = {
 def done(tmp_path_factory):
     """The whole command's work, once: what was found, and the folder."""
     folder = tmp_path_factory.mktemp("reproduce")
-    return reproduce(folder), folder
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(conftest, "DRAWN_WHOLE", 0)  # each is drawn as a PDF, too
+        return reproduce(folder), folder
 
 
 @pytest.fixture(scope="module")
