@@ -1,5 +1,6 @@
 """The law of Welch bins and the likelihoods: against simulation, closed forms, scipy and finite differences."""
 
+import dataclasses
 import functools
 
 import jax
@@ -13,6 +14,8 @@ from scipy.special import digamma, gammaln
 
 import jaxmuscle as jm
 from jaxmuscle._common.arrays import as_arrays
+from jaxmuscle.objective._arguments import FitOptions, planned
+from jaxmuscle.objective._covariance import residual_covariance
 from jaxmuscle.objective._likelihood import _gamma_level, likeliest_offset, log_density, log_marginal, measured_bins
 from jaxmuscle.response._expected import expected_moments
 from jaxmuscle.spectra._bin_law import bin_rows, welch_law
@@ -55,6 +58,24 @@ def test_trials_add_their_degrees_of_freedom():
     one, two = welch_law(settings, bins, (6,)), welch_law(settings, bins, (6, 6))
     np.testing.assert_allclose(two.degrees, 2 * one.degrees)
     np.testing.assert_allclose(two.correlation, one.correlation, atol=1e-12)
+
+
+@pytest.mark.slow
+def test_a_mean_of_seeds_without_control_scatters_as_that_of_so_many_spectra():
+    """Over the ten seconds that a fit simulates there is room for `SEGMENTS`. With a control variate nothing scatters."""
+    assert SEGMENTS == (1000 - 256) // 128 + 1
+    target = jm.Target("white", np.ones(30), segments=SEGMENTS)
+    problem = planned(jm.Isometric(), target, FitOptions(free=("c_w",))).problem
+    plain, controlled = (dataclasses.replace(problem, control=c).montecarlo(8).parts[0] for c in (False, True))
+    data, none = problem.linear().parts[0], np.zeros(30)
+    np.testing.assert_array_equal(residual_covariance(target, controlled, none), residual_covariance(target, data, none))
+    simulated = residual_covariance(target, plain, none) - residual_covariance(target, data, none)
+    logs = np.log(white_powers().reshape(-1, 8, 30).mean(axis=1))
+    rows = (logs - logs.mean(axis=1, keepdims=True)) / data.statistics.sd
+    found, variance = np.cov(rows.T), np.diag(simulated)
+    # 465 different entries; that the bins' law is approximate moves a correlation by up to 0.01
+    scale, correlation = np.sqrt(np.outer(variance, variance)), simulated / np.sqrt(np.outer(variance, variance))
+    assert np.all(np.abs(found / scale - correlation) < 5 * np.sqrt((1 + correlation**2) / len(rows)) + 0.01)
 
 
 def independent(bins):
