@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import scipy.signal
 from compiled import at_once
+from refits import without_intervals
 from scipy.interpolate import make_interp_spline
 from scipy.optimize import brentq
 
@@ -117,7 +118,8 @@ def test_tangents_do_not_hang_on_the_reference_displacement(minute, result, x64)
     for name, value in (("K_w_tangent", true), ("tangent_stiffness", 1 / (1 / true + 1 / WHOLE["K_z0"]))):
         assert abs(result[name].value - value) < 3 * result[name].stderr, name
     longer = {"x_ref_w": 0.03, "x_ref_z": 0.03, "k_w": 5e5 / 2.25, "k_z": 5e5 / 2.25}
-    other = jm.fit(jm.PrescribedLength().replace(**longer), minute, check_seeds=0)
+    with without_intervals():
+        other = jm.fit(jm.PrescribedLength().replace(**longer), minute, starts=8, check_seeds=0)
     assert other.adequate
     ratio = float(active) / result["K_w0"].value
     foretold = float(active) / (1 + (ratio - 1) / 2.25)
@@ -332,9 +334,10 @@ def test_a_published_response_with_a_spectrum_of_the_same_muscle(published):
     spectrum = jm.Target("held", power, segments=40, settings=still.settings)
     moved = still.as_task(jm.PrescribedLength, P_w=still.P_w)
     tasks = {"moved": moved, "held": still}
-    result = jm.fit_joint({"moved": published, "held": spectrum}, tasks=tasks)
+    with without_intervals():
+        result = jm.fit_joint({"moved": published, "held": spectrum}, tasks=tasks, starts=8, seeds=0)
+        alone = jm.fit(moved, published, starts=8, check_seeds=0)
     assert result.success and result.adequate
-    alone = jm.fit(moved, published)
     for name in ("K_w0", "K_z0", "C_w0"):
         assert abs(result[name].value - WHOLE[name]) < 4 * result[name].stderr
         assert result[name].stderr < 1.02 * alone[name].stderr
@@ -371,8 +374,9 @@ def test_points_of_no_use_are_left_out(published):
 @pytest.mark.slow
 def test_two_minutes_know_more(minute, result):
     """Of a muscle whose active mass is known: with a free one its doubt, which no record lessens, is in the errors."""
-    one, both = (jm.fit(jm.PrescribedLength(), trials, fix={"m_w": TRUE["m_w"]}, check_seeds=0)
-                 for trials in (minute, [minute, recorded(6)]))  # fmt: skip
+    given = {"fix": {"m_w": TRUE["m_w"]}, "starts": 8, "check_seeds": 0}
+    with without_intervals():
+        one, both = (jm.fit(jm.PrescribedLength(), trials, **given) for trials in (minute, [minute, recorded(6)]))
     assert both.success and both.adequate
     for name, true in WHOLE.items():
         assert abs(both[name].value - true) < 3.9 * both[name].stderr
@@ -397,7 +401,8 @@ def test_a_muscle_of_a_richer_model_takes_its_own_response_off():
     moved = jm.settled(muscle).with_parts(x_z=jm.model.Sampled.through(time, -length))
     force = np.asarray(jm.simulate(moved, 11, duration=90.0, rate=float(rate)).output)
     record = jm.PerturbedRecording.from_array(force, length, rate).steady((30.0, 90.0))
-    fit = jm.fit(jm.PrescribedLength(), record, rungs=1, starts=16, seeds=0, check_seeds=0)
+    with without_intervals():
+        fit = jm.fit(jm.PrescribedLength(), record, rungs=1, starts=8, seeds=0, check_seeds=0)
     assert fit.adequate and [rung.number for rung in fit.ladder if rung.chosen] == [1]
     with jax.enable_x64(True):
         again = seen_with(fit.task, (record,))
@@ -414,7 +419,8 @@ def test_a_muscle_of_a_richer_model_takes_its_own_response_off():
 @pytest.mark.slow
 def test_a_line_in_the_fluctuations_is_fitted_though_noise_alone_passes():
     """Left out, it would move C_w0 and K_z0 by about one stated error. (Without one none is fitted: `minute`.)"""
-    result = jm.fit(jm.PrescribedLength(), recorded(5, line=0.003), check_seeds=0)
+    with without_intervals():
+        result = jm.fit(jm.PrescribedLength(), recorded(5, line=0.003), starts=8, check_seeds=0)
     before, after = result.ladder[:2]
     assert (before.model, after.number) == ("noise alone", 0) and before.p >= 0.01
     assert after.aic < before.aic - 2 and result.adequate
@@ -444,7 +450,8 @@ def test_a_hold_beside_it_is_of_the_same_masses(minute, result):
     """Both tasks share the masses, which are not carried with the mean force; a hold more leaves no larger errors."""
     force = muscle_force(np.zeros(SECONDS * RATE), np.random.default_rng(8))
     hold = jm.Recording(force, RATE, unit="N", name="held").steady((2.0, 62.0)).target()
-    both = jm.fit_joint({"moved": minute, "held": hold}, starts=16, seeds=0)
+    with without_intervals():
+        both = jm.fit_joint({"moved": minute, "held": hold}, starts=8, seeds=0)
     assert both.success and both.adequate
     assert both["m_w"].free and both["m_z"].free and not any("m_w@" in name or "m_z@" in name for name in both.parameters)
     assert both.settings["prior_centre"]["m_w"] == both.settings["prior_centre"]["m_z"] == 0.5
