@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
+from refits import without_intervals
 from test_fit import true_derived
 from test_result import assert_equal
 
@@ -77,15 +78,17 @@ LEVELS = {"low": jm.Isometric().replace(P_w=3.0), "high": jm.Isometric().replace
 
 @functools.cache
 def two_levels():
-    return jm.fit_joint(levels(), tasks=LEVELS, seeds=64)  # as many as its check simulates: one program
+    with without_intervals():
+        return jm.fit_joint(levels(), tasks=LEVELS, starts=16, seeds=64)  # as many as its check simulates: one program
 
 
 @pytest.mark.slow
 def test_two_force_levels_tell_what_one_does_not():
     joint = two_levels()
     assert joint.success, joint.message
-    alone = jm.fit_cohort([levels()["low"]], fix={"P_w": 3.0}).results["low"].derived
-    more = jm.fit_cohort([levels()["high"]], fix={"P_w": 12.0}).results["high"].derived
+    with without_intervals():
+        alone = jm.fit_cohort([levels()["low"]], fix={"P_w": 3.0}, starts=16).results["low"].derived
+        more = jm.fit_cohort([levels()["high"]], fix={"P_w": 12.0}, starts=16).results["high"].derived
     assert alone["K_z0"].stderr is None and more["K_z0"].stderr is None
     with jax.enable_x64(True):
         low, high = (true_derived(TRUTH.replace(P_w=P_w)) for P_w in (3.0, 12.0))
@@ -107,9 +110,10 @@ def test_force_and_displacement_tell_every_stiffness_and_damping():
     held = TRUTH.as_task(jm.PrescribedForce, P_w=TRUTH.P_w, F_ext=load)
     targets = {"force": simulated(TRUTH, "force", 3), "displacement": simulated(held, "displacement", 4, variation=False)}
     tasks = {"force": jm.Isometric(), "displacement": jm.PrescribedForce(F_ext=load)}
-    joint = jm.fit_joint(targets, tasks=tasks, seeds=64)
+    with without_intervals():
+        joint = jm.fit_joint(targets, tasks=tasks, starts=16, seeds=64)
+        alone = jm.fit_cohort([targets["force"]], starts=16).results["force"].derived
     assert joint.success, joint.message
-    alone = jm.fit_cohort([targets["force"]]).results["force"].derived
     determined = ("K_w0", "K_z0", "C_w0", "C_z0")
     assert all(alone[name].stderr is None for name in ("K_w0", "K_z0", "C_z0"))
     with jax.enable_x64(True):
@@ -133,8 +137,9 @@ def two_people():
 
 @pytest.mark.slow
 def test_with_all_parameters_separate_it_is_the_single_fits():
-    joint = jm.fit_joint(two_people(), separate=DEFAULT_FREE, starts=32, seeds=0)
-    alone = jm.fit_cohort(two_people().values(), starts=32).results
+    with without_intervals():
+        joint = jm.fit_joint(two_people(), separate=DEFAULT_FREE, starts=16, seeds=0)
+        alone = jm.fit_cohort(two_people().values(), starts=16).results
     assert joint.success
     assert set(joint.free) == {f"{n}@{t}" for t in two_people() for n in DEFAULT_FREE}
     values = [s for result in alone.values() for s in result.singular_values]
@@ -154,8 +159,9 @@ def test_with_all_parameters_separate_it_is_the_single_fits():
 def test_a_second_equal_target_narrows_errors_by_the_root_of_two():
     """Of another level, which the tasks do not know of: that is noticed."""
     target, other = (expected(TRUTH, coefficient_of_variation=0.016, mvc_fraction=level) for level in (0.2, 0.4))
-    alone = jm.fit_cohort([target], starts=8).results["expected"]
-    joint = jm.fit_joint({"a": target, "b": other}, starts=8, seeds=0)
+    with without_intervals():
+        alone = jm.fit_cohort([target], starts=8).results["expected"]
+        joint = jm.fit_joint({"a": target, "b": other}, starts=8, seeds=0)
     assert any("different levels (a 20 % MVC, b 40 % MVC), but their tasks have the same forces" in n for n in joint.notices)
     names = [n for n, p in alone.derived.items() if p.stderr is not None and n not in ("K_w0", "C_w0", "mean")]
     assert len(names) >= 5
@@ -433,7 +439,8 @@ def test_two_targets_climb_together_and_their_aic_is_that_of_both(x64):
     rng, truth = np.random.default_rng(4), jm.on_rung(jm.Isometric(), 2).replace(resonance_amplitude=0.3)
     power = np.asarray(jm.expected_spectrum(truth).proportional)
     pair = {name: jm.Target(name, power * rng.gamma(60, 1 / 60, power.size), segments=60) for name in ("first", "second")}
-    found = jm.fit_joint(pair, rungs=2, starts=16, seeds=0, check_seeds=0)
+    with without_intervals():
+        found = jm.fit_joint(pair, rungs=2, starts=8, seeds=0, check_seeds=0)
     numbers = [rung.number for rung in found.ladder]
     assert numbers == [0, 1, 2] and found.ladder[0].p < 0.01 and found.ladder[2].chosen and found.adequate
     rung = found.ladder[2]
