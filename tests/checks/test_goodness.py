@@ -58,6 +58,12 @@ def fits(powers, segments=12, sigma=None, free=FREE, base=None):
         return search_together(plans, lambda text, share: None)
 
 
+@pytest.fixture(autouse=True)
+def _few_starts(monkeypatch):
+    """Of the refits of a bootstrap: two parameters without a harmonic have one minimum, which eight starts do not miss."""
+    monkeypatch.setattr(_bootstrap, "STARTS", 8)
+
+
 @functools.cache
 def perfect():
     return fits([expected()])[0]
@@ -118,18 +124,18 @@ def test_reference_runs_are_those_of_correlated_bins(x64):
 
 @pytest.mark.slow
 def test_p_values_are_uniform_where_the_model_is_true():
-    replicates = 39
+    replicates = 19
     found = [jm.goodness(result, replicates=replicates, key=i) for i, result in enumerate(drawn_fits())]
     for name in ("chi2_per_bin", "largest", "all"):
         values = [g.p_values[name] for g in found]
-        # p-values are whole fortieths, the largest of those that lie within 1/40 above a uniform number: the deviation
-        # that 20 uniform numbers exceed with probability `SURE`, 0.42, and 1/40.
+        # p-values are whole twentieths, the largest of those that lie within 1/20 above a uniform number: the deviation
+        # that 20 uniform numbers exceed with probability `SURE`, 0.42, and 1/20.
         most = scipy.stats.kstwo.ppf(1 - SURE, CASES) + 1 / (replicates + 1)
         assert scipy.stats.kstest(values, "uniform").statistic < most, name
     few = sum(g.p_values["runs"] <= 0.05 for g in found)
     assert few <= scipy.stats.binom.ppf(1 - SURE, CASES, 0.05)
     reference = np.mean([g.reference["chi2_per_bin"].mean() for g in found])
-    # Replicates of standard deviation 0.28, and 0.02 for what is not linear in θ and in the log powers: 0.06 together. What
+    # Replicates of standard deviation 0.28, and 0.02 for what is not linear in θ and in the log powers: 0.08 together. What
     # two parameters take up is 0.14.
     assert abs(reference - linear_chi2(perfect())) < 4 * 0.28 / np.sqrt(replicates * CASES) + 0.02
 

@@ -7,6 +7,7 @@ import jax
 import numpy as np
 import pytest
 import scipy.stats
+from refits import without_intervals
 from scipy.optimize import brentq
 
 import jaxmuscle as jm
@@ -25,7 +26,7 @@ from jaxmuscle.spectra._bin_law import bin_statistics
 from jaxmuscle.spectra._settings import WINDOW
 
 TASK = jm.Isometric()
-QUICK: dict[str, Any] = {"starts": 16, "seeds": 0, "check_seeds": 0}
+QUICK: dict[str, Any] = {"starts": 8, "seeds": 0, "check_seeds": 0}
 TREMOR = {"resonance_amplitude": 0.08, "resonance_frequency": 9.0, "resonance_width": 2.0}
 
 
@@ -143,7 +144,8 @@ def test_the_progress_says_which_model_it_is_at_and_never_falls_back():
 @pytest.mark.slow
 def test_a_significant_line_is_tried_against_the_tremor():
     """A short recording of a tremor: the base model describes it, with a line. Rung 1 has it, too, so rung 2 is tried."""
-    result = jm.fit(TASK, drawn(expected(with_tremor()), 12, 0), **QUICK)
+    with without_intervals():
+        result = jm.fit(TASK, drawn(expected(with_tremor()), 12, 0), **QUICK)
     first, tremor = result.ladder
     assert (first.number, tremor.number) == (0, 2) and first.p > 0.1
     assert first.chosen == (tremor.aic > first.aic - 2)
@@ -153,7 +155,8 @@ def test_a_significant_line_is_tried_against_the_tremor():
 def test_a_chosen_model_or_noise_is_not_climbed_from():
     target = drawn(expected(with_tremor()), 90, 1)
     for asked in ({"noise": "band-limited"}, {"free": ("c_w", "noise_K_w", "noise_K_z")}, {"rungs": 0}):
-        assert jm.fit(TASK, target, **asked, **QUICK).ladder == ()
+        with without_intervals():
+            assert jm.fit(TASK, target, **asked, **QUICK | {"starts": 2}).ladder == ()
 
 
 @pytest.mark.slow
@@ -352,6 +355,7 @@ def test_all_that_follows_a_fit_takes_a_model_with_tremor(tmp_path):
     assert len(same) >= 3
     told = jm.identifiability(result, designs=[design for design in same if design.lengthening is None]).told
     assert "tremor_frequency" in told and "resonance_frequency" not in told
-    cohort = jm.fit_cohort([result.target], starts=16, rung=2)
+    with without_intervals():
+        cohort = jm.fit_cohort([result.target], starts=8, rung=2)
     (found,) = cohort.results.values()
     assert found.derived["tremor_frequency"].value == pytest.approx(result.derived["tremor_frequency"].value, abs=0.2)

@@ -124,7 +124,7 @@ def well_known():
     power = np.asarray(runs.spectrum().proportional).mean(axis=0)
     target = jm.Target("well known", power, segments=(6,) * 60)
     with without_intervals():
-        return truth, jm.fit(jm.Isometric(), target, free=FREE, starts=24, check_seeds=0)
+        return truth, jm.fit(jm.Isometric(), target, free=FREE, starts=8, check_seeds=0)
 
 
 @functools.cache
@@ -217,7 +217,7 @@ def test_chains_without_a_summary():
 def sloppy():
     target = jm.load_target("vastus-lateralis-26mvc")
     with without_intervals():
-        return jm.fit(jm.task_for(target), target, starts=24, check_seeds=0, rungs=0)
+        return jm.fit(jm.task_for(target), target, starts=8, check_seeds=0, rungs=0)
 
 
 @pytest.mark.slow

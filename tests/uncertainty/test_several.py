@@ -12,6 +12,7 @@ from compiled import at_once
 from refits import without_intervals
 
 import jaxmuscle as jm
+from jaxmuscle.checks import _bootstrap
 from jaxmuscle.fits._reopened import reopened
 from jaxmuscle.objective._consequences import expand
 from jaxmuscle.objective._likelihood import Likelihood
@@ -209,7 +210,8 @@ def test_goodness_of_two_targets():
 
 
 @pytest.mark.slow
-def test_bootstrap_of_two_targets():
+def test_bootstrap_of_two_targets(monkeypatch):
+    monkeypatch.setattr(_bootstrap, "STARTS", 8)
     with without_intervals():
         found = jm.bootstrap(both(), replicates=12, key=2)
     assert {"c_w", "noise_K_w", "corner_frequency@low", "corner_frequency@high"} <= set(found.quantities)
