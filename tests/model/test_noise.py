@@ -10,6 +10,7 @@ import pytest
 import references
 import scipy.integrate
 import scipy.linalg
+from compiled import at_once
 from jax.scipy.special import gammainc
 
 import jaxmuscle as jm
@@ -25,8 +26,11 @@ OU = jm.OrnsteinUhlenbeckNoise(1.0, 0.05)
 
 
 def unit_paths(noise, dt, steps, seeds=256, key=KEY):
-    keys = jax.random.split(key, seeds)
-    return jax.jit(jax.vmap(lambda k: noise.realise(noise.draw(k, steps), dt)))(keys)
+    def paths(key):
+        made = jax.vmap(lambda k: noise.realise(noise.draw(k, steps), dt))(jax.random.split(key, seeds))
+        return made.values, made.slopes, made.increments
+
+    return Realisation(*at_once(paths, key))
 
 
 def band_variance(noise):
@@ -68,7 +72,7 @@ def test_paths_have_the_density(x64, noise):
     dt, steps, chunk = 4e-3, 2048, 256
     paths = unit_paths(noise, dt, steps)
     # White noise is the derivative of its increments' sum: its mean over a step.
-    x = np.asarray(paths.increments / dt if paths.values is None else paths.values[:, :steps])
+    x = np.asarray(paths.increments) / dt if paths.values is None else np.asarray(paths.values)[:, :steps]
     bins = np.arange(4, 84, 2)  # to 80 Hz of 250 Hz
     segments = x.reshape(256, steps // chunk, chunk, 4)
     taper = np.hanning(chunk + 1)[:-1, None]
@@ -114,13 +118,17 @@ def test_the_autocovariance_is_exact_at_any_step(x64, noise, dt):
 @pytest.mark.parametrize("noise", [BAND, OU], ids=["band-limited", "ornstein-uhlenbeck"])
 def test_the_transition_is_the_exact_one(x64, noise):
     """The map from normals to the path, taken as a matrix: its Gram matrix must be the closed-form covariance."""
-    steps = 5
-    for dt in (8e-3, 2e-3):
-        normals = noise.draw(KEY, steps)[:, ::4]  # of the first channel
-        matrix = jax.jacfwd(lambda z, h=dt: noise.realise(z, h).values[:, 0])(normals).reshape(steps + 1, -1)
+    steps, grids = 5, (8e-3, 2e-3)
+
+    def matrices(key):
+        normals = noise.draw(key, steps)[:, ::4]  # of the first channel
+        return [jax.jacfwd(lambda z, h=dt: noise.realise(z, h).values[:, 0])(normals) for dt in grids]
+
+    for dt, found in zip(grids, at_once(matrices, KEY), strict=True):
+        matrix = np.asarray(found).reshape(steps + 1, -1)
         lag = dt * np.subtract.outer(np.arange(steps + 1), np.arange(steps + 1))
         exact = band_autocovariance(noise, lag) if noise is BAND else np.exp(-np.abs(lag) / noise.correlation_time)
-        np.testing.assert_allclose(np.asarray(matrix @ matrix.T), exact, rtol=1e-9, atol=1e-12)
+        np.testing.assert_allclose(matrix @ matrix.T, exact, rtol=1e-9, atol=1e-12)
 
 
 def test_band_limited_transition_is_the_matrix_exponential(x64):
@@ -139,7 +147,8 @@ def test_slopes_are_the_derivative_of_values(x64):
     for dt in (2e-3, 5e-4):
         path = unit_paths(BAND, dt, 500, seeds=64)
         difference = np.diff(path.values, axis=1) / dt
-        middle = 0.5 * np.asarray(path.slopes[:, 1:] + path.slopes[:, :-1])
+        slopes = np.asarray(path.slopes)
+        middle = 0.5 * (slopes[:, 1:] + slopes[:, :-1])
         rms = np.sqrt(np.mean((difference - middle) ** 2) / (omega**2 * band_variance(BAND)))
         # N' is as rough as Brownian motion of variance q = 2√2 ω var(N') per second: a bridge's mean has q dt / 12.
         # The next term is of relative order ω dt.
@@ -252,19 +261,23 @@ def test_impossible_rates_and_grids_are_refused():
 
 @pytest.mark.slow
 def test_single_precision_paths_follow_double_ones():
-    for kind, attribute in ((jm.BandLimitedNoise, "values"), (jm.BandLimitedNoise, "slopes"),
-                            (jm.OrnsteinUhlenbeckNoise, "values"), (jm.WhiteNoise, "increments")):  # fmt: skip
+    for kind, attributes in ((jm.BandLimitedNoise, ("values", "slopes")), (jm.OrnsteinUhlenbeckNoise, ("values",)),
+                             (jm.WhiteNoise, ("increments",))):  # fmt: skip
         normals = np.random.default_rng(0).normal(size=(501, 8 if kind is jm.BandLimitedNoise else 4))
 
-        def path(dtype, kind=kind, normals=normals, attribute=attribute):
-            with jax.enable_x64(dtype == np.float64):
-                realisation = kind(1.0).realise(jnp.asarray(normals, dtype), 1e-3)
-                assert isinstance(realisation, Realisation)
-                return np.asarray(getattr(realisation, attribute), float)
+        def paths(dtype, kind=kind, normals=normals, attributes=attributes):
+            def made(normals):
+                realisation = kind(1.0).realise(normals, 1e-3)
+                return [getattr(realisation, attribute) for attribute in attributes]
 
-        double = path(np.float64)
-        # The process noise is a difference of nearly equal numbers, good to a few 1e-4 in single precision.
-        np.testing.assert_allclose(path(np.float32), double, atol=1e-3 * double.std())
+            with jax.enable_x64(dtype == np.float64):
+                found = at_once(made, normals.astype(dtype))
+            assert all(path.dtype == dtype for path in found)
+            return [np.asarray(path, float) for path in found]
+
+        for single, double in zip(paths(np.float32), paths(np.float64), strict=True):
+            # The process noise is a difference of nearly equal numbers, good to a few 1e-4 in single precision.
+            np.testing.assert_allclose(single, double, atol=1e-3 * double.std())
 
 
 class Smooth(jm.model.AbstractNoise):
