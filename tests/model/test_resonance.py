@@ -9,6 +9,7 @@ import references
 import scipy.integrate
 import scipy.linalg
 import scipy.signal
+from compiled import at_once
 
 import jaxmuscle as jm
 from jaxmuscle.model import NoiseSum
@@ -65,11 +66,14 @@ def test_a_step_is_the_exact_one(case, precision):
     F, G = equation(*CASES[case])
     decay = np.linalg.eigvals(F).real.max()
     rounding = 8 * np.finfo(precision).eps  # of an exponential, and of sums of eight kicks relative to their own size
-    for dt in (1e-3, 1e-2):
-        with jax.enable_x64(precision == "float64"):
-            made = jm.ResonantNoise(1.0, *CASES[case]).shaping_filter()
-            step, kick = (np.asarray(x, float) for x in exact_step(made, dt))
-            assert exact_step(made, dt)[1].dtype == precision
+    grids = (1e-3, 1e-2)
+    with jax.enable_x64(precision == "float64"):
+        made = at_once(
+            lambda *numbers: [exact_step(jm.ResonantNoise(1.0, *numbers).shaping_filter(), dt) for dt in grids], *CASES[case]
+        )
+    for dt, (step, kick) in zip(grids, made, strict=True):
+        assert step.dtype == kick.dtype == precision
+        step, kick = np.asarray(step, float), np.asarray(kick, float)
         whole = scipy.linalg.expm(dt * np.block([[-F, G @ G.T], [np.zeros((2, 2)), F.T]]))
         exact = whole[2:, 2:].T
         added = exact @ whole[:2, 2:]
@@ -87,9 +91,14 @@ def test_a_step_is_the_exact_one(case, precision):
 def test_the_path_is_exact_on_the_grid(x64, case):
     """The map from normals to the path, taken as a matrix: its Gram matrix must be the closed-form covariance."""
     noise, steps = jm.ResonantNoise(1.0, *CASES[case]), 6
-    for dt in (8e-3, 1e-3):
-        normals = noise.draw(KEY, steps)
-        matrix = jax.jacfwd(lambda z, h=dt: noise.realise(z, h).values[:, 0])(normals).reshape(steps + 1, -1)
+    grids = (8e-3, 1e-3)
+
+    def matrices(key):
+        normals = noise.draw(key, steps)
+        return [jax.jacfwd(lambda z, h=dt: noise.realise(z, h).values[:, 0])(normals) for dt in grids]
+
+    for dt, found in zip(grids, at_once(matrices, KEY), strict=True):
+        matrix = np.asarray(found).reshape(steps + 1, -1)
         lag = dt * np.subtract.outer(np.arange(steps + 1), np.arange(steps + 1))
         np.testing.assert_allclose(matrix @ matrix.T, autocovariance(lag, *CASES[case]), rtol=1e-9, atol=1e-11)
 
@@ -102,8 +111,8 @@ def test_paths_have_variance_covariances_and_spectrum(case, precision):
     dt, steps, seeds = 4e-3, 512, 2048
     with jax.enable_x64(precision == "float64"):
         noise = jm.ResonantNoise(1.0, *CASES[case])
-        keys = jax.random.split(KEY, seeds)
-        values = jax.jit(jax.vmap(lambda key: noise.realise(noise.draw(key, steps - 1), dt).values))(keys)
+        path = jax.vmap(lambda key: noise.realise(noise.draw(key, steps - 1), dt).values)
+        values = at_once(lambda key: path(jax.random.split(key, seeds)), KEY)
     assert values.dtype == precision and values.shape == (seeds, steps, 1)
     x = np.asarray(values, float)[..., 0]
     lags, bins, taper = np.array([0, 1, 5, 14, 28, 100]), np.arange(2, 125, 3), scipy.signal.get_window("hann", steps)
@@ -130,13 +139,16 @@ def test_a_sum_is_its_parts(x64):
     rows = np.zeros((5, 2))
     rows[0], rows[4] = 0.04 / 100 / (1 + (f / 50) ** 4), 9e-4 * density(f, 9.0, 2.0)
     np.testing.assert_allclose(both.psd(f), rows, rtol=1e-12)
-    alone, together = (noise.per_channel().draw(KEY, 20) for noise in (band, both))
+    independent, shared = (jm.ResonantNoise((0.1, 0.1, 0.0, 0.0, 0.2), shared=shared) for shared in (False, True))
+
+    def drawn(key):
+        alone, together = (noise.per_channel().draw(key, 20) for noise in (band, both))
+        return alone, together, (tremor + tremor).draw(key, 2000), independent.draw(key, 3), shared.draw(key, 3)
+
+    alone, together, again, *four = at_once(drawn, KEY)
     np.testing.assert_array_equal(together[0], alone)  # a tremor is added to a path
-    again = (tremor + tremor).draw(KEY, 2000)
     assert abs(np.corrcoef(np.ravel(again[0]), np.ravel(again[1]))[0, 1]) < 3.3 / np.sqrt(4002)
-    independent = jm.ResonantNoise((0.1, 0.1, 0.0, 0.0, 0.2))
-    assert independent.draw(KEY, 3).shape == (4, 10)
-    assert jm.ResonantNoise((0.1, 0.1, 0.0, 0.0, 0.2), shared=True).draw(KEY, 3).shape == (4, 2)
+    assert [rows.shape for rows in four] == [(4, 10), (4, 2)]
 
 
 FAST = jm.ResonantNoise(0.1, 90.0, 20.0)
