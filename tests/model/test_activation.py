@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.signal
+from compiled import at_once
 
 import jaxmuscle as jm
 
@@ -67,7 +68,7 @@ def test_white_noise_comes_out_with_its_variance(x64):
             kicks = noise.realise(normals, dt).increments[:, :1] / dt
             return jm.Activation(time).through(kicks, kicks, dt)[0][-1, 0]
 
-        weights = np.asarray(jax.grad(last)(noise.draw(KEY, steps)))
+        weights = np.asarray(at_once(lambda key, steps=steps, last=last: jax.grad(last)(noise.draw(key, steps)), KEY))
         variance = np.sum(weights**2) * 4 * time * 80.0
         assert variance == pytest.approx(1 - (dt / time) ** 2 / 12, abs=0.1 * (dt / time) ** 3)
 
