@@ -35,8 +35,8 @@ def autocovariance(noise, lag):
 
 
 def unit_paths(noise, dt, steps, seeds, key=KEY):
-    keys = jax.random.split(key, seeds)
-    return np.asarray(jax.jit(jax.vmap(lambda k: noise.realise(noise.draw(k, steps), dt).values))(keys))
+    path = jax.vmap(lambda k: noise.realise(noise.draw(k, steps), dt).values)
+    return np.asarray(at_once(lambda key: path(jax.random.split(key, seeds)), key))
 
 
 @pytest.mark.parametrize("band", BANDS)
@@ -91,9 +91,14 @@ def test_the_density_is_the_transform_of_the_autocovariance(x64):
 def test_the_transition_is_the_exact_one(x64, dt):
     """The map from normals to the path, taken as a matrix: its Gram matrix is the autocovariance at any step."""
     steps = 6
-    normals = PINK.draw(KEY, steps)
+
+    def drawn(key):
+        normals = PINK.draw(key, steps)
+        return normals, jax.jacfwd(lambda z: PINK.realise(z, dt).values[:, 0])(normals[:, ::4])
+
+    normals, matrix = at_once(drawn, KEY)
     assert normals.shape == (steps + 1, 16)
-    matrix = jax.jacfwd(lambda z: PINK.realise(z, dt).values[:, 0])(normals[:, ::4]).reshape(steps + 1, -1)
+    matrix = np.asarray(matrix).reshape(steps + 1, -1)
     exact = autocovariance(PINK, dt * np.subtract.outer(np.arange(steps + 1), np.arange(steps + 1)))
     np.testing.assert_allclose(matrix @ matrix.T, exact, rtol=1e-12)
 
@@ -230,14 +235,14 @@ def test_single_precision():
     task = jm.Isometric(5.0, 0.003, noise=jm.PinkNoise())
 
     def both():
-        values = noise.realise(jnp.asarray(normals, jnp.result_type(float)), 1e-3).values
+        values = at_once(lambda z: noise.realise(z, 1e-3).values, normals.astype(jnp.result_type(float)))
         return np.asarray(values), np.asarray(jm.expected_spectrum(task).power)
 
     path, power = both()
     assert path.dtype == power.dtype == np.float32
     with jax.enable_x64(True):
         exact_path, exact_power = both()
-        A, F = np.asarray(linearise(as_arrays(task)).A), np.asarray(noise.shaping_filter().F)
+        A, F = map(np.asarray, at_once(lambda task: (linearise(task).A, noise.shaping_filter().F), as_arrays(task)))
     # Each of 500 steps rounds a state by 6e-8; they are forgotten or add up at random.
     np.testing.assert_allclose(path, exact_path, atol=500 * 6e-8)
     # Rounding, of sums over hundreds of lags and of the covariance equations.
