@@ -1,8 +1,8 @@
 """Random numbers of a seed: their law, their independence, and that they are the same wherever they are made."""
 
+import functools
 import itertools
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -27,25 +27,25 @@ def streams(seeds=SEEDS, key=KEY, draws=Draws()):  # noqa: B008
     return jax.vmap(lambda i: Stream.of(jax.random.fold_in(key, i), draws))(jnp.arange(seeds))
 
 
-@eqx.filter_jit
-def words_of(streams, steps, first, count):
-    """Words of every seed, step and number."""
-    return jnp.stack(jax.vmap(lambda one: jnp.stack(one._words(jnp.arange(steps), first, count), axis=-1))(streams))
+def of_every(function, seeds=SEEDS, key=KEY, draws=Draws()):  # noqa: B008
+    """What a function makes of the stream of every seed."""
+    made = at_once(lambda key: jax.vmap(lambda one: jnp.stack(function(one), axis=-1))(streams(seeds, key, draws)), key)
+    return np.asarray(made)
 
 
-@eqx.filter_jit
-def normals_of(streams, steps, first, count):
-    return jax.vmap(lambda one: jnp.stack(one.normals(jnp.arange(steps), first, count), axis=-1))(streams)
+def normals_of(steps=STEPS, first=0, count=CHANNELS, **streams):
+    """Normals of every seed, step and number."""
+    return of_every(lambda one: one.normals(jnp.arange(steps), first, count), **streams).astype(float)
 
 
 @pytest.fixture(scope="module")
 def words():
-    return np.asarray(words_of(streams(), STEPS, 0, CHANNELS))
+    return of_every(lambda one: one._words(jnp.arange(STEPS), 0, CHANNELS))
 
 
 @pytest.fixture(scope="module")
 def normals():
-    return np.asarray(normals_of(streams(), STEPS, 0, CHANNELS), float)
+    return normals_of()
 
 
 def test_weak_numbers_have_seven_moments_of_a_normal():
@@ -126,17 +126,16 @@ def test_channels_are_independent(normals):
 
 @pytest.mark.slow
 def test_parts_of_a_sum_and_the_start_are_independent(normals):
-    later = np.asarray(normals_of(streams(), STEPS, APART, 1), float)[..., 0]
+    later = normals_of(first=APART, count=1)[..., 0]
     references.assert_standard_normal(together((channel, later) for channel in np.moveaxis(normals, -1, 0)))
-    many = streams(4096)
-    begun = np.asarray(jax.vmap(lambda s: jnp.stack(s.normals(START, 0, CHANNELS)))(many), float)
-    first = np.asarray(normals_of(many, 1, 0, CHANNELS), float)[:, 0]
+    begun = of_every(lambda one: one.normals(START, 0, CHANNELS), seeds=4096).astype(float)
+    first = normals_of(1, seeds=4096)[:, 0]
     assert abs(np.mean(begun)) < 4 / np.sqrt(begun.size) and abs(np.var(begun) - 1) < 4 * np.sqrt(2 / begun.size)
     references.assert_standard_normal(together([(begun.T, first.T)]))
 
 
 def test_different_keys_make_different_noise(normals):
-    other = np.asarray(normals_of(streams(key=jax.random.key(22)), STEPS, 0, CHANNELS), float)
+    other = normals_of(key=jax.random.key(22))
     references.assert_standard_normal(together([(normals.reshape(SEEDS, -1), other.reshape(SEEDS, -1))]))
 
 
@@ -210,19 +209,24 @@ def test_a_number_depends_on_seed_step_and_place_alone(generator, increments):
     def of_step(stream, made):
         return [stream.numbers(made, part, first[part], count[part]) for part in (0, 1)]
 
-    @eqx.filter_jit
-    def batch(streams, begin):
+    def batch(key, begin, seeds):
         def one(stream):
             return jax.lax.map(lambda made: of_step(stream, made), stream.ahead(begin + jnp.arange(20), first, count))
 
-        return jax.vmap(one)(streams)
+        return jax.vmap(one)(streams(seeds, key, draws))
 
-    found, later = batch(streams(5, draws=draws), 7), batch(streams(3, draws=draws), 17)
+    found, later = (
+        jax.tree.map(np.asarray, at_once(functools.partial(batch, seeds=seeds), KEY, begin))
+        for begin, seeds in ((7, 5), (17, 3))
+    )
     jax.tree.map(lambda a, b: np.testing.assert_array_equal(a[:3, 10:], b[:, :10]), found, later)
-    alone = Stream.of(jax.random.fold_in(KEY, 2), draws)
+
+    def alone(key, step):
+        stream = Stream.of(jax.random.fold_in(key, 2), draws)
+        return of_step(stream, jax.tree.map(lambda x: x[0], stream.ahead(step, first, count)))
+
     for step in (7, 20):
-        made = jax.tree.map(lambda x: x[0], alone.ahead(jnp.array([step]), first, count))
-        for part, single in enumerate(of_step(alone, made)):
+        for part, single in enumerate(at_once(alone, KEY, np.array([step]))):
             assert len(single) == count[part]
             # A product and a sum may be fused or not: a few units in the last place.
             np.testing.assert_allclose(single, [x[2, step - 7] for x in found[part]], rtol=1e-6, atol=1e-7)
@@ -231,19 +235,22 @@ def test_a_number_depends_on_seed_step_and_place_alone(generator, increments):
 @pytest.mark.slow
 def test_both_precisions_have_the_same_numbers():
     for increments in ("gaussian", "weak"):
+
+        def numbers(key, increments=increments):
+            stream = Stream.of(jax.random.fold_in(key, 3), Draws.of("hash", increments))
+            return jnp.stack(stream.numbers(stream.ahead(jnp.arange(50), (0,), (4,)), 0, 0, 4))
+
         made = []
         for double in (False, True):
             with jax.enable_x64(double):
-                stream = Stream.of(jax.random.fold_in(KEY, 3), Draws.of("hash", increments))
-                given = stream.ahead(jnp.arange(50), (0,), (4,))
-                made.append(np.stack(stream.numbers(given, 0, 0, 4)))
+                made.append(np.asarray(at_once(numbers, KEY)))
         assert (made[0].dtype, made[1].dtype) == (np.float32, np.float64)
         np.testing.assert_array_equal(made[0].astype(float), made[1])
 
 
 @pytest.mark.slow
 def test_threefry_makes_other_numbers_of_the_same_law(normals):
-    other = np.asarray(normals_of(streams(64, draws=Draws.of("threefry", "gaussian")), 512, 0, CHANNELS), float)
+    other = normals_of(512, seeds=64, draws=Draws.of("threefry", "gaussian"))
     assert scipy.stats.kstest(other.ravel(), "norm").pvalue > P_LEAST
     references.assert_standard_normal(together([(other.reshape(64, -1), normals[:64, :512].reshape(64, -1))]))
 
@@ -295,7 +302,11 @@ def test_what_is_drawn_on_the_way_is_the_path_in_single_precision_too(name):
 @pytest.mark.slow
 def test_simulate_draws_from_the_key_folded_with_the_seed(x64):
     found = jm.simulate(jm.PrescribedForce(noise=BAND), KEY, seed=4, duration=0.6, substeps=1)
-    path = BAND.realise(BAND.draw(jax.random.fold_in(KEY, 4), 600), 1e-3)
-    states, _ = eqx.filter_jit(respond)(found.task, path, Grid(1e-3, 600, 10), "instant")
+
+    def given(key):
+        path = BAND.realise(BAND.draw(jax.random.fold_in(key, 4), 600), 1e-3)
+        return respond(found.task, path, Grid(1e-3, 600, 10), "instant")[0]
+
+    states = at_once(given, KEY)
     # The filter's noise is a difference of nearly equal numbers: another program has it to 1e-10 or so.
     assert largest(found.states, states) < 1e-9
