@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import references
+from compiled import at_once
 from jaxtyping import Array, Float
 
 import jaxmuscle as jm
@@ -129,13 +130,15 @@ def test_isometric_is_the_same_muscle_with_its_insertion_held(x64):
 def test_contraction_velocity_inverts_passive_force(x64, argument, c_z, v_ref_z):
     damping = jm.model.QuadraticDamping(c_z, v_ref_z)
     muscle = jm.Muscle(damping_z=damping, argument=argument)
-    for y, u in random_states():
-        x_w, _, x_z, v_z = map(jnp.asarray, y)
-        # Noise far below the damping: with a negative damping there is no velocity to find.
-        u = jnp.asarray(u) * jnp.array([1.0, 1.0, 1.0, 0.01])
-        force = jnp.asarray(12.0 * y[1])
-        v_w = muscle.contraction_velocity(x_w, x_z, v_z, force, u)
-        np.testing.assert_allclose(muscle.passive_force(x_w, v_w, x_z, v_z, u), force, rtol=1e-9, atol=1e-9)
+
+    def passed(y, force, u):
+        x_w, _, x_z, v_z = y
+        return muscle.passive_force(x_w, muscle.contraction_velocity(x_w, x_z, v_z, force, u), x_z, v_z, u)
+
+    y, u = map(np.array, zip(*random_states(), strict=True))
+    # Noise far below the damping: with a negative damping there is no velocity to find.
+    u, force = u * [1.0, 1.0, 1.0, 0.01], 12.0 * y[:, 1]
+    np.testing.assert_allclose(at_once(jax.vmap(passed), y, force, u), force, rtol=1e-9, atol=1e-9)
 
 
 @pytest.mark.slow
@@ -167,30 +170,33 @@ def test_a_custom_law_may_reuse_a_table_name():
     np.testing.assert_allclose(task.muscle.base()[1], 400.0, rtol=1e-6)
 
 
+class Linear(jm.AbstractMuscle):
+    """A whole muscle; here, and not in the test, so that its programs are kept."""
+
+    m_w: Scalar = 0.5
+    m_z: Scalar = 0.4
+    stiff: Scalar = 150.0
+
+    def base(self) -> Float[Array, "4"]:
+        return jnp.stack([jnp.asarray(v) for v in (self.stiff, self.stiff, 20.0, 10.0)])
+
+    def active_force(self, x_w, v_w, u):
+        return (self.stiff + u[0]) * x_w + (20.0 + u[2]) * v_w
+
+    def passive_force(self, x_w, v_w, x_z, v_z, u):
+        return (self.stiff + u[1]) * (x_z - x_w) + (10.0 + u[3]) * (v_z - v_w)
+
+    def contraction_velocity(self, x_w, x_z, v_z, force, u):
+        return v_z - (force - (self.stiff + u[1]) * (x_z - x_w)) / (10.0 + u[3])
+
+
 @pytest.mark.slow
 def test_a_whole_own_muscle_runs_in_every_task():
-    class Linear(jm.AbstractMuscle):
-        m_w: Scalar = 0.5
-        m_z: Scalar = 0.4
-        stiff: Scalar = 150.0
-
-        def base(self) -> Float[Array, "4"]:
-            return jnp.stack([jnp.asarray(v) for v in (self.stiff, self.stiff, 20.0, 10.0)])
-
-        def active_force(self, x_w, v_w, u):
-            return (self.stiff + u[0]) * x_w + (20.0 + u[2]) * v_w
-
-        def passive_force(self, x_w, v_w, x_z, v_z, u):
-            return (self.stiff + u[1]) * (x_z - x_w) + (10.0 + u[3]) * (v_z - v_w)
-
-        def contraction_velocity(self, x_w, x_z, v_z, force, u):
-            return v_z - (force - (self.stiff + u[1]) * (x_z - x_w)) / (10.0 + u[3])
-
     for kind in TASKS:
         task = kind(muscle=Linear()).replace(stiff=120.0)
         assert task["stiff"] == 120.0
-        states, zero = jnp.full(len(task.state_names), 0.01), jnp.zeros(4)
-        assert jnp.isfinite(task.output(0.8, states, zero, zero))
+        states, zero = np.full(len(task.state_names), 0.01, np.float32), np.zeros(4, np.float32)
+        assert np.isfinite(at_once(lambda states, zero, task=task: task.output(0.8, states, zero, zero), states, zero))
     run = jm.simulate(jm.Isometric(muscle=Linear()), jax.random.key(0), duration=0.8)
     assert run.finite and run.output[-1] != 0
 
