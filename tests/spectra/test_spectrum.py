@@ -1,5 +1,6 @@
 """The spectral estimate against scipy, analytic values, its own spread and its derivatives."""
 
+import functools
 import itertools
 import json
 from typing import Any
@@ -13,6 +14,7 @@ import numpy as np
 import pytest
 import scipy.signal
 import scipy.stats
+from compiled import at_once, kept_jit
 from hypothesis import given, settings
 
 from jaxmuscle.spectra._settings import NAMED, SpectrumSettings, taper_of
@@ -71,7 +73,7 @@ def test_welch_is_scipy(x64, settings):
     np.testing.assert_allclose(settings.frequency, frequency, rtol=1e-14)
     # Where the mean stays in, its rounding is what the smaller bins are made of.
     floor = ROUNDING * np.max(power) if settings.detrend == "none" else 0.0
-    np.testing.assert_allclose(welch(FORCE, settings), power, rtol=ROUNDING, atol=floor)
+    np.testing.assert_allclose(at_once(lambda force: welch(force, settings), FORCE), power, rtol=ROUNDING, atol=floor)
 
 
 @pytest.mark.parametrize("settings", FILTERS, ids=lambda s: f"{s.filter_order}-{s.filter_direction}")
@@ -122,7 +124,7 @@ def test_without_cutoff_nothing_is_filtered(x64):
 @pytest.mark.parametrize("samples", [999, 1000])
 def test_periodogram_is_scipy(x64, window, samples):
     chosen = SpectrumSettings(window=window, detrend="linear")
-    frequency, power = periodogram(FORCE[:, :samples], chosen)
+    frequency, power = map(np.asarray, at_once(lambda force: periodogram(force, chosen), FORCE[:, :samples]))
     expected = scipy.signal.periodogram(FORCE[:, :samples], 100.0, window=window, detrend="linear")
     np.testing.assert_allclose(frequency, expected[0], rtol=1e-14)
     # Bin 0 is zero but for rounding.
@@ -131,20 +133,28 @@ def test_periodogram_is_scipy(x64, window, samples):
 
 lengths = st.sampled_from((33, 48, 80))  # few shapes, few compilations
 records = hnp.arrays(np.float64, lengths, elements=st.floats(-100, 100, width=32))
+PLAIN = [
+    SpectrumSettings(length=length, first_bin=0, last_bin=8, window="boxcar", overlap=0.0, filter_cutoff=None)
+    for length in (16, 17)
+]
+
+
+@functools.cache
+def plain_spectra():
+    return kept_jit(lambda record: ([welch(record, chosen) for chosen in PLAIN], periodogram(record, PLAIN[0])))
 
 
 @settings(max_examples=40)
-@given(records, st.sampled_from([16, 17]))
+@given(records)
 @pytest.mark.slow
-def test_power_adds_up_to_the_variance(record, length):
+def test_power_adds_up_to_the_variance(record):
     with jax.enable_x64(True):
-        chosen = SpectrumSettings(length=length, first_bin=0, last_bin=8, window="boxcar", overlap=0.0, filter_cutoff=None)
-        whole = record[: record.size // length * length].reshape(-1, length)
-        total = float(jnp.sum(welch(record, chosen))) * chosen.resolution
+        powers, (frequency, power) = jax.tree.map(np.asarray, plain_spectra()(record))
+    for chosen, found in zip(PLAIN, powers, strict=True):
+        whole = record[: record.size // chosen.length * chosen.length].reshape(-1, chosen.length)
+        total = np.sum(found) * chosen.resolution
         np.testing.assert_allclose(total, np.mean(np.var(whole, axis=1)), rtol=1e-9, atol=1e-9)
-        frequency, power = periodogram(record, chosen)
-        total = float(jnp.sum(power)) * float(frequency[1])
-        np.testing.assert_allclose(total, np.var(record), rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(np.sum(power) * frequency[1], np.var(record), rtol=1e-9, atol=1e-9)
 
 
 @pytest.mark.slow
@@ -153,14 +163,14 @@ def test_derivatives_agree(x64, direction):
     chosen = SpectrumSettings(length=64, last_bin=20, filter_direction=direction)
     signal, along = jnp.asarray(FORCE[0, :300]), jnp.asarray(np.random.default_rng(1).standard_normal(300))
 
-    @jax.jit
     def path(size):
         return jnp.log(spectrum_of(signal + size * along, chosen).proportional)
 
-    forward, reverse = jax.jacfwd(path)(0.01), jax.jacrev(path)(0.01)
-    np.testing.assert_allclose(forward, reverse, rtol=1e-9, atol=1e-9)
     h = 1e-6
-    differences = (path(0.01 + h) - path(0.01 - h)) / (2 * h)
+    three = at_once(lambda size: (jax.jacfwd(path)(size), jax.jacrev(path)(size), path(size + h) - path(size - h)), 0.01)
+    forward, reverse, rise = map(np.asarray, three)
+    np.testing.assert_allclose(forward, reverse, rtol=1e-9, atol=1e-9)
+    differences = rise / (2 * h)
     # Central differences: truncation h² f'''/6 below 1e-5 (f varies over 0.01), rounding 1e-13 / h.
     np.testing.assert_allclose(forward, differences, rtol=1e-5, atol=1e-5 * np.max(np.abs(forward)))
 
@@ -205,7 +215,7 @@ def test_degrees_of_freedom_are_the_spread_of_white_noise(x64, window, overlap):
     chosen = SpectrumSettings(length=32, first_bin=3, last_bin=12, window=window, overlap=overlap, detrend="none")
     samples = 112
     noise = np.random.default_rng(2).standard_normal((20_000, samples))
-    power = np.asarray(welch(noise, chosen))[:, ::3]  # bins three apart are independent
+    power = np.asarray(at_once(lambda noise: welch(noise, chosen), noise))[:, ::3]  # bins three apart are independent
     assert np.mean(power) == pytest.approx(2 / chosen.rate, rel=4 / np.sqrt(power.size))
     nu = chosen.degrees_of_freedom(chosen.segments(samples))
     relative_variance = np.mean(np.var(power, axis=0) / np.mean(power, axis=0) ** 2)
@@ -299,7 +309,7 @@ def test_spectra_of_long_segments_are_scipys(x64, name, window):
     each = [scipy.signal.welch(signal, 100, taper, 1000, 500, detrend="linear")[1] for taper in window]
     chosen = SpectrumSettings.named(name)
     expected = np.mean(each, axis=0)[:, chosen.first_bin : chosen.last_bin + 1]
-    np.testing.assert_allclose(welch(signal, chosen), expected, rtol=1e-10)
+    np.testing.assert_allclose(at_once(lambda signal: welch(signal, chosen), signal), expected, rtol=1e-10)
     np.testing.assert_allclose(chosen.frequency, np.arange(chosen.first_bin, 118) / 10)
 
 
@@ -309,10 +319,12 @@ def test_a_drift_leaves_slow_spectra_alone(x64):
     noise = np.random.default_rng(5).standard_normal(3000)
     for name in ("slow", "multitaper"):
         chosen = SpectrumSettings.named(name)
-        still, drifting = (np.asarray(welch(noise + slope * np.arange(3000), chosen)) for slope in (0.0, 0.01))
+        level, rows = chosen.replace(detrend="constant"), noise + np.outer([0.0, 0.01], np.arange(3000))
+        straight, mean = at_once(lambda rows, both=(chosen, level): [welch(rows, each) for each in both], rows)
+        still, drifting = np.asarray(straight)
         np.testing.assert_allclose(drifting, still, rtol=1e-9)
-        level = chosen.replace(detrend="constant")
-        assert welch(noise + 0.01 * np.arange(3000), level)[0] > 20 * welch(noise, level)[0]
+        still, drifting = np.asarray(mean)[:, 0]
+        assert drifting > 20 * still
 
 
 @pytest.mark.parametrize(
