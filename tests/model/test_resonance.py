@@ -138,14 +138,15 @@ def test_a_sum_is_its_parts(x64):
     assert len((both + tremor).components) == len((tremor + both).components) == 3
     rows = np.zeros((5, 2))
     rows[0], rows[4] = 0.04 / 100 / (1 + (f / 50) ** 4), 9e-4 * density(f, 9.0, 2.0)
-    np.testing.assert_allclose(both.psd(f), rows, rtol=1e-12)
     independent, shared = (jm.ResonantNoise((0.1, 0.1, 0.0, 0.0, 0.2), shared=shared) for shared in (False, True))
 
     def drawn(key):
         alone, together = (noise.per_channel().draw(key, 20) for noise in (band, both))
-        return alone, together, (tremor + tremor).draw(key, 2000), independent.draw(key, 3), shared.draw(key, 3)
+        again = (tremor + tremor).draw(key, 2000)
+        return both.psd(f), alone, together, again, independent.draw(key, 3), shared.draw(key, 3)
 
-    alone, together, again, *four = at_once(drawn, KEY)
+    found, alone, together, again, *four = at_once(drawn, KEY)
+    np.testing.assert_allclose(found, rows, rtol=1e-12)
     np.testing.assert_array_equal(together[0], alone)  # a tremor is added to a path
     assert abs(np.corrcoef(np.ravel(again[0]), np.ravel(again[1]))[0, 1]) < 3.3 / np.sqrt(4002)
     assert [rows.shape for rows in four] == [(4, 10), (4, 2)]
