@@ -6,7 +6,7 @@ import numpy as np
 import optimistix as optx
 import pytest
 import scipy
-from compiled import at_once
+from compiled import at_once, kept_jit
 
 import jaxmuscle as jm
 
@@ -55,12 +55,12 @@ def test_values_are_traced_on_their_way_to_theta_and_exact_beside_a_bound():
     """A log density of parameters in their units, as `problem.theta` under `jit` and `grad` makes it."""
     problem = jm.problem(TASK, TARGET, free=("k_w", "x_z", "harmonic_frequency"), bounds=BOUNDS)
     start = {name: float(TASK[name]) for name in problem.names}
-    back = jax.jit(lambda values: problem.parameters(problem.theta(values)))
+    back = kept_jit(lambda values: problem.parameters(problem.theta(values)))
     for values in ({"k_w": 3e5, "x_z": -0.003, "harmonic_frequency": 3.0001}, {"harmonic_frequency": 8.9999}):
         given = start | values
         assert problem.parameters(problem.theta(given)) == pytest.approx(given, rel=1e-9)
         assert {name: float(value) for name, value in back(given).items()} == pytest.approx(given, rel=1e-9)
-    slopes = jax.jacrev(lambda values: problem.parameters(problem.theta(values)))(start)
+    slopes = at_once(jax.jacrev(lambda values: problem.parameters(problem.theta(values))), start)
     for name in start:  # the way there and back is the identity
         of_each = {other: float(slope) for other, slope in slopes[name].items()}
         assert of_each == pytest.approx({n: float(n == name) for n in start}, abs=1e-9)
@@ -78,8 +78,11 @@ def test_the_prior_is_a_density_of_the_coordinates(problem):
         values = problem.parameters(theta)
         return jnp.stack([jnp.log(values[name] / TASK[name]) for name in problem.names]) / sds
 
+    both = kept_jit(lambda theta: (z(theta), jax.jacfwd(z)(theta)))
+
     def density(theta):
-        return -0.5 * np.sum(np.asarray(z(theta)) ** 2) + np.linalg.slogdet(np.asarray(jax.jacfwd(z)(theta)))[1]
+        distance, slopes = map(np.asarray, both(theta))
+        return -0.5 * np.sum(distance**2) + np.linalg.slogdet(slopes)[1]
 
     difference = float(problem.log_prior(theta) - problem.log_prior(problem.start))
     assert difference == pytest.approx(density(theta) - density(problem.start), abs=1e-9)
@@ -131,7 +134,7 @@ def test_a_theta_of_another_shape_is_refused(problem):
     for wrong, said in ((many, "use jax.vmap for several"), (np.zeros(2), "theta has the shape"), ({}, "problem.theta")):
         with pytest.raises(ValueError, match=said):
             problem._scaled(wrong)  # of all methods, which the tests' type checker guards by itself
-    assert jax.vmap(problem.log_prior)(many).shape == (5,)
+    assert at_once(jax.vmap(problem.log_prior), many).shape == (5,)
 
 
 @pytest.mark.slow
@@ -154,9 +157,10 @@ def test_scipy_finds_the_minimum_of_the_fit(problem, result):
     """
     near = problem.theta({name: result[name].value for name in problem.names})
     for turn, used in enumerate((problem, problem.scattering_as(near))):
-        given = jax.jit(used.residuals), near + 0.05 * (-1.0) ** np.arange(len(near)), jax.jit(jax.jacfwd(used.residuals))
-        found = scipy.optimize.least_squares(*given, ftol=1e-12, xtol=1e-12)
-        ours = 0.5 * float(jnp.sum(given[0](near) ** 2)) if turn else min(start.cost for start in result.starts)
+        residuals, slopes = (kept_jit(each) for each in (used.residuals, jax.jacfwd(used.residuals)))
+        begin = np.asarray(near) + 0.05 * (-1.0) ** np.arange(len(near))
+        found = scipy.optimize.least_squares(residuals, begin, slopes, ftol=1e-12, xtol=1e-12)
+        ours = 0.5 * np.sum(np.asarray(residuals(near)) ** 2) if turn else min(start.cost for start in result.starts)
         assert found.success and found.cost == pytest.approx(ours, rel=1e-3)
 
 

@@ -10,6 +10,7 @@ import references
 import scipy.integrate
 import scipy.optimize
 import scipy.stats
+from compiled import at_once, kept_jit
 from test_expected import ACTS_ON, KEY, RHYTHM, WINDOW, Settings, assert_as_by_quadrature, density, shape, some_slow
 
 import jaxmuscle as jm
@@ -43,7 +44,7 @@ def test_the_variance_is_the_integral_of_the_density(x64, name):
     task = TASKS[name]
     p = {key: float(value) for key, value in task.parameters.items()}
     half = integral(lambda f: density(task, p, Settings(), f))
-    found = noise_variance(as_arrays(task), linearised(task).system)
+    found = at_once(noise_variance, as_arrays(task), linearised(task).system)
     np.testing.assert_allclose(found, 2 * half, rtol=1e-8)  # the tail: P_w of a motion falls with f^-2, 1e-9 of it is left
 
 
@@ -118,10 +119,11 @@ def test_any_linear_system(x64, name):
         return total
 
     given = jax.tree.map(jnp.asarray, system)
-    np.testing.assert_allclose(noise_variance(as_arrays(task), given), 2 * integral(density), rtol=1e-8)
-    whole = harmonic_system(as_arrays(task), given)
+    both = at_once(lambda *given: (noise_variance(*given), tuple(harmonic_system(*given))), as_arrays(task), given)
+    variance, whole = jax.tree.map(np.asarray, both)
+    np.testing.assert_allclose(variance, 2 * integral(density), rtol=1e-8)
     for f in (0.0, 1.0, 7.0):
-        s, (A_h, b, c, d, e) = 2j * np.pi * f, (np.asarray(x) for x in whole)
+        s, (A_h, b, c, d, e) = 2j * np.pi * f, whole
         found = c @ np.linalg.solve(s * np.eye(len(A_h)) - A_h, b) + d + s * e
         np.testing.assert_allclose(found, reply(f)[0] @ np.array([200.0, 200.0, 0, 0, 0]), rtol=1e-10)
 
@@ -176,9 +178,10 @@ def test_a_drive_that_multiplies(x64, kind):
         pull = (0.05 * (rest(x) + 100.0 * x)) ** 2 * 1.5 / np.pi * f**2 / ((36.0 - f**2) ** 2 + (1.5 * f) ** 2)
         return gain * (stiffness + pull)
 
-    found = noise_variance(as_arrays(task), linearised(task).system)
+    variance, system = kept_jit(noise_variance), linearised(task).system
+    found = variance(as_arrays(task), system)
     np.testing.assert_allclose(found, 2 * integral(output), rtol=1e-8)
-    without = noise_variance(as_arrays(task.replace(resonance_amplitude=0.0)), linearised(task).system)
+    without = variance(as_arrays(task.replace(resonance_amplitude=0.0)), system)
     assert without < 0.5 * found
 
 

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 import references
 import scipy.signal
-from compiled import drawing
+from compiled import at_once, drawing, kept_jit
 
 import jaxmuscle as jm
-from jaxmuscle._common.arrays import is_concrete
+from jaxmuscle._common.arrays import as_arrays, is_concrete
 from jaxmuscle._common.types import Scalar
 from jaxmuscle.model import Decay, RampHold, Sampled, SmoothStep
 from jaxmuscle.model._noise import Realisation
@@ -159,10 +159,14 @@ def test_every_step_gets_its_own_noise(steps, every, substeps, precision):
     """diffrax rounds the times of steps: none may find its neighbour's noise."""
     with jax.enable_x64(precision == "float64"):
         noise = np.random.default_rng(0).normal(size=(steps + 1, 4)).astype(precision)
-        task = Integral(noise=jm.WhiteNoise(1.0, relative=False), harmonic=jm.Harmonic(0.0))
+        task = as_arrays(Integral(noise=jm.WhiteNoise(1.0, relative=False), harmonic=jm.Harmonic(0.0)))
         grid = Grid(1e-3, steps, every, substeps)
-        paths = Realisation(values=jnp.asarray(noise)), Realisation(increments=jnp.asarray(noise[1:]))
-        smooth, rough = (respond(task, path, grid, "instant")[0][:, 0] for path in paths)
+
+        def integrals(task, noise):
+            paths = Realisation(values=noise), Realisation(increments=noise[1:])
+            return [respond(task, path, grid, "instant")[0][:, 0] for path in paths]
+
+        smooth, rough = at_once(integrals, task, noise)
         sums = np.cumsum(0.5e-3 * (noise[1:, 0] + noise[:-1, 0]).astype(float)), np.cumsum(noise[1:, 0].astype(float))
         for seen, expected, size in ((smooth, sums[0], 1e-3), (rough, sums[1], 1.0)):
             # One wrong value is an error of order `size`, at a thousand of the steps.
@@ -247,7 +251,7 @@ def test_what_does_not_stay_finite_is_named(x64):
         assert part in str(error.value), part
     with pytest.raises(jm.errors.SimulationError, match=r"1 seed\(s\) did not stay finite \(7\)"):
         jm.simulate(task, KEY, seed=7, duration=3.0)
-    traced = jax.jit(lambda a: jm.simulate(task.replace(noise_C_w=a), KEY, duration=3.0).output)
+    traced = kept_jit(lambda a: jm.simulate(task.replace(noise_C_w=a), KEY, duration=3.0).output)
     assert not np.isfinite(traced(30.0)).all()
     assert np.isfinite(traced(0.1)).all()
 
