@@ -10,7 +10,7 @@ import pages
 import pytest
 import references
 import scipy.optimize
-from compiled import at_once
+from compiled import at_once, kept_jit
 
 import jaxmuscle as jm
 from jaxmuscle.model import SmoothStep
@@ -98,41 +98,49 @@ def test_lengthening_rises_to_its_plateau(x64):
 
 @pytest.mark.slow
 def test_force_velocity_is_smooth_at_rest(x64):
-    f, h = lambda v: float(hill.force_velocity(jnp.asarray(v))), 1e-5
-    slopes = [(f(0.0) - f(-h)) / h, (f(h) - f(0.0)) / h]
-    bends = [(f(0.0) - 2 * f(-h) + f(-2 * h)) / h**2, (f(2 * h) - 2 * f(h) + f(0.0)) / h**2]
+    h = 1e-5
+    f = np.asarray(at_once(jax.vmap(hill.force_velocity), h * np.arange(-2.0, 3.0)))
+    slopes, bends = np.diff(f)[1:3] / h, np.diff(f, 2)[[0, 2]] / h**2
     # One-sided differences miss curvature · h / 2 and third derivative (480 and -7690) · h; rounding 4e-16 / h².
     np.testing.assert_allclose(slopes, 5.0, atol=25 * h)
     np.testing.assert_allclose(bends, 40.0, atol=8e3 * h)
-    for v in (0.0, -1e-13, 1e-13):
-        assert jax.grad(hill.force_velocity)(v) == pytest.approx(5.0, rel=1e-10)
-        assert jax.grad(jax.grad(hill.force_velocity))(v) == pytest.approx(40.0, rel=1e-8)
+    slope = jax.grad(hill.force_velocity)
+    slopes, bends = at_once(jax.vmap(lambda v: (slope(v), jax.grad(slope)(v))), np.array([0.0, -1e-13, 1e-13]))
+    np.testing.assert_allclose(slopes, 5.0, rtol=1e-10)
+    np.testing.assert_allclose(bends, 40.0, rtol=1e-8)
 
 
 @pytest.mark.slow
 def test_force_length_passive_and_tendon_pass_through_what_is_published(x64):
-    np.testing.assert_allclose(hill.force_length(np.array([0.5, 1.0, 1.5])), np.exp([-0.25 / 0.45, 0, -0.25 / 0.45]))
-    np.testing.assert_allclose(hill.passive_length(np.array([1.0, 1.6])), [0.0, 1.0], atol=1e-15)
-    np.testing.assert_allclose(hill.tendon(np.array([0.0, 1.0])), [0.0, 1.0], atol=1e-14)
-    assert jax.grad(hill.tendon)(3.0) == pytest.approx(1.712, rel=1e-6)
-    eta = np.linspace(-0.3, 1.5, 1801)
-    difference = np.abs(np.asarray(hill.tendon(eta)) - hill.thelen_tendon(eta))
-    assert 0.02 < difference.max() < 0.023
-    assert np.all(np.diff(hill.tendon(eta)) > 0) and hill.tendon(-10.0) > -0.0016
-    force = np.linspace(0.0, 1.2, 25)
-    np.testing.assert_allclose(hill.tendon(hill.tendon_strain(force)), force, atol=1e-12)
+    eta, force = np.linspace(-0.3, 1.5, 1801), np.linspace(0.0, 1.2, 25)
+
+    def curves(length, stretched, eta, force):
+        pulled = hill.tendon(eta), hill.tendon(hill.tendon_strain(force)), jax.grad(hill.tendon)(3.0)
+        return hill.force_length(length), hill.passive_length(stretched), *pulled
+
+    given = np.array([0.5, 1.0, 1.5]), np.array([1.0, 1.6]), np.r_[0.0, 1.0, -10.0, eta], force
+    active, passive, tendon, again, slope = map(np.asarray, at_once(curves, *given))
+    np.testing.assert_allclose(active, np.exp([-0.25 / 0.45, 0, -0.25 / 0.45]))
+    np.testing.assert_allclose(passive, [0.0, 1.0], atol=1e-15)
+    np.testing.assert_allclose(tendon[:2], [0.0, 1.0], atol=1e-14)
+    assert slope == pytest.approx(1.712, rel=1e-6)
+    assert 0.02 < np.abs(tendon[3:] - hill.thelen_tendon(eta)).max() < 0.023
+    assert np.all(np.diff(tendon[3:]) > 0) and tendon[2] > -0.0016
+    np.testing.assert_allclose(again, force, atol=1e-12)
 
 
 @pytest.mark.slow
 def test_the_passive_curves_are_smooth(x64):
-    h = 1e-5
-    for curve in (hill.force_length, hill.passive_length, hill.tendon):
-        for q in np.linspace(-0.2, 1.6, 19):
-            slope = (curve(q + h) - curve(q - h)) / (2 * h)
-            bend = (curve(q + h) - 2 * curve(q) + curve(q - h)) / h**2
-            # Central differences: fourth derivatives are below 4e3 (the toe: 1.7/0.09³), rounding 1e-15 / h².
-            np.testing.assert_allclose(jax.grad(curve)(q), slope, rtol=1e-7, atol=1e-7)
-            np.testing.assert_allclose(jax.grad(jax.grad(curve))(q), bend, rtol=1e-5, atol=1e-4)
+    h, q, curves = 1e-5, np.linspace(-0.2, 1.6, 19), (hill.force_length, hill.passive_length, hill.tendon)
+
+    def of_all(around, q):
+        return [(curve(around), jax.vmap(jax.grad(curve))(q), jax.vmap(jax.grad(jax.grad(curve)))(q)) for curve in curves]
+
+    for values, slopes, bends in at_once(of_all, np.stack([q - h, q, q + h]), q):
+        before, here, after = np.asarray(values)
+        # Central differences: fourth derivatives are below 4e3 (the toe: 1.7/0.09³), rounding 1e-15 / h².
+        np.testing.assert_allclose(slopes, (after - before) / (2 * h), rtol=1e-7, atol=1e-7)
+        np.testing.assert_allclose(bends, (after - 2 * here + before) / h**2, rtol=1e-5, atol=1e-4)
 
 
 # --- mechanics
@@ -157,26 +165,34 @@ def test_at_rest_nothing_pulls_and_shortening_lowers_the_force(muscle):
     assert abs(muscle.active_force(zero, zero, STILL)) < 1e-14 * muscle.force_max
     assert abs(muscle.passive_force(zero, zero, zero, zero, STILL)) < 1e-14 * muscle.force_max
     x, v = np.linspace(0.0, 0.01, 21), np.linspace(-0.2, 0.2, 21)
-    against_length = np.asarray(muscle.active_force(x, 0.0, STILL))
-    assert np.all(np.diff(against_length) > 0)  # the ascending limb: shorter is weaker
-    assert np.all(np.diff(np.asarray(muscle.active_force(0.0, v, STILL))) > 0)  # faster is weaker
-    pull = -np.asarray(muscle.passive_force(x, 0.0, 0.0, 0.0, STILL))
-    assert np.all(np.diff(pull) > 0)  # the belly's shortening stretches the tendon
+
+    def forces(x, v):
+        active = muscle.active_force(x, 0.0, STILL), muscle.active_force(0.0, v, STILL)
+        return *active, muscle.passive_force(x, 0.0, 0.0, 0.0, STILL)
+
+    shorter, faster, passive = (np.diff(force) for force in at_once(forces, x, v))
+    assert np.all(shorter > 0)  # the ascending limb: shorter is weaker
+    assert np.all(faster > 0)  # faster is weaker
+    assert np.all(passive < 0)  # the belly's shortening stretches the tendon
 
 
 @pytest.mark.slow
 def test_the_base_coefficients_are_those_of_small_motions(muscle):
     task = hill.at_activation(jm.Isometric(muscle=muscle), muscle.activation)
-    K_w, K_z, C_w, C_z = np.asarray(muscle.base())
     x = float(jm.response.equilibrium(task)[0])
-    assert float(muscle.shortening()) == pytest.approx(x, rel=1e-10)
-    A = np.asarray(jax.jacfwd(lambda y: task.vector_field(15.0, y, jnp.zeros(4)))(jnp.array([x, 0.0])))
+
+    def small_motions(y):
+        motion = jax.jacfwd(lambda y: task.vector_field(15.0, y, jnp.zeros(4)))(y)
+        return muscle.base(), muscle.shortening(), motion, muscle.fibre(y[0])
+
+    base, shortening, A, (length, cosine) = jax.tree.map(np.asarray, at_once(small_motions, np.array([x, 0.0])))
+    K_w, K_z, C_w, C_z = base
+    assert float(shortening) == pytest.approx(x, rel=1e-10)
     np.testing.assert_allclose(A[1] * muscle.m_w, [-(K_w + K_z), -(C_w + C_z)], rtol=1e-9)
     p, h = numpy_values(muscle), 1e-6
     ahead, behind = (numpy_forces(p, x + s, 0.0, 0.0, 0.0) for s in (h, -h))
     np.testing.assert_allclose([K_w, -K_z], (np.array(ahead) - behind) / (2 * h), rtol=1e-5)
     # C_w0 = a F_max f_L cos² α (1 + 1/A) / (v_max ℓ₀)
-    length, cosine = muscle.fibre(x)
     share = 5 * muscle.activation * np.exp(-((length - 1) ** 2) / 0.45) * cosine**2
     np.testing.assert_allclose(C_w, share * muscle.force_max / (muscle.velocity_max * muscle.optimal_length), rtol=1e-10)
     assert C_z == muscle.tendon_damping and min(K_w, K_z, C_w) > 0
@@ -316,6 +332,7 @@ def test_prescribed_motion_is_the_inverse_problem(x64):
         elastic = numpy_tendon(p, x_w - x_z) + u[1] * (x_w - x_z)
         return v_z + (pull - elastic) / (p["tendon_damping"] + u[3])
 
+    fields = kept_jit(lambda t, y, u, du: (task.vector_field(t, y, u), task.output(t, y, u, du)))
     for t in (0.3, 0.45, 3.0):
         u, du = rng.normal(size=5) * [20, 90, 5, 1, 0.2], rng.normal(size=5) * [99, 99, 9, 9, 2]
         x_w = -0.001 + 1e-3 * rng.normal()
@@ -323,9 +340,9 @@ def test_prescribed_motion_is_the_inverse_problem(x64):
         ahead, behind = (velocity(t + s, x_w + s * v_w, u + s * du) for s in (h, -h))
         active, _ = numpy_forces(p, x_w, v_w, 0.0, 0.0, u)
         P_w = p["m_w"] * (ahead - behind) / (2 * h) + active + p["m_z"] * motion(t)[2] + input_at(t, 4.5)
-        y, u, du = jnp.array([x_w]), jnp.asarray(u), jnp.asarray(du)
-        np.testing.assert_allclose(task.vector_field(t, y, u), [v_w], rtol=1e-9)
-        np.testing.assert_allclose(task.output(t, y, u, du), P_w, rtol=1e-6)  # differences: h² and 1e-16 v / h
+        moved, asked = fields(t, np.array([x_w]), u, du)
+        np.testing.assert_allclose(moved, [v_w], rtol=1e-9)
+        np.testing.assert_allclose(asked, P_w, rtol=1e-6)  # differences: h² and 1e-16 v / h
 
 
 @pytest.mark.slow
