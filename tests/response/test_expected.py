@@ -12,7 +12,7 @@ import references
 import scipy.linalg
 import scipy.optimize
 import scipy.signal
-from compiled import at_once
+from compiled import at_once, kept_jit
 
 import jaxmuscle as jm
 from jaxmuscle._common import programs
@@ -318,11 +318,17 @@ def test_what_is_filtered_is_a_recording_of_a_signal_known_at_all_times(x64, mon
 @pytest.mark.slow
 @pytest.mark.parametrize("f", [0.4, 3.0, 11.0, 60.0])
 def test_the_transfer_function_of_acceleration_is_that_of_displacement_twice_differentiated(x64, f):
-    moved, felt = (jm.PrescribedForce(5.0, 1.0, observe=what) for what in ("displacement", "acceleration"))
-    omega = jnp.asarray(2 * np.pi * f)
-    for base in np.eye(5)[[0, 1, 4]]:
-        x, a = (transfer(system_of(task, linearised(task).system, jnp.asarray(base)), omega) for task in (moved, felt))
-        np.testing.assert_allclose(a, -(omega**2) * x, rtol=1e-11)
+    omega = np.asarray(2 * np.pi * f)
+    for x, a in replies_of_both()(omega):
+        np.testing.assert_allclose(a, -(omega**2) * np.asarray(x), rtol=1e-11)
+
+
+@functools.cache
+def replies_of_both():
+    """Of displacement and acceleration to noise of K_w, K_z and P_w each: a program."""
+    tasks = [jm.PrescribedForce(5.0, 1.0, observe=what) for what in ("displacement", "acceleration")]
+    systems = [[system_of(t, linearised(t).system, jnp.asarray(base)) for t in tasks] for base in np.eye(5)[[0, 1, 4]]]
+    return kept_jit(lambda omega: [[transfer(system, omega) for system in pair] for pair in systems])
 
 
 def assert_as_by_quadrature(task, settings, window):
@@ -348,8 +354,14 @@ def test_the_variance_of_a_line_is_that_of_its_samples(x64, frequency, direction
         passed = scipy.signal.sosfilt(settings.sections, passed[::-1])[::-1]
     first = ahead + round(begin * settings.rate)
     expected = np.var(passed[first : first + samples])
-    table = line_table(settings, (begin, begin + samples / settings.rate), jnp.asarray(frequency), samples)
-    np.testing.assert_allclose(table.variance(jnp.asarray(reply)), expected, rtol=1e-9)
+    found = variance_of_a_line(settings, (begin, begin + samples / settings.rate), samples)
+    np.testing.assert_allclose(found(np.asarray(frequency), reply), expected, rtol=1e-9)
+
+
+@functools.cache
+def variance_of_a_line(settings, window, samples):
+    """Of any frequency and reply: a program."""
+    return kept_jit(lambda frequency, reply: line_table(settings, window, frequency, samples).variance(reply))
 
 
 @pytest.mark.slow
@@ -581,9 +593,10 @@ def test_lags_and_the_variance_of_a_mean_are_plain_sums(x64, samples, head):
     powers = jnp.stack([np.linalg.matrix_power(step, 2**k) for k in range(11)])
     r = r[:samples]
     found = Autocovariance(jnp.asarray(first), jnp.asarray(rows), powers, jnp.asarray(start))
-    np.testing.assert_allclose(found.lagged(samples), r, rtol=1e-12, atol=1e-13)
+    lagged, variance = at_once(lambda found: (found.lagged(samples), found.mean_variance(samples)), found)
+    np.testing.assert_allclose(lagged, r, rtol=1e-12, atol=1e-13)
     lag = np.abs(np.subtract.outer(np.arange(samples), np.arange(samples)))
-    np.testing.assert_allclose(found.mean_variance(samples), np.array(r)[lag].mean(), rtol=1e-11)
+    np.testing.assert_allclose(variance, np.array(r)[lag].mean(), rtol=1e-11)
 
 
 @pytest.mark.parametrize("name", ["zagrodny-slifkin", "zagrodny-hamilton"])
@@ -776,7 +789,7 @@ def test_what_has_no_linear_response(x64, name):
 
 @pytest.mark.slow
 def test_without_an_equilibrium_under_a_transformation_it_is_not_finite(x64):
-    @jax.jit
+    @kept_jit
     def power(F_ext, k_w):
         return jm.expected_spectrum(snapped().replace(F_ext=F_ext, k_w=k_w)).power
 
@@ -830,7 +843,9 @@ def test_who_forbids_jax_to_add_axes_can_use_it():
         with pytest.raises(ValueError, match="rank_promotion"):
             jnp.ones((2, 3)) * jnp.ones(3)
         assert jm.expected_spectrum(task).power.shape == (30,)
-        assert np.isfinite(jax.grad(lambda k_w: jm.expected_spectrum(task.replace(k_w=k_w)).power.sum())(5e5))
-        signal = np.random.default_rng(0).standard_normal((2, 3, 1000))
+        # JAX looks at axes while it traces: nothing is computed.
+        slope = jax.grad(lambda k_w: jm.expected_spectrum(task.replace(k_w=k_w)).power.sum())
+        assert jax.eval_shape(slope, 5e5).shape == ()
         settings = jm.SpectrumSettings(detrend="linear")
-        assert jm.spectra.welch(jm.spectra.lowpass(signal, settings), settings).shape == (2, 3, 30)
+        found = jax.eval_shape(lambda x: jm.spectra.welch(jm.spectra.lowpass(x, settings), settings), np.zeros((2, 3, 1000)))
+        assert found.shape == (2, 3, 30)
