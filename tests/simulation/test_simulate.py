@@ -420,12 +420,13 @@ def test_the_runs_of_an_ensemble_are_taken_by_their_place():
     for place in (0, 2, -1):
         for name in ("states", "output", "seeds", "linear"):
             np.testing.assert_array_equal(getattr(runs[place], name), getattr(runs, name)[place])
-    alone = jm.simulate(jm.Isometric(), KEY, seed=1).output  # computed alone, so rounded otherwise
-    np.testing.assert_allclose(runs[1].output, alone, rtol=1e-6, atol=1e-6)
+    alone = jm.simulate(jm.Isometric(), KEY, seed=1)  # computed alone, so rounded otherwise
+    np.testing.assert_allclose(runs[1].output, alone.output, rtol=1e-6, atol=1e-6)
     np.testing.assert_array_equal(runs[1:].output, runs.output[1:])
     with pytest.raises(IndexError, match=r"\[3\]: there are 3 seeds, 0 to 2"):
         runs[3]
     with pytest.raises(TypeError, match="this trajectory is one run"):
         runs[0][0]
-    mapped = jax.vmap(lambda k: jm.simulate(jm.Isometric(), k))(jax.random.split(KEY, 2))
+    # What `vmap` makes of runs, whose every number gets an axis; that runs can be mapped: the test of ensembles under vmap.
+    mapped = jax.vmap(lambda output: eqx.tree_at(lambda run: run.output, alone, output))(runs.output[:2])
     assert mapped[1].task["m_w"] == 0.5 and mapped[1].output.shape == runs[0].output.shape
