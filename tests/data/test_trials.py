@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import scipy.signal
 import scipy.stats
+from refits import without_intervals
 
 import jaxmuscle as jm
 from jaxmuscle._common.errors import TargetError
@@ -352,7 +353,8 @@ def people(task, seeds, key):
 def strong():
     task = jm.at_force(jm.Isometric(), 40.5)
     found = people(task, 5, 11)
-    return found, jm.fit(jm.Isometric(), found, rungs=0, seeds=0, check_seeds=0, starts=16)
+    with without_intervals():
+        return found, jm.fit(jm.Isometric(), found, rungs=0, seeds=0, check_seeds=0, starts=8)
 
 
 @pytest.mark.slow
@@ -369,7 +371,8 @@ def test_a_fit_has_the_measured_mean(strong):
     said = " ".join(str(result).split())
     assert "the muscle has the measured mean force" in said
     assert f"The masses are the usual 0.5 kg times {result.settings['carried']:.3g}. They are no measurements" in said
-    without = jm.fit(jm.Isometric(), target, rungs=0, seeds=0, check_seeds=0, starts=16, mean_force=False)
+    with without_intervals():
+        without = jm.fit(jm.Isometric(), target, rungs=0, seeds=0, check_seeds=0, starts=8, mean_force=False)
     assert without.per_newton and "P_w" not in without.free
     # Another scale of force is the same spectrum: P_w is one more freedom, which a mean takes away again.
     assert result.chi2_per_bin == pytest.approx(without.chi2_per_bin, rel=0.05)
@@ -391,7 +394,8 @@ def test_a_joint_fit_at_two_forces():
     """One muscle at two drives: stiffness is shared, every P_w follows its own mean."""
     weak = jm.at_force(jm.Isometric(), 20.0)
     found = {"weak": people(weak, 3, 12), "strong": people(weak.replace(P_w=1.5 * weak["P_w"]), 3, 13)}
-    result = jm.fit_joint(found, starts=8, seeds=0)
+    with without_intervals():
+        result = jm.fit_joint(found, starts=8, seeds=0)
     assert {"P_w@weak", "P_w@strong"} <= set(result.free) and "k_w" in result.free
     for name, recordings in found.items():
         measured = np.mean([np.mean(r.samples) for r in recordings])
