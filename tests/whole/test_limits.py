@@ -6,6 +6,7 @@ import jax
 import numpy as np
 import pages
 import pytest
+from compiled import kept_jit
 
 import jaxmuscle as jm
 from jaxmuscle._common.arrays import as_arrays
@@ -43,7 +44,7 @@ def says(*words):
 
 @pytest.mark.slow
 def test_the_force_read_is_less_than_the_force_of_the_muscle(x64):
-    mean = jax.jit(jax.vmap(lambda v: linearise(jm.Isometric().replace(**v)).rest))
+    mean = kept_jit(jax.vmap(lambda v: linearise(jm.Isometric().replace(**v)).rest))
     rng, n = np.random.default_rng(0), 2000
     drawn = {name: jm.PARAMETERS[name].default * np.exp(rng.normal(size=n)) for name in ("k_w", "k_z")}
     share = np.asarray(mean(drawn | {"x_z": np.zeros(n), "P_w": np.full(n, 5.0)})) / 5.0
