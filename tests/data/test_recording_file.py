@@ -477,9 +477,8 @@ def test_command(tmp_path):
     assert found.exit_code == 0 and "found automatically" in found.stderr
     assert json.loads(found.stdout) == json.loads((out / "analysis.json").read_text()) != record
     assert {file.name for file in out.iterdir()} == {"analysis.json", "analysis.pdf", "analysis.svg", "spectrum.csv"}
-    slow = run(
-        path, "--window", "4:16", "--spectrum", "slow", "--out", out, "--force", "--save-target", tmp_path / "slow.toml"
-    )
+    options = "--out", out, "--force", "--format", "svg", "--save-target", tmp_path / "slow.toml"
+    slow = run(path, "--window", "4:16", "--spectrum", "slow", *options)
     assert slow.exit_code == 0 and re.search(r"Welch segments[ │]+1\b", slow.output)
     assert load_target(tmp_path / "slow.toml") == held.target("slow", settings="slow")
     assert json.loads((out / "analysis.json").read_text())["settings"]["length"] == 1000
