@@ -608,7 +608,7 @@ def wait_for(condition, seconds=120.0):
 
 @pytest.mark.slow
 def test_a_process_that_dies_stops_the_others_and_loses_nothing(tmp_path):
-    arguments = ["--seeds", "800", "--duration", "1", "--chunk", "8", "--out", "runs.zarr"]
+    arguments = ["--seeds", "1600", "--duration", "1", "--chunk", "8", "--out", "runs.zarr"]
     workers = started(2, arguments, tmp_path)
     path = tmp_path / "runs.zarr"
     wait_for((path / "progress" / "chunk-00000001.json").exists)  # process 1 has the odd chunks
@@ -618,7 +618,7 @@ def test_a_process_that_dies_stops_the_others_and_loses_nothing(tmp_path):
     assert "another process of this run died or stopped" in told and "--resume" in told
     assert xarray.open_zarr(path).attrs["complete"] is False
     ended(command("ensemble", "zagrodny-slifkin", *arguments, "--resume", cwd=tmp_path))
-    whole = jm.ensemble(jm.load_preset("zagrodny-slifkin"), jax.random.key(0), seeds=800, control=False, **SHORT)
+    whole = jm.ensemble(jm.load_preset("zagrodny-slifkin"), jax.random.key(0), seeds=1600, control=False, **SHORT)
     close(xarray.open_zarr(path)["P_w"], whole.output)
 
 
