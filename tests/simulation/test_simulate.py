@@ -284,6 +284,15 @@ def test_a_step_that_leaves_nothing_to_be_low_passed_is_refused():
         jm.simulate(slow, KEY, sampling="filtered", dt=0.01)
 
 
+@pytest.mark.parametrize(
+    "rate, sampling", [(None, "filtered"), (100.0, "filtered"), (50.0, "filtered"), (1000.0, "instant")]
+)
+def test_only_a_finer_run_of_filtered_settings_is_seen_at_instants(rate, sampling):
+    """Its spectrum is low-passed when it is made. At the rate of the settings and below, the run itself is."""
+    settings = jm.SpectrumSettings(rate=100.0, sampling="filtered")
+    assert schedule(jm.Isometric(settings=settings), 1.0, 1e-3, rate, None, None).sampling == sampling
+
+
 def test_a_traced_duration_says_that_it_is_traced():
     plan = inspect.unwrap(schedule)  # without the tests' type checker
     with pytest.raises(ValueError, match=r"duration is traced by JAX.*static_argnames"):
