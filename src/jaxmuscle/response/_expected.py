@@ -14,13 +14,13 @@ from jaxmuscle._common.programs import kept
 from jaxmuscle._common.types import Scalar
 from jaxmuscle.model._resonant_noise import ResonantNoise
 from jaxmuscle.model._tasks import AbstractTask
-from jaxmuscle.spectra._bin_law import bin_rows
+from jaxmuscle.spectra._bin_law import bin_rows, sides_of
 from jaxmuscle.spectra._settings import LONGEST, WINDOW, SpectrumSettings, samples_in, tapers_of
 from jaxmuscle.spectra._welch import Spectrum
 
 from ._autocovariance import autocovariances, covariances
 from ._equilibrium import mechanics
-from ._harmonic_line import LONG, harmonic_line, removed, sides_of, transformed
+from ._harmonic_line import LONG, harmonic_line, removed, transformed
 from ._linearised import Linearisation, LinearTask, linearisation, linearise
 
 TAIL = 1e-13
@@ -117,10 +117,10 @@ def expected_powers(settings: SpectrumSettings, r: Float[Array | np.ndarray, " l
     moved = [convolved(jnp.concatenate([R[:0:-1], R]), jnp.asarray(q, r.dtype), mode="valid") for q in away]
     for w in tapers:
         seen = [transformed(settings, jnp.asarray(w * q, r.dtype)) for q in away]
-        for q, (here, Tq) in enumerate(zip(seen, moved, strict=True)):
+        for here, Tq in zip(seen, moved, strict=True):
             power -= 2 * jnp.real(jnp.conj(transformed(settings, jnp.asarray(w, r.dtype) * Tq)) * here)
-            for p, there in enumerate(seen):
-                power += jnp.real(jnp.conj(there) * here) * (jnp.asarray(away[p], r.dtype) @ moved[q])
+            for there, p in zip(seen, away, strict=True):
+                power += jnp.real(jnp.conj(there) * here) * (jnp.asarray(p, r.dtype) @ Tq)
     lowered = _lowered(spread)[reach:] * np.append(1.0, np.full(reach, 2.0))
     further = jnp.stack([R[0], jnp.asarray(lowered, r.dtype) @ r[: reach + 1]])
     return jnp.concatenate([power * jnp.asarray(sides_of(settings), r.dtype), further])

@@ -11,7 +11,7 @@ from jaxmuscle._common.matrices import exponential
 from jaxmuscle._common.programs import kept
 from jaxmuscle.model._signals import Constant
 from jaxmuscle.model._tasks import AbstractTask
-from jaxmuscle.spectra._bin_law import bin_rows
+from jaxmuscle.spectra._bin_law import bin_rows, sides_of
 from jaxmuscle.spectra._decimation import FINER, anti_alias
 from jaxmuscle.spectra._settings import WINDOW, SpectrumSettings, tapers_of
 from jaxmuscle.spectra._welch import lowpass, spectrum_of
@@ -25,12 +25,6 @@ LONG = 1024  # samples of a segment: beyond, a fast Fourier transform takes the 
 def transformed(settings: SpectrumSettings, x: Float[Array, "*some samples"]) -> Complex[Array, "*some bins"]:
     """Fourier transform of segments, at the bins."""
     return jnp.fft.rfft(x)[..., settings.first_bin : settings.last_bin + 1]
-
-
-def sides_of(settings: SpectrumSettings) -> Float[np.ndarray, " bins"]:
-    """How often a bin counts, once or for both signs of its frequency, over the rate [1/Hz]."""
-    k = np.arange(settings.first_bin, settings.last_bin + 1)
-    return np.where((k == 0) | (2 * k == settings.length), 1.0, 2.0) / settings.rate
 
 
 def removed(settings: SpectrumSettings) -> Float[np.ndarray, "directions samples"]:

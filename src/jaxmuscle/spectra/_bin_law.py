@@ -180,13 +180,18 @@ def shares_map(p: Float[np.ndarray, " bins"]) -> Float[np.ndarray, "bins bins"]:
     return np.diag(p) - np.outer(p, p)
 
 
+def sides_of(settings: SpectrumSettings) -> Float[np.ndarray, " bins"]:
+    """How often a bin counts, once or for both signs of its frequency, over the rate [1/Hz]."""
+    k = np.arange(settings.first_bin, settings.last_bin + 1)
+    return np.where((k == 0) | (2 * k == settings.length), 1.0, 2.0) / settings.rate
+
+
 @functools.cache
 def bin_rows(settings: SpectrumSettings) -> Complex[np.ndarray, "bins tapers length"]:
     """Detrending, tapers and transform of a segment as one matrix: X_kt = Σ_m a_ktm x_m, so that power is Σ_t |X_kt|²."""
     n, m = settings.length, np.arange(settings.length)
     k = np.arange(settings.first_bin, settings.last_bin + 1)
-    sides = np.where((k == 0) | (2 * k == n), 1.0, 2.0)
-    turns = np.exp(-2j * np.pi * np.outer(k, m) / n) * np.sqrt(sides / settings.rate)[:, None]
+    turns = np.exp(-2j * np.pi * np.outer(k, m) / n) * np.sqrt(sides_of(settings))[:, None]
     rows = turns[:, None] * tapers_of(settings, n)
     if settings.detrend != "none":
         rows = rows - rows.mean(axis=-1, keepdims=True)
