@@ -24,6 +24,9 @@ from jaxmuscle.commands.main import app
 from jaxmuscle.fits._reopened import reopened
 from jaxmuscle.model._parameters import PARAMETERS
 from jaxmuscle.objective._likelihood import Likelihood
+from jaxmuscle.response._expected import noise_variance
+from jaxmuscle.response._linearised import linearise
+from jaxmuscle.response._transfer import harmonic_system
 from jaxmuscle.uncertainty._chains import Chains, sample
 from jaxmuscle.uncertainty._posterior_checks import diagnosed, modes_of, verdict
 from jaxmuscle.uncertainty._posterior_density import density_about
@@ -300,6 +303,23 @@ def test_the_common_scale_is_counted_from_the_coefficient_of_variation():
         places[1, level.column] += 0.1
         here, moved = np.asarray(at_once(lambda places: jax.lax.map(variation, places), places))
         assert moved - here == pytest.approx(0.1 * level.sd, rel=1e-3)  # noise on damping is fixed, but tiny
+
+        # The square of that variation: of the noise, and half that of the amplitude the harmonic has in the output.
+        strong = places[0].copy()
+        strong[problem.coordinates.names.index("harmonic_amplitude")] += 3.0
+
+        def parts(s):
+            task = density.task(s, 0)
+            system = linearise(task)
+            told = tuple(harmonic_system(task, system)), noise_variance(task, system), system.rest, task.harmonic.amplitude
+            return *told, density.log_variation(s, 0, level.weight)[0]
+
+        (A, b, c, d, e), noise, rest, amplitude, log = jax.tree.map(np.asarray, at_once(parts, strong))
+        s = 2j * np.pi * density.bands[0].frequency
+        swing = amplitude * np.abs([c @ np.linalg.solve(one * np.eye(len(A)) - A, b) + d + one * e for one in s])
+        line = 0.5 * float(level.weight @ swing**2)
+        assert line > 0.2 * noise
+        np.testing.assert_allclose(np.exp(2 * log), (noise + line) / rest**2, rtol=1e-9)
 
 
 def bare():
