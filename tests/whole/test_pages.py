@@ -1,6 +1,7 @@
 """The Python of README and documentation does what it says; commands in them have the options that they are given."""
 
 import contextlib
+import functools
 import io
 import re
 from pathlib import Path
@@ -42,9 +43,15 @@ def jitted(*functions: str) -> dict[str, str]:
     return {f"{function}(": f"jax.jit({function})(" for function in functions}
 
 
-IN_PYTHON = {"seeds=100_000": "seeds=100", "seeds=1000)": "seeds=100)"} | jitted(
-    "jax.grad(variation)", "jax.grad(lambda v: jm.expected_spectrum(rebuild(v)).proportional[10])"
-)
+# The bundled spectrum with the usual settings (see `write_plain`), and its fit, of which is asked what to measure next.
+PLAIN = 'jm.load_target("plain.toml")'
+PLAIN_FIT = f"jm.fit(jm.task_for({PLAIN}), {PLAIN}, {FEW})"
+IN_PYTHON = {
+    "seeds=100_000": "seeds=100", "seeds=1000)": "seeds=100)",
+    "summary = jm.ensemble(result.task": "summary = jm.ensemble(jm.Isometric()",  # as docs/ensembles.md has it
+    "jm.identifiability(result)": f"jm.identifiability({PLAIN_FIT})",
+    "jm.design_input(result,": f"jm.design_input({PLAIN_FIT},",
+} | jitted("jax.grad(variation)", "jax.grad(lambda v: jm.expected_spectrum(rebuild(v)).proportional[10])")  # fmt: skip
 FULL = "starts=32, seeds=16, check_seeds=16"
 # What a notebook does as the README does is done as there. The ladder, tremor and all, is climbed in fits/test_rungs.py.
 IN_NOTEBOOKS = {
@@ -55,13 +62,20 @@ IN_NOTEBOOKS = {
         f"target, {FULL}": "target",
         'task, target, noises=("band-limited", "ornstein-uhlenbeck"), groups=3': "jm.Isometric(), target",
         f"jm.Isometric(), measured, {FULL}": f"person, measured, {FEW}",
+        "hand = result.task": f"result = {PLAIN_FIT}\nhand = result.task",
+        # In the precision of the fit's own simulations: one program.
+        "trials = jm.ensemble(": "with jax.enable_x64(True):\n    trials = jm.ensemble(",
+        "np.mean(trials.power": "np.mean(np.asarray(trials.power)",
     },
     "06-gradients-and-design": {
         "jax.jvp(spread, (k_w,), (1.0,))": "jax.jit(lambda k: jax.jvp(spread, (k,), (1.0,)))(k_w)",
+        # The slopes of the force are known, from a cell before.
+        "jax.jacfwd(log_power)(centre, task)": "(slopes if task is person else jax.jacfwd(log_power)(centre, task))",
         **jitted("jax.grad(spread)"),
     },
     "07-your-own-muscle": {
         "starts=16": FEW,
+        '"paper\'s, as printed": jm.Isometric(), ': "",  # the muscle of all other pages
         **jitted(
             "jax.vmap(variation, in_axes=(None, 0))",
             "jax.grad(lambda damping: jm.expected_spectrum(mine.replace(damping=damping)).proportional[0])",
@@ -73,7 +87,7 @@ IN_NOTEBOOKS = {
     },
 }
 CALLED_OFTEN = ("fit", "fit_cohort", "ensemble", "profile", "posterior", "identifiability", "compare_noise", "goodness",
-                "bootstrap", "design_input")  # fmt: skip
+                "bootstrap", "design_input", "sensitivity")  # fmt: skip
 FEWER: dict[str, dict[str, Any]] = {
     "ensemble": {"chunk": 16},  # one program for any number of seeds
     "fit_cohort": {"starts": 8},
@@ -87,18 +101,25 @@ FEWER: dict[str, dict[str, Any]] = {
 @pytest.fixture(autouse=True)
 def in_a_folder_of_its_own(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
+    write_plain("plain.toml")
     yield
     plt.close("all")
 
 
-def write_recording(path, key=5):
+@functools.cache
+def recorded(key):
     """A trial as a force sensor writes it: 2048 Hz, rest, ramp, hold of a known task, release."""
     run = jm.simulate(jm.settled(TRUTH), jax.random.key(key), duration=40.0, rate=1000.0)
     held = np.interp(np.arange(40 * 2048) / 2048, run.time, np.asarray(run.output, dtype=float))
     level = held.mean()
     force = np.concatenate([np.zeros(4096), level * np.linspace(0, 1, 4096), held, level * np.linspace(1, 0, 2048)])
     rows = "".join(f"{k / 2048:.6f},{f:.6f}\n" for k, f in enumerate(force))
-    Path(path).write_text("time,force\n" + rows, encoding="utf-8")
+    return "time,force\n" + rows
+
+
+def write_recordings():
+    for number, name in enumerate(("trial.csv", "trial1.csv", "trial2.csv", "trial3.csv")):
+        Path(name).write_text(recorded(5 + number), encoding="utf-8")
 
 
 def write_tremor(path):
@@ -107,6 +128,17 @@ def write_tremor(path):
     run = jm.simulate(task, jax.random.key(6), duration=30.0, rate=1000.0)
     rows = "".join(f"{t:.3f},{a / 9.81 + 0.5:.8f}\n" for t, a in zip(run.time, np.asarray(run.output), strict=True))
     Path(path).write_text("time,acc\n" + rows, encoding="utf-8")
+
+
+def write_plain(path):
+    """The bundled spectrum as that of a signal low-passed once, by the usual settings: other tests ask the same about such.
+
+    A program is made for the settings of a spectrum. What the pages say does not depend on these.
+    """
+    text = (pages.ROOT / "src/jaxmuscle/targets/vastus-lateralis-26mvc.toml").read_text(encoding="utf-8")
+    bundled, settings = text.split("[settings]")
+    assert settings.split() == ["filter_direction", "=", '"both"']
+    Path(path).write_text(bundled, encoding="utf-8")
 
 
 def write_spectrum(path, seed=0, task=None):
@@ -148,10 +180,10 @@ def readme(once, tmp_path_factory):
     """What the README leaves behind, and the page that goes on from it."""
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(tmp_path_factory.mktemp("readme"))
-        for number, name in enumerate(("trial.csv", "trial1.csv", "trial2.csv", "trial3.csv")):
-            write_recording(name, 5 + number)
+        write_recordings()
         for seed, name in enumerate("abc"):
             write_spectrum(f"{name}.csv", seed)
+        write_plain("plain.toml")
         with contextlib.redirect_stdout(io.StringIO()) as printed:
             names = pages.run("docs/python.md", pages.run("README.md", {"printed": printed}, OF_TRIALS), IN_PYTHON)
     return names | {"returned": dict(once.last)}
@@ -217,7 +249,9 @@ def test_force():
 def test_identifiability():
     write_spectrum("displacement.csv", task=TRUTH.as_task(jm.PrescribedForce, P_w=TRUTH.P_w, F_ext=2.93))
     # What tests/uncertainty/test_several.py runs on less.
-    fewer = {"(2.93, 0.06)},": "(2.93, 0.06)}, starts=16, seeds=16, check_seeds=16,",
+    fewer = {'jm.load_target("vastus-lateralis-26mvc")': PLAIN,
+             "jm.task_for(target), target)": f"jm.task_for(target), target, {FEW})",
+             "(2.93, 0.06)},": "(2.93, 0.06)}, starts=16, seeds=16, check_seeds=16,",
              'jm.profile(joint, "K_w0")': 'joint["K_w0"]', "jm.bootstrap(joint)": "", "jm.posterior(joint, key=0)": "",
              "jm.goodness(joint)": "jm.goodness(joint, replicates=19)"}  # fmt: skip
     names = pages.run("docs/identifiability.md", {}, fewer)
@@ -229,10 +263,11 @@ def test_own_data():
     write_spectrum("mine.csv")
     once = {"jm.task_for(target), target)": f"jm.task_for(target), target, {FEW})"}
     assert pages.run("docs/fit-a-csv.md", {}, once)["target"].segments == (6,) * 10
-    for number, name in enumerate(("trial.csv", "trial1.csv", "trial2.csv", "trial3.csv")):
-        write_recording(name, 5 + number)
+    write_recordings()
     write_tremor("tremor.csv")
-    quick = {"jm.task_for(tremor), tremor": "jm.task_for(tremor), tremor, rungs=0, starts=8, seeds=0, check_seeds=0",
+    # With a tremor at once: the program of the fit that data/test_tremor.py makes.
+    few = "rungs=0, starts=8, seeds=0, check_seeds=0"
+    quick = {"jm.task_for(tremor), tremor": f"jm.on_rung(jm.task_for(tremor), 2), tremor, {few}",
              "held.target())\n": f"held.target(), {FEW})\n",
              "target)  # the same": f"target, {FEW})  # the same"}  # fmt: skip
     names = pages.run("docs/recordings.md", {}, quick)
@@ -260,7 +295,8 @@ def test_own_optimisers():
     """scipy's minimum, found as the page says, is that of the fit with another optimiser."""
     try:
         with jax.numpy_dtype_promotion("standard"):  # optax mixes integers of two lengths
-            names = pages.run("docs/how-to/own-optimiser.md")
+            # The second descent with the slopes of the first: those of its own residuals differ only in what weighs them.
+            names = pages.run("docs/how-to/own-optimiser.md", {}, {"jax.jit(jax.jacfwd(closer.residuals))": "slopes"})
         problem = names["problem"]
         assert problem.log_density(names["theta"]) > problem.log_density(problem.start)
     finally:
@@ -344,13 +380,23 @@ def unlabelled(figure):
 @pytest.mark.slow
 def test_the_gallery_is_drawn_by_its_code_with_units_and_in_given_axes(readme, monkeypatch):
     """The statements of the README's results are those of the gallery: what takes minutes is not done twice."""
-    for name in ("posterior", "identifiability", "compare_noise", "goodness", "bootstrap", "design_input"):
+    for name in ("posterior", "identifiability", "compare_noise", "goodness", "bootstrap", "design_input", "sensitivity"):
         monkeypatch.setattr(jm, name, lambda *_, found=readme["returned"][name], **__: found)
+    smaller = {
+        "seeds=200)": "seeds=100)", "seeds=2000": "seeds=100", "seeds=100), strict": "seeds=16), strict",
+        # Recordings as long as others here.
+        "jm.ensemble(jm.settled(result.task), key, seeds=5, duration=20.0)": "runs",
+        "enumerate(np.asarray(seeds.output))": "enumerate(np.asarray(seeds.output)[:5])",
+        "key, duration=60.0, rate=1000.0": "key, duration=40.0, rate=1000.0", "window=(2.0, 60.0)": "window=(2.0, 40.0)",
+    }  # fmt: skip
+    for old in smaller:
+        assert any(old in section.setup for section in GALLERY.SECTIONS), f"the gallery says no longer {old}"
     names = dict(readme)
     for section in GALLERY.SECTIONS[:-2]:  # the paper's figures and a study, which fits/test_study.py does
-        exec(section.setup.replace("seeds=2000", "seeds=100"), names)
+        exec(functools.reduce(lambda setup, old: setup.replace(old, smaller[old]), smaller, section.setup), names)
         for figure in section.figures:
-            made = eval(figure.code.replace(", minute)", f", minute, {FEW})"), names)
+            code = figure.code.replace(", minute)", f", minute, {FEW})").replace("tasks=pair)", f"tasks=pair, {FEW})")
+            made = eval(code, names)
             whole = getattr(made[0] if isinstance(made, tuple) else made, "figure", made)
             assert not list(unlabelled(whole)), figure.file
             plt.close("all")
