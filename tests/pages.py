@@ -16,7 +16,7 @@ from compiled import PAGE, kept_jit
 
 ROOT = Path(__file__).resolve().parents[1]
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
-IN_A_KERNEL = "03-three-tasks"  # the one with sliders, which test_notebooks.py runs as Jupyter does
+IN_A_KERNEL = "03-three-tasks"  # the one with sliders, which test_notebooks.py runs as Jupyter does, too
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
 
 
