@@ -1,5 +1,6 @@
 """`jaxmuscle reproduce`: every row of the table on its numbers, the three readings, the figures, the page."""
 
+import functools
 import json
 import re
 from html.parser import HTMLParser
@@ -18,6 +19,7 @@ from typer.testing import CliRunner
 import jaxmuscle as jm
 from jaxmuscle.commands.reproduce import reproduce as command
 from jaxmuscle.data._recording import Recording
+from jaxmuscle.paper import _levels, _numbers, _readings
 from jaxmuscle.paper._claims import CLAIMS, check
 from jaxmuscle.paper._figures import FIGURES
 from jaxmuscle.paper._levels import Levels, fitted
@@ -89,9 +91,14 @@ EXPECTED = {
 
 @pytest.fixture(scope="module")
 def done(tmp_path_factory):
-    """The whole command's work, once: what was found, and the folder."""
+    """The whole command's work, once: what was found, and the folder.
+
+    In chunks of eight seeds, so that ensembles of 1, 16 and 32 seeds share a program: a seed is the same in any chunk.
+    """
     folder = tmp_path_factory.mktemp("reproduce")
     with pytest.MonkeyPatch.context() as patch:
+        for module in (_levels, _numbers, _readings):
+            patch.setattr(module, "ensemble", functools.partial(module.ensemble, chunk=8))
         patch.setattr(conftest, "DRAWN_WHOLE", 0)  # each is drawn as a PDF, too
         return reproduce(folder), folder
 
