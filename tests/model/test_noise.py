@@ -191,12 +191,12 @@ def test_channels_are_independent_unless_shared(x64, kind):
 def test_a_shared_noise_moves_all_coefficients_together(x64):
     def force(shared, channel):
         noise = jm.BandLimitedNoise({channel: 0.1}, shared=shared)
-        return jm.simulate(jm.Isometric(noise=noise, x_z=0.01), KEY, duration=2.0).output
+        return jm.simulate(jm.Isometric(noise=noise, x_z=0.01), KEY, duration=1.0).output
 
-    quiet = jm.simulate(jm.Isometric(noise=jm.BandLimitedNoise(0.0), x_z=0.01), KEY, duration=2.0).output
+    quiet = jm.simulate(jm.Isometric(noise=jm.BandLimitedNoise(0.0), x_z=0.01), KEY, duration=1.0).output
     # Nearly linear: what K_w and K_z do with one path adds up to what a shared noise does on both.
     both = jm.BandLimitedNoise({"K_w": 1e-4, "K_z": 1e-4}, shared=True)
-    joint = jm.simulate(jm.Isometric(noise=both, x_z=0.01), KEY, duration=2.0).output - quiet
+    joint = jm.simulate(jm.Isometric(noise=both, x_z=0.01), KEY, duration=1.0).output - quiet
     parts = force(True, "K_w") + force(True, "K_z") - 2 * quiet
     np.testing.assert_allclose(joint * 1e3, parts, atol=0.1 * np.abs(parts).max())
     apart = force(False, "K_w") + force(False, "K_z") - 2 * quiet

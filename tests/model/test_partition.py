@@ -105,7 +105,7 @@ def test_a_gradient_step_by_an_optimiser_of_pytrees(x64):
 def test_a_rebuilt_task_is_simulated_and_saved(x64, tmp_path):
     values, rebuild = jm.model.partition(TASK, NAMES)
     again = rebuild(values)
-    runs = [jm.simulate(task, jax.random.key(0), duration=0.5).output for task in (TASK, again)]
+    runs = [jm.simulate(task, jax.random.key(0), duration=1.0).output for task in (TASK, again)]
     np.testing.assert_allclose(runs[1], runs[0], rtol=1e-12)
     jm.save_preset(tmp_path / "again.toml", again)
     assert jm.load_preset(tmp_path / "again.toml").parameters == TASK.parameters

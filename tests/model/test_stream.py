@@ -301,7 +301,7 @@ def test_what_is_drawn_on_the_way_is_the_path_in_single_precision_too(name):
 
 @pytest.mark.slow
 def test_simulate_draws_from_the_key_folded_with_the_seed(x64):
-    found = jm.simulate(jm.PrescribedForce(noise=BAND), KEY, seed=4, duration=0.6, substeps=1)
+    found = jm.simulate(jm.PrescribedForce(noise=BAND), KEY, seed=4, substeps=1)
 
     def given(key):
         path = BAND.realise(BAND.draw(jax.random.fold_in(key, 4), 600), 1e-3)
@@ -309,4 +309,4 @@ def test_simulate_draws_from_the_key_folded_with_the_seed(x64):
 
     states = at_once(given, KEY)
     # The filter's noise is a difference of nearly equal numbers: another program has it to 1e-10 or so.
-    assert largest(found.states, states) < 1e-9
+    assert largest(np.asarray(found.states)[:61], states) < 1e-9

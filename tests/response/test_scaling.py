@@ -169,11 +169,11 @@ def test_dynamic_similarity_is_exact_far_from_linear(x64):
     )
     large = scaled(small, size)
     stretched = {n: type(s)(s.level, s.start * size, s.rise * size) for n, s in (("P_w", large.P_w), ("F_ext", large.F_ext))}
-    here = jm.simulate(small, jax.random.key(0), duration=4.0)
+    here = np.asarray(jm.simulate(small, jax.random.key(0)).states)[:401]
     there = jm.simulate(large.with_parts(**stretched), jax.random.key(0), duration=8.0, dt=2e-3, rate=50.0)
     factors = np.array([size, 1.0, size, 1.0])
-    np.testing.assert_allclose(there.states, np.asarray(here.states) * factors, rtol=1e-8, atol=1e-12)
-    assert np.abs(here.state("x_w")).max() > 2 * float(small["x_ref_w"])
+    np.testing.assert_allclose(there.states, here * factors, rtol=1e-8, atol=1e-12)
+    assert np.abs(here[:, 0]).max() > 2 * float(small["x_ref_w"])
 
 
 @pytest.mark.slow

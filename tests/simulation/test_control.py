@@ -184,7 +184,7 @@ def test_what_an_estimate_holds(x64):
 
 @pytest.mark.slow
 def test_one_seed_has_a_spectrum_but_no_error(x64):
-    estimate = jm.simulate(jm.Isometric(), KEY, dt=2.5e-3).mean_spectrum()
+    estimate = jm.simulate(jm.Isometric(), KEY).mean_spectrum()
     assert estimate.seeds == 1 and estimate.expected is None
     assert np.all(estimate.power > 0) and np.all(np.isnan(estimate.stderr))
 
@@ -216,12 +216,12 @@ def test_control_by_default_where_it_pays(x64):
     assert jm.ensemble(jm.Isometric(), KEY, seeds=8, dt=2.5e-3).linear is not None
     for task in (SLOW, UNDAMPED):
         assert jm.ensemble(task, KEY, seeds=8, dt=2.5e-3).linear is None
-    assert jm.ensemble(jm.Isometric(), KEY, seeds=2, dt=5e-3, duration=1.0).linear is None
+    assert jm.ensemble(jm.Isometric(), KEY, seeds=2, duration=1.0).linear is None
 
 
 @pytest.mark.slow
 def test_a_settled_task_has_no_transient_however_slow(x64):
-    assert jm.ensemble(jm.settled(SLOW), KEY, seeds=2, dt=2.5e-3).linear is not None
+    assert jm.ensemble(jm.settled(SLOW), KEY, seeds=32, **TOGETHER).linear is not None
 
 
 @pytest.mark.slow
@@ -253,7 +253,7 @@ def test_under_a_transformation(x64):
 @pytest.mark.slow
 def test_single_precision_estimates_the_same():
     def estimate():
-        task = made(jm.Isometric, "band-limited", "paper")
+        task = jm.settled(made(jm.Isometric, "band-limited", "paper"))
         return jm.ensemble(task, KEY, seeds=32, **TOGETHER).mean_spectrum()
 
     single = estimate()

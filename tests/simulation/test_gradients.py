@@ -65,7 +65,7 @@ def test_a_parameter_by_its_natural_name(x64):
     task = jm.Isometric()
 
     def last_force(k_w):
-        return jm.simulate(task.replace(k_w=k_w), KEY, duration=0.8).output[-1]
+        return jm.simulate(task.replace(k_w=k_w), KEY, duration=1.0).output[-1]
 
     slope = at_once(jax.grad(last_force), jnp.asarray(task["k_w"]))
     h = 1e-4 * task["k_w"]
