@@ -72,7 +72,7 @@ SMALL = 2e-3  # second order effects of this noise are 1e-5 of its power
 )
 def test_spectrum_of_a_linear_oscillator(x64, noise):
     task = oscillator(noise)
-    power = np.asarray(jm.ensemble(task, KEY, seeds=256, substeps=1).spectrum().power)
+    power = np.asarray(jm.ensemble(task, KEY, seeds=256, substeps=1, chunk=32).spectrum().power)
     expected = references.expected_welch(functools.partial(response, noise=task.noise))
     error = power.std(axis=0, ddof=1) / np.sqrt(len(power))
     assert np.all(error < 0.04 * expected)
