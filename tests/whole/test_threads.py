@@ -25,7 +25,7 @@ def expected(number):
 
 
 def simulated(number):
-    return np.asarray(jm.simulate(TASK, KEY, seed=number, duration=0.2).output)
+    return np.asarray(jm.simulate(TASK, KEY, seed=number).output)
 
 
 def reduced(number):
