@@ -420,7 +420,8 @@ def test_a_muscle_of_a_richer_model_takes_its_own_response_off():
 def test_a_line_in_the_fluctuations_is_fitted_though_noise_alone_passes():
     """Left out, it would move C_w0 and K_z0 by about one stated error. (Without one none is fitted: `minute`.)"""
     with without_intervals():
-        result = jm.fit(jm.PrescribedLength(), recorded(5, line=0.003), starts=8, check_seeds=0)
+        # Without the tremor, which is tried where a line is significant: tests/fits/test_rungs.py has it.
+        result = jm.fit(jm.PrescribedLength(), recorded(5, line=0.003), rungs=1, starts=8, check_seeds=0)
     before, after = result.ladder[:2]
     assert (before.model, after.number) == ("noise alone", 0) and before.p >= 0.01
     assert after.aic < before.aic - 2 and result.adequate
