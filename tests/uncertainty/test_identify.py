@@ -48,7 +48,7 @@ def fitted(task=TRUTH, free=DEFAULT_FREE, settings: dict[str, Any] | None = None
     """What a fit would give that found `task`, its target being the expected spectrum; nothing is fitted."""
     power = np.asarray(jm.expected_spectrum(task).proportional)
     quantity = "displacement" if task.output_unit == "m" else "force"
-    made = jm.Target("made", power, quantity=quantity, **({"segments": SEGMENTS} | target))
+    made = jm.Target("made", power, quantity=quantity, **({"segments": SEGMENTS, "settings": task.settings} | target))
     table = {
         "free": list(free), "residual": "log", "mean_force": None, "bounds": {}, "starts": 1, "dt": 1e-3,
         "prior_centre": {n: float(task[n]) for n in free}, "prior_sd": {n: PARAMETERS[n].prior_sd for n in free},

@@ -18,6 +18,7 @@ from test_identify import slopes as by_differences
 import jaxmuscle as jm
 from jaxmuscle.commands.design import design
 from jaxmuscle.data import FrequencyResponse
+from jaxmuscle.model._parameters import DEFAULT_FREE
 from jaxmuscle.objective._coordinates import Coordinates
 from jaxmuscle.objective._problem import FitProblem
 from jaxmuscle.uncertainty import Lengthening, _input_design
@@ -142,13 +143,14 @@ def test_two_moved_records_know_of_the_masses_once():
 @pytest.mark.slow
 def test_what_follows_from_the_spectrum_depends_on_the_masses_too(x64):
     """Slopes of the coefficient of variation and the highest bins by differences; a record of the motion measures both."""
-    made = Experiment.of(hold(), ("K_w0",), Lengthening.flat(1e-3, (0.5, 5.0), SECONDS), None)
+    task = jm.Isometric(settings=jm.SpectrumSettings(filter_direction="both")).replace(**VALUES)  # as bundled targets
+    made = Experiment.of(fitted(task), ("K_w0",), Lengthening.flat(1e-3, (0.5, 5.0), SECONDS), None)
     names = made.here.coordinates.names
     for name, read in {
         "coefficient_of_variation": lambda m: np.sqrt(m.variance) / m.mean,
         "high_frequency_floor": lambda m: m.proportional[-10:].mean(),
     }.items():
-        expected = by_differences(TRUTH, read, free=("m_w", "m_z"))
+        expected = by_differences(task, read, free=("m_w", "m_z"))
         sd = [jm.model.PARAMETERS[n].prior_sd for n in ("m_w", "m_z")]
         found = made.here.gradients[name][[names.index("m_w"), names.index("m_z")]]
         np.testing.assert_allclose(found, expected * sd, rtol=1e-3, atol=1e-5 * np.linalg.norm(made.here.gradients[name]))
@@ -460,12 +462,16 @@ def test_the_standard_designs_know_what_a_flat_motion_tells():
 @pytest.mark.slow
 def test_a_measured_stiffness_with_these_errors_tells_the_same(x64):
     """The likelihood of a fit and the information of a design are one."""
-    lengthening = Lengthening.flat(1e-3, BAND, SECONDS)
-    sd = np.sqrt(density(VALUES, lengthening.frequency) / (2 * SECONDS * lengthening.power))
+    # As many points, settings and free parameters as in tests/fits/test_perturbed_fit.py: one program.
+    lengthening = Lengthening.flat(1e-3, (0.4, 5.0), 10.0)
+    assert len(lengthening.frequency) == 47
+    sd = np.sqrt(density(VALUES, lengthening.frequency) / (2 * 10.0 * lengthening.power))
     measured = FrequencyResponse(lengthening.frequency, stiffness(VALUES, lengthening.frequency), sd)
-    found = {}
+    recorded = jm.SpectrumSettings(filter_direction="both", sampling="filtered")
+    task = jm.PrescribedLength(settings=recorded).replace(**VALUES)
+    free, found = (*DEFAULT_FREE, "P_w", "m_w", "m_z"), {}
     for given in (None, measured):
-        problem, theta = fitted_problem(fitted(stiffness=given), None)
+        problem, theta = fitted_problem(fitted(task, free, stiffness=given), None)
         found[given is None] = information_of(problem, seen_here(problem, theta))
     added = (found[False] - found[True])[:4, :4]
     expected = information(lengthening)
