@@ -36,9 +36,9 @@ test: .venv/.stamp-test
 	@$(BIN)/python tests/wings.py $(WING) >/dev/null
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
-	$(BIN)/basedpyright
 	$(BIN)/lint-imports
-	$(PYTEST) `$(BIN)/python tests/wings.py $(WING)`
+	@echo "$(BIN)/basedpyright, beside the tests: it takes one core for half a minute"
+	@$(BIN)/basedpyright & types=$$!; $(PYTEST) `$(BIN)/python tests/wings.py $(WING)`; tests=$$?; wait $$types && exit $$tests
 
 test-fast: .venv/.stamp-test
 	$(PYTEST) -m "not slow"

@@ -468,7 +468,7 @@ def test_a_noisy_drive_multiplies_the_activation(x64, time):
 
 
 @pytest.mark.slow
-def test_the_page_runs_as_written_and_its_fit_finds_the_muscle(monkeypatch):
+def test_the_page_runs_and_its_fit_finds_the_muscle(monkeypatch):
     """Every Python block of docs/own-muscle.md, in order, from the root of a checkout.
 
     Without the fit's nonlinear correction, simulated check and intervals: the notebook on own muscles has these.

@@ -59,7 +59,6 @@ IN_NOTEBOOKS = {
     "02-monte-carlo-ensemble": {"seeds=1000": "seeds=100"},
     pages.IN_A_KERNEL: {
         "plt.show()": "None",  # where there is no screen
-        "needed.output)": "np.asarray(needed.output))",  # types are checked here
     },
     "04-from-recording-to-parameters": {"target, starts=40": f"target, {FEW}"},
     "05-uncertainty-and-noise-colour": {

@@ -169,7 +169,9 @@ class Sampled(AbstractSignal):
         require(rising, "breaks must increase")
 
     @classmethod
-    def through(cls, times: Float[np.ndarray, " samples"], values: Float[np.ndarray, " samples"]) -> "Sampled":
+    def through(
+        cls, times: Float[Array | np.ndarray, " samples"], values: Float[Array | np.ndarray, " samples"]
+    ) -> "Sampled":
         """Spline through `values` at `times` [s], at least six, increasing. Raises `ValueError` otherwise."""
         times, values = np.asarray(times, dtype=float), np.asarray(values, dtype=float)
         if times.ndim != 1 or times.shape != values.shape or len(times) < 6:
