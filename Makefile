@@ -3,8 +3,7 @@ PYTHON ?= python3
 BIN = .venv/bin
 # Two workers, whatever the machine: each compiles a lot and takes up to 7 GiB.
 PYTEST = $(BIN)/python -m pytest -q -n 2 --dist loadfile --no-loadscope-reorder
-# Python compiles a module when it is first imported. pip would compile all of them at once, for half a minute.
-PIP = $(BIN)/python -m pip --quiet --disable-pip-version-check install --no-compile
+PIP = $(BIN)/python -m pip --quiet --disable-pip-version-check install
 
 .PHONY: help install fit notebooks test test-fast test-minimum mutants bench docs clean
 
@@ -70,7 +69,7 @@ clean:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
 	  { echo "error: jaxmuscle needs Python >= 3.11, but $(PYTHON) is $$($(PYTHON) --version 2>&1);" \
 	         "name another: make PYTHON=/path/to/python" >&2; exit 1; }
-	@echo "Installing jaxmuscle into .venv (half a minute or longer, as fast as the packages come)"
+	@echo "Installing jaxmuscle into .venv (a few minutes the first time)"
 	@$(PYTHON) -m venv .venv
 	@$(PIP) --upgrade pip
 	@$(PIP) --editable '.[all]'
