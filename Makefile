@@ -37,7 +37,7 @@ test: .venv/.stamp-test
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
 	$(BIN)/lint-imports
-	@echo "$(BIN)/basedpyright, beside the tests: it takes one core for half a minute"
+	@echo "$(BIN)/basedpyright (checks types while the tests begin)"
 	@$(BIN)/basedpyright & types=$$!; $(PYTEST) `$(BIN)/python tests/wings.py $(WING)`; tests=$$?; wait $$types && exit $$tests
 
 test-fast: .venv/.stamp-test

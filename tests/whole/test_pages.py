@@ -134,9 +134,10 @@ def write_tremor(path):
 
 
 def write_plain(path):
-    """The bundled spectrum as that of a signal low-passed once, by the usual settings: other tests ask the same about such.
+    """The bundled spectrum, as if its signal had been low-passed only once, as by the usual settings.
 
-    A program is made for the settings of a spectrum. What the pages say does not depend on these.
+    Every choice of settings has programs of its own, and other tests make those of the usual ones.
+    What the pages say is the same.
     """
     text = (pages.ROOT / "src/jaxmuscle/targets/vastus-lateralis-26mvc.toml").read_text(encoding="utf-8")
     bundled, settings = text.split("[settings]")
@@ -268,7 +269,7 @@ def test_own_data():
     assert pages.run("docs/fit-a-csv.md", {}, once)["target"].segments == (6,) * 10
     write_recordings()
     write_tremor("tremor.csv")
-    # With a tremor at once: the program of the fit that data/test_tremor.py makes.
+    # With a tremor at once: the program of the fit that fits/test_tremor.py makes.
     few = "rungs=0, starts=8, seeds=0, check_seeds=0"
     quick = {"jm.task_for(tremor), tremor": f"jm.on_rung(jm.task_for(tremor), 2), tremor, {few}",
              "held.target())\n": f"held.target(), {FEW})\n",
