@@ -73,7 +73,8 @@ def _compile_quickly(known: Path) -> None:
     less than half the time, run as fast, the same numbers to rounding; and each program in one piece, since a worker has
     one core.
 
-    An XLA that no longer has them ends the process at the flag: tried once for every version, in a process of its own.
+    An XLA that no longer has them ends the process at the flag: tried once for every version, in a process of its own. One
+    that ends for another reason is tried again the next time.
     """
     if os.environ.get("XLA_FLAGS"):
         return
@@ -83,8 +84,9 @@ def _compile_quickly(known: Path) -> None:
         tried = subprocess.run([sys.executable, "-c", "import jax; jax.devices()"], capture_output=True,
                                env=os.environ | {"XLA_FLAGS": QUICK_COMPILER})  # fmt: skip
         answer = f"{asked} {'understood' if tried.returncode == 0 else 'unknown'}"
-        known.parent.mkdir(parents=True, exist_ok=True)
-        known.write_text(answer, encoding="utf-8")
+        if tried.returncode == 0 or b"XLA_FLAGS" in tried.stderr:
+            known.parent.mkdir(parents=True, exist_ok=True)
+            known.write_text(answer, encoding="utf-8")
     if answer.endswith("understood"):
         os.environ["XLA_FLAGS"] = QUICK_COMPILER
 

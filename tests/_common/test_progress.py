@@ -1,6 +1,7 @@
 """Progress: a function, silence, or lines every so often where there is no terminal, also while nothing is told."""
 
 import logging
+import queue
 import time
 
 import pytest
@@ -11,7 +12,16 @@ from jaxmuscle._common.progress import nothing, told
 
 @pytest.fixture
 def quick(monkeypatch):
+    """Lines come every 20 ms. What to wait for one with: it and when it was said."""
+    said, say = queue.SimpleQueue(), progress._say
+
+    def heard(line):
+        say(line)
+        said.put((line, time.monotonic()))
+
     monkeypatch.setattr(progress, "EVERY", 0.02)
+    monkeypatch.setattr(progress, "_say", heard)
+    return lambda: said.get(timeout=60)
 
 
 def test_a_function_is_called_and_its_share_never_falls():
@@ -28,14 +38,17 @@ def test_lines_go_on_while_nothing_is_told(quick, capfd, monkeypatch):
     monkeypatch.setattr(progress.LOG, "hasHandlers", lambda: False)
     with told(True, "fitting x") as tell:
         tell("compiling", 0.25)
-        time.sleep(0.2)
-    lines = capfd.readouterr().err.splitlines()
-    assert 3 <= len(lines) <= 10 and all(line.startswith("fitting x: 25 %, compiling (") for line in lines)
+        while quick()[0].startswith("fitting x: 0 %, starting"):  # where 20 ms had passed before anything was told
+            pass
+        whole = [quick() for _ in range(3)]
+    assert all(line.startswith("fitting x: 25 %, compiling (") for line, _ in whole)
+    assert whole[-1][1] - whole[0][1] > 1.9 * 0.02  # twice 20 ms at least, however slow the machine is
+    assert {line for line, _ in whole} <= set(capfd.readouterr().err.splitlines())
 
 
 def test_lines_go_through_logging_where_it_is_set_up(quick, caplog, capfd):
     with caplog.at_level(logging.INFO, "jaxmuscle"), told(True, "fitting x"):
-        time.sleep(0.1)
+        quick()
     assert "fitting x: 0 %, starting" in caplog.text and not capfd.readouterr().err
 
 

@@ -485,7 +485,7 @@ def test_threads_change_nothing(tmp_path, monkeypatch, threads):
     swept = jm.ensemble(points, KEY, reduce=True, threads=1, **sweep)
     slow = Slow(monkeypatch, 6 if threads > 1 else 0)
     np.testing.assert_array_equal(jm.ensemble(TASK, KEY, threads=threads, **given).output, whole.output)
-    assert slow.most == threads
+    assert slow.most == _batch.threads_of(threads)  # fewer in versions of JAX whose threads wait for one another
     for given_store in ({}, {"store": tmp_path / "a.zarr"}):
         found = jm.ensemble(TASK, KEY, reduce=True, threads=threads, **given, **given_store)
         for name, (_, values, _) in found.arrays().items():
@@ -642,7 +642,7 @@ jm.ensemble(jm.Isometric(), jax.random.key(5), seeds=1600, duration=1.0, chunk=8
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["trajectories", "reduced"])
-def test_kill_9_six_times(tmp_path, kind):
+def test_kill_9_four_times(tmp_path, kind):
     """Each time at a random moment after it goes on; the end is that of an uninterrupted run."""
     path, rng, kills = tmp_path / "runs.zarr", random.Random(kind), 0
     while kills < 4:

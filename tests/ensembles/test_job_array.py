@@ -14,7 +14,7 @@ import jax
 import numpy as np
 import pytest
 import xarray
-from processes import Run, command, ended
+from processes import Run, command, ended, python
 from test_ensemble import BRITTLE, KEY, RUNNER, SHORT, TASK, Stop, close, stopped_after
 
 import jaxmuscle as jm
@@ -253,7 +253,10 @@ def test_what_cannot_be_merged(tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize("reduce", [False, True], ids=["trajectories", "reduced"])
 def test_parts_killed_at_random_end_as_one_run(tmp_path, monkeypatch, reduce):
-    """Two of the trials of benchmarks/kills.py, which has twenty, of more seeds. Killed before one part alone would end."""
+    """Two of the trials of benchmarks/kills.py, which has twenty, of more seeds. Killed before one part alone would end.
+
+    More where none came early, as may happen on a machine that is now slow, now fast.
+    """
     monkeypatch.syspath_prepend(str(Path(__file__).parents[2] / "benchmarks"))
     import kills
 
@@ -261,12 +264,15 @@ def test_parts_killed_at_random_end_as_one_run(tmp_path, monkeypatch, reduce):
     monkeypatch.setitem(kills.OPTIONS, "seeds", 1600)
     monkeypatch.setattr(kills, "PARTS", 3)
     one, rng = kills.whole(reduce), random.Random(int(reduce))  # compiles what the parts load
+    ended(python("pass"))  # the first process of all waits for imports
     start = time.monotonic()
     kills.ended([kills.begun(tmp_path / "a.zarr", reduce, part=(1, kills.PARTS))])
-    longest = 0.6 * (time.monotonic() - start)
-    trials = [kills.parts(tmp_path / f"{number}.zarr", reduce, rng, longest) for number in range(2)]
-    assert [kills.equal(found, one, reduce) for found, _ in trials] == [True] * 2
-    assert any(early for _, early in trials), "nothing was interrupted: the test shows nothing"
+    longest, early, number = 0.6 * (time.monotonic() - start), False, 0
+    while number < 2 or (not early and number < 12):
+        found, at_once = kills.parts(tmp_path / f"{number}.zarr", reduce, rng, longest)
+        assert kills.equal(found, one, reduce)
+        early, number = early or at_once, number + 1
+    assert early, "nothing was interrupted: the test shows nothing"
 
 
 def started(part, out):

@@ -12,7 +12,7 @@ NAMES = ("chromium", "chromium-browser", "google-chrome")
 FLAGS = (
     "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-component-update",
     "--disable-background-networking", "--disable-sync", "--remote-debugging-pipe", "--hide-scrollbars",
-    "--disable-dev-shm-usage",
+    "--disable-dev-shm-usage", "--allow-pre-commit-input",
 )  # fmt: skip
 FOUND = next((path for path in map(shutil.which, NAMES) if path), None)
 
@@ -35,6 +35,7 @@ class Browser:
         self.session = found["sessionId"]
         for domain in ("Page", "Runtime", "Network"):
             self.send(f"{domain}.enable")
+        self.send("Page.setLifecycleEventsEnabled", enabled=True)
 
     def send(self, method: str, **parameters: Any) -> dict[str, Any]:
         """The answer to a command; what happens meanwhile is kept in `events`."""
@@ -58,10 +59,20 @@ class Browser:
         return json.loads(text)
 
     def open(self, url: str) -> None:
-        """Opens a page and waits until its script has run."""
+        """Opens a page and waits until its script has run and it is on the screen: earlier keys are lost.
+
+        What is asked before it is loaded would go to the page before it.
+        """
         self.send("Page.navigate", url="about:blank")
-        self.send("Page.navigate", url=url)
+        loader = self.send("Page.navigate", url=url)["loaderId"]
+        self.hear_of("Page.lifecycleEvent", loaderId=loader, name="load")
         self.wait("window.explorer && window.explorer.state")
+        self.run("new Promise((yes) => requestAnimationFrame(() => requestAnimationFrame(yes)))")
+
+    def hear_of(self, method: str, **parameters: Any) -> None:
+        """Waits until an event with these parameters has come."""
+        while not any(e.get("method") == method and parameters.items() <= e["params"].items() for e in self.events):
+            self.events.append(self._next())
 
     def run(self, code: str) -> Any:
         """The value of an expression, waited for if it is a promise."""
@@ -96,7 +107,10 @@ class Browser:
     def close(self) -> None:
         """Ends it."""
         self.process.terminate()
-        self.process.wait(timeout=20)
+        try:
+            self.process.wait(timeout=20)
+        except subprocess.TimeoutExpired:
+            self.process.kill()
         shutil.rmtree(Path(self.profile), ignore_errors=True)
 
 

@@ -7,6 +7,7 @@ digest). With node: JavaScript reproduces the table. With Chromium: the page its
 import json
 import re
 import shutil
+import time
 from pathlib import Path
 
 import cases
@@ -264,10 +265,10 @@ def test_the_saved_preset_and_the_link_hold_what_is_seen(page, tmp_path, x64):
     page.send("Page.setDownloadBehavior", behavior="allow", downloadPath=str(tmp_path))
     page.run("document.getElementById('save').click()")
     saved = tmp_path / "explored.json"
-    for _ in range(200):
-        if saved.exists():
-            break
+    end = time.monotonic() + 60
+    while not saved.exists() and time.monotonic() < end:
         page.run("new Promise((yes) => setTimeout(yes, 25))")
+    assert saved.exists(), "the browser has saved nothing in a minute"
     task = jm.load_preset(saved)
     assert task["k_w"] == 612345.6 and task["activation_time"] == 0.06 and "resonance_width" in task.parameter_names
     seen = power_in(page)

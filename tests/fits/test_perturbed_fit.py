@@ -153,8 +153,8 @@ def test_further_questions_take_it(result):
     low, high = result["k_z"].interval
     np.testing.assert_allclose((profile.low, profile.high), (low, high), rtol=0.02)
     checked = jm.goodness(result, replicates=99)
-    assert checked.p_value > 0.001 and set(checked.observed) == {"chi2_per_bin", "runs", "largest", "chi2_per_point",
-                                                                 "largest_point"}  # fmt: skip
+    assert checked.p_value > 0.01  # the least that 99 replicates can give, if none is as far off
+    assert set(checked.observed) == {"chi2_per_bin", "runs", "largest", "chi2_per_point", "largest_point"}
     assert checked.observed["chi2_per_point"] == pytest.approx(result.only.chi2_per_point)
     words = " ".join(str(checked).split())
     assert "99 spectra and dynamic stiffnesses that were drawn from the fit" in words and "all five together" in words

@@ -167,9 +167,10 @@ def rises(density, centre, steps):
 
 
 @pytest.mark.slow
-def test_the_posterior_of_two_targets(tmp_path):
+def test_the_posterior_of_two_targets(tmp_path, monkeypatch):
     joint = both()
-    found = jm.posterior(joint, key=1, chains=2, draws=500, warmup=200)
+    monkeypatch.setattr("jaxmuscle.uncertainty._posterior.DRAWS", (500, 1500))
+    found = jm.posterior(joint, key=1, chains=2, warmup=200)
     assert found.success, found.message
     assert set(found.parts) == {"low", "high"} and set(found.samples) == set(FREE)
     summary = found.summary()
