@@ -53,8 +53,10 @@ def test_pipeline_equals_scipy(rate):
     np.testing.assert_allclose(part.target().proportional_power, p, rtol=EXACT)
 
 
-def test_fft_equals_scipy():
-    x, window = noisy(rate=1000), (2.0, 19.0)
+@pytest.mark.parametrize("window", [(2.0, 19.0), (2.0, 12.24)], ids=["bins of its own", "ends of the settings"])
+def test_fft_equals_scipy(window):
+    """Of 10.24 s the fourth and the 120th frequency are the first and the last of the settings: both belong to it."""
+    x = noisy(rate=1000)
     fft = Recording(x, 1000).steady(window).fft_spectrum()
     frequency, power = scipy.signal.periodogram(by_scipy(x, window, 1000)[2], 100, window="hann")
     inside = (frequency > 0.390624) & (frequency < 11.71876)

@@ -153,6 +153,16 @@ def test_the_error_of_one_mean_is_that_of_noise_with_its_lowest_bin():
     assert two.mean_force[1] == pytest.approx(error / np.sqrt(2), rel=1e-12)  # twice the time
 
 
+@pytest.mark.parametrize("lacking", ["segments", "coefficient_of_variation"])
+def test_the_error_of_a_mean_without_what_it_follows_from_is_two_per_cent(lacking):
+    given = {"segments": (6,), "coefficient_of_variation": (0.1,)}
+    (_, whole), (force, error) = (
+        jm.Target("x", np.ones(30), mean=(20.0,), unit="N", **each).mean_force
+        for each in (given, {name: value for name, value in given.items() if name != lacking})
+    )
+    assert (force, error) == (20.0, pytest.approx(0.4)) and whole != pytest.approx(0.4, rel=0.1)
+
+
 @pytest.mark.parametrize("count", [3, 5, 10])
 def test_the_error_by_the_scatter_of_trials_has_students_t(count):
     """± 1.96 of it hold the mean in 95 %. It counts where it is larger than what is expected."""

@@ -290,6 +290,17 @@ def test_tapers_that_do_not_fit():
             SpectrumSettings(length=64, window="dpss", tapers=count)
 
 
+def test_a_table_may_lack_its_tapers_and_no_other_setting():
+    table = SpectrumSettings(detrend="linear").to_dict()
+    assert SpectrumSettings.from_dict(table, needed=SpectrumSettings.names(whole=False)).detrend == "linear"
+    for name in table:
+        less = {key: value for key, value in table.items() if key != name}
+        with pytest.raises(ValueError, match=f"has no key '{name}'"):
+            SpectrumSettings.from_dict(less, needed=SpectrumSettings.names(whole=False))
+    with pytest.raises(ValueError, match="has no key 'tapers'"):
+        SpectrumSettings.from_dict(table, needed=SpectrumSettings.names())
+
+
 def test_names():
     for name in NAMED:
         chosen = SpectrumSettings.named(name)
