@@ -183,6 +183,15 @@ def test_theta_counts_standard_deviations_of_the_prior(x64):
         np.testing.assert_allclose(values[name], expected, rtol=1e-14)
 
 
+def test_a_frequency_with_a_prior_of_its_own_comes_back():
+    """A grid of frequencies is laid in coordinates: half a standard deviation of 0.2 in the log is `exp(0.1)`."""
+    made = Coordinates(("c_w", "harmonic_frequency"), np.array([60.0, 6.0]), np.array([1.0, 0.2]), np.array([True, True]),
+                       np.full(2, -np.inf), np.full(2, np.inf))  # fmt: skip
+    found = made.theta_of("harmonic_frequency", 6.0 * np.exp([0.0, 0.1]))
+    np.testing.assert_allclose(found, [0.0, 0.5], atol=1e-14)
+    np.testing.assert_allclose(made.values_of(np.array([[0.0, 0.5]]))[0, 1], 6.0 * np.exp(0.1), rtol=1e-14)
+
+
 @pytest.mark.slow
 @given(theta=st.lists(st.floats(-0.8, 0.8), min_size=5, max_size=5))
 def test_from_theta_is_the_reverse_of_theta(theta):
