@@ -404,6 +404,7 @@ BAD_FILES = {
     "names only": ("f.csv", "a,\nX,Y\n", {}, "holds no points"),
     "negative": ("f.csv", "a,\nX,Y\n0.4,0.5\n0.8,-0.1\n", {}, "line 4: proportional_power -0.1 must be finite"),
     "log10 not said": ("f.csv", "-0.4,-0.5\n0.3,-1.1\n", {}, "give axis='log-log' (--axis log-log)"),
+    "log10 not said, of a power of 1": ("f.csv", "0.4,0\n0.8,-0.5\n", {}, "give axis='log-log' (--axis log-log)"),
     "no log10": ("f.csv", "0.4,0.5\n600,0.1\n", {"axis": "log-log"}, "line 2: log10 of the frequency is 600"),
     "header": ("f.csv", "frequency_hz,proportional_power\n0.4,1\n", {"axis": "log-log"}, "states frequency in Hz and power"),
     "no datasets": ("f.csv", "0.4,1\n0.8,1\n", {"dataset": "a"}, "has no named datasets"),
