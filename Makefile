@@ -3,9 +3,7 @@ PYTHON ?= python3
 BIN = .venv/bin
 # Two workers, whatever the machine: each compiles a lot and takes up to 7 GiB.
 PYTEST = $(BIN)/python -m pytest -q -n 2 --dist loadfile --no-loadscope-reorder
-PIP = $(BIN)/python -m pip --quiet --disable-pip-version-check install --no-compile
-# What pip would do, on all cores at once. A file that cannot be compiled (some packages bring such tests) is no error there.
-COMPILE = $(BIN)/python -m compileall -qq -j 0 .venv/lib || true
+PIP = $(BIN)/python -m pip --quiet --disable-pip-version-check install
 
 .PHONY: help install fit notebooks test test-fast test-minimum mutants bench docs clean
 
@@ -75,32 +73,27 @@ clean:
 	@$(PYTHON) -m venv .venv
 	@$(PIP) --upgrade pip
 	@$(PIP) --editable '.[all]'
-	@$(COMPILE)
 	@$(BIN)/python -m compileall -q src
 	@touch $@
 
 .venv/.stamp-notebooks: .venv/.stamp-run
 	@echo "Installing JupyterLab into .venv"
 	@$(PIP) --editable '.[notebooks]'
-	@$(COMPILE)
 	@touch $@
 
 .venv/.stamp-test: .venv/.stamp-run
 	@echo "Installing the test tools into .venv"
 	@$(PIP) --group test
-	@$(COMPILE)
 	@touch $@
 
 .venv/.stamp-bench: .venv/.stamp-run
 	@echo "Installing the benchmark tools into .venv"
 	@$(PIP) --group bench
-	@$(COMPILE)
 	@touch $@
 
 .venv/.stamp-docs: .venv/.stamp-run
 	@echo "Installing the documentation tools into .venv"
 	@$(PIP) --group docs
-	@$(COMPILE)
 	@touch $@
 
 .venv-minimum/.stamp: pyproject.toml
