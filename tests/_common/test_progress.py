@@ -12,7 +12,7 @@ from jaxmuscle._common.progress import nothing, told
 
 @pytest.fixture
 def quick(monkeypatch):
-    """Lines come every 20 ms. What to wait for one with: it and when it was said."""
+    """Lines come every 20 ms. Gives a function that waits for the next line, and returns it and when it was said."""
     said, say = queue.SimpleQueue(), progress._say
 
     def heard(line):

@@ -485,7 +485,7 @@ def test_threads_change_nothing(tmp_path, monkeypatch, threads):
     swept = jm.ensemble(points, KEY, reduce=True, threads=1, **sweep)
     slow = Slow(monkeypatch, 6 if threads > 1 else 0)
     np.testing.assert_array_equal(jm.ensemble(TASK, KEY, threads=threads, **given).output, whole.output)
-    assert slow.most == _batch.threads_of(threads)  # fewer in versions of JAX whose threads wait for one another
+    assert slow.most == threads or jax.__version__ in _batch.WAITING  # where they may be fewer
     for given_store in ({}, {"store": tmp_path / "a.zarr"}):
         found = jm.ensemble(TASK, KEY, reduce=True, threads=threads, **given, **given_store)
         for name, (_, values, _) in found.arrays().items():

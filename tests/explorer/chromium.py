@@ -59,9 +59,9 @@ class Browser:
         return json.loads(text)
 
     def open(self, url: str) -> None:
-        """Opens a page and waits until its script has run and it is on the screen: earlier keys are lost.
+        """Opens a page and waits until it is loaded, its script has run and it is on the screen.
 
-        What is asked before it is loaded would go to the page before it.
+        What is asked before it is loaded would go to the page before it. Keys before it is on the screen would be lost.
         """
         self.send("Page.navigate", url="about:blank")
         loader = self.send("Page.navigate", url=url)["loaderId"]
@@ -111,6 +111,7 @@ class Browser:
             self.process.wait(timeout=20)
         except subprocess.TimeoutExpired:
             self.process.kill()
+            self.process.wait()
         shutil.rmtree(Path(self.profile), ignore_errors=True)
 
 
