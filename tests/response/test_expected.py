@@ -22,7 +22,7 @@ from jaxmuscle.objective._problem import target_variation
 from jaxmuscle.response._autocovariance import Autocovariance
 from jaxmuscle.response._expected import covariance_operator, expected_moments, expected_powers, lags_of, linear_spectrum
 from jaxmuscle.response._harmonic_line import _ordinates, line_table
-from jaxmuscle.response._linearised import has_response, linearised
+from jaxmuscle.response._linearised import check_equilibrium, has_response, linearised
 from jaxmuscle.response._transfer import system_of, transfer
 from jaxmuscle.spectra._bin_law import bin_rows
 from jaxmuscle.spectra._decimation import FINER
@@ -785,6 +785,16 @@ def test_what_has_no_linear_response(x64, name):
         has_response(task, required=True)
     assert not has_response(task, required=False)
     assert has_response(jm.Isometric(), required=True)
+
+
+def test_an_undamped_motion_beside_a_fast_decay_is_told_from_rounding():
+    # ± 1i/s beside -1e5/s: rounding gives the oscillation a real part of about 1e-16 times 1e5/s, of either sign.
+    rng = np.random.default_rng(3)
+    for _ in range(8):
+        turned = np.linalg.qr(rng.standard_normal((3, 3)))[0]
+        A = turned @ np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, -1e5]]) @ turned.T
+        with pytest.raises(jm.errors.OperatingPointError, match="is undamped"):
+            check_equilibrium(jm.Isometric(), np.zeros(3), A)
 
 
 @pytest.mark.slow

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import jaxmuscle as jm
-from jaxmuscle.response._characteristics import static_characteristics
+from jaxmuscle.response._characteristics import StaticCharacteristics, static_characteristics
 
 EXACT = {"rtol": 1e-12, "atol": 1e-12}
 
@@ -110,6 +110,17 @@ def test_the_figure_has_units_a_legend_and_the_callers_axes():
     assert all(ax.get_legend() is not None for ax in axes)
     with pytest.raises(ValueError, match="ax has 2 axes: give three"):
         seen.plot(given[:2])
+    plt.close(figure)
+
+
+@pytest.mark.parametrize(("P_w", "count"), [(0.0, 1), (1.0, 2), (float("nan"), 1)])
+def test_the_force_under_a_drive_is_drawn_where_there_is_one(P_w, count):
+    x = np.linspace(0.0, 0.01, 5)
+    names = {field.name for field in dataclasses.fields(StaticCharacteristics)}
+    seen = StaticCharacteristics(**dict.fromkeys(names, x) | {"P_w": P_w, "x_w": 0.002, "x_z": 0.0})
+    figure, given = plt.subplots(1, 3)
+    seen.plot(given)
+    assert sum(str(line.get_label()).startswith("$F_\\mathrm{ext}$") for line in given[2].lines) == count
     plt.close(figure)
 
 

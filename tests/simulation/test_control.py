@@ -14,6 +14,7 @@ from jaxmuscle.response._expected import linear_spectrum
 from jaxmuscle.response._linearised import LinearTask, linearised
 from jaxmuscle.simulation._batch import respond
 from jaxmuscle.simulation._grid import Grid
+from jaxmuscle.simulation._simulate import companion
 
 KEY = jax.random.key(41)
 WINDOW = (5.0, 15.0)
@@ -209,6 +210,18 @@ def test_where_control_cannot_be(name):
     task, options, message = IMPOSSIBLE[name]
     with pytest.raises(ValueError, match=message):
         jm.ensemble(task, KEY, seeds=2, control=True, **options)
+
+
+def test_slow_beside_fast_motion_is_damped_also_in_single_precision():
+    # In single precision the slow rate would be lost in the rounding of the fast one, which is 30,000 times as large.
+    c, m, k, ref = 3000.0, 0.5, 5e5, 0.02
+    found = companion(jm.settled(jm.Isometric(5.0, 0.0).replace(c_w=c)), 15.0, required=True)
+    x = np.roots([k, 0.0, 2 * k * ref**2, -5.0])  # P_w = 5 N against k (x_ref² + x²) x and, at x_z = 0, k x_ref² x
+    stretch = x[np.abs(x.imag) < 1e-12].real[0]
+    stiffness, damping = k * (2 * ref**2 + 3 * stretch**2), c + 5.0
+    expected = np.roots([m, damping, stiffness]).real  # of m x'' + C x' + K x = 0
+    assert found is not None
+    np.testing.assert_allclose(np.sort(np.linalg.eigvals(found.system.A).real), np.sort(expected), rtol=1e-9)
 
 
 @pytest.mark.slow
