@@ -283,6 +283,10 @@ REFUSED = {
     ),
     "signal short": (lambda: Recording(GOOD[:200], 100).spectrum(), "one segment needs 256"),
     "fft short": (lambda: Recording(GOOD[:7], 100).fft_spectrum(), "is too short for a spectrum"),
+    "fft without bins": (
+        lambda: Recording(GOOD[:100], 100).fft_spectrum(SpectrumSettings(last_bin=1)),  # 0.39 Hz: less than once in 1 s
+        "is too short for a spectrum",
+    ),
     "flat window": (
         lambda: Recording(np.append(np.zeros(900), GOOD), 100).steady((0, 8)).spectrum(),
         "is constant in the window (0.0, 8.0)",

@@ -55,6 +55,11 @@ def close(a, b, rtol=1e-6):
 # Tallies
 
 
+@pytest.mark.parametrize(("seeds", "count"), [(1, 1), (128, 1), (1024, 1), (1025, 2), (4096, 4)])
+def test_seeds_fit_into_so_many_blocks(seeds, count):
+    assert _batch.blocks(seeds, 1024) == count
+
+
 @pytest.mark.parametrize("pieces", [1, 3, 40])
 def test_merged_moments_are_those_of_the_whole(pieces):
     """Also far from zero, where sums of squares would have lost all digits."""

@@ -47,14 +47,18 @@ def people():
 GROUPS = {f"person{n}": "old" if n % 2 else "young" for n in range(PEOPLE)}
 
 
+SHARES: list[float] = []
+
+
 @functools.cache
 def cohort():
-    return jm.fit_cohort(people(), groups=GROUPS, starts=16)
+    return jm.fit_cohort(people(), groups=GROUPS, starts=16, progress=lambda _text, share: SHARES.append(share))
 
 
 @pytest.mark.slow
 def test_what_the_data_determine_is_recovered():
     found = cohort()
+    assert len(set(SHARES)) > PEOPLE and max(SHARES) <= 1 + 1e-9
     assert found.success and list(found.results) == [t.name for t in people()]
     deviations = []
     for number, result in enumerate(found.results.values()):

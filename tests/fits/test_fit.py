@@ -733,7 +733,9 @@ def test_a_fit_is_in_double_precision_whatever_the_callers():
 @pytest.mark.slow
 def test_progress_is_told_up_to_the_end():
     told = []
-    jm.fit(jm.Isometric(), simple_target(), free=FEW, key=0, progress=lambda *a: told.append(a), **QUICK)
+    found = jm.fit(jm.Isometric(), simple_target(), free=FEW, key=0, progress=lambda *a: told.append(a), **QUICK)
+    held = found.derived["harmonic_frequency"]  # it follows from what is fixed alone
+    assert not held.free and held.stderr is None and held.identifiable is None
     shares = [share for _, share in told]
     assert shares == sorted(shares) and shares[0] == 0 and shares[-1] == 1
     for stage in ("searching from all starting points, misfit", "correcting by simulation"):

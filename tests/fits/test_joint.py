@@ -22,7 +22,7 @@ from jaxmuscle.objective._coordinates import task_at
 from jaxmuscle.objective._covariance import common_scales, identifiability
 from jaxmuscle.objective._derived import derived
 from jaxmuscle.objective._residuals import Residuals
-from jaxmuscle.objective._starts import starting_points
+from jaxmuscle.objective._starts import distinct, starting_points
 
 TRUTH = jm.Isometric().replace(k_w=3.5e5, k_z=7e5, c_w=80.0, harmonic_frequency=5.0, harmonic_amplitude=0.012)
 SEEDS = 24
@@ -278,6 +278,10 @@ def test_starts_are_at_the_maxima_of_all_targets(x64):
             assert np.min(np.abs(frequency - maximum)) < 0.5 * BIN
             assert len(np.unique(np.round(frequency, 6))) == 32
         np.testing.assert_array_equal(np.asarray(c.theta(starts))[0, :4], 0.0)
+        apart = np.zeros((2, len(c.names)))
+        apart[1, c.names.index(name)] = 1.0  # in one frequency, of whichever target, is enough
+        assert distinct(problem, np.zeros(2), apart, BIN, 1.0) == [0, 1]
+        assert distinct(problem, np.zeros(2), 0 * apart, BIN, 1.0) == [0]
 
 
 def test_directions_of_single_targets_are_named():

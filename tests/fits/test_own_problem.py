@@ -9,6 +9,7 @@ import scipy
 from compiled import at_once, kept_jit
 
 import jaxmuscle as jm
+from jaxmuscle.objective._coordinates import Coordinates
 
 TARGET = jm.load_target("vastus-lateralis-26mvc")
 TASK = jm.task_for(TARGET)
@@ -135,6 +136,14 @@ def test_a_theta_of_another_shape_is_refused(problem):
         with pytest.raises(ValueError, match=said):
             problem._scaled(wrong)  # of all methods, which the tests' type checker guards by itself
     assert at_once(jax.vmap(problem.log_prior), many).shape == (5,)
+
+
+def test_bounds_are_counted_in_standard_deviations_of_the_prior():
+    found = Coordinates.of(
+        {"k_w": 5e5, "x_z": 0.001}, {"k_w": (1e5, 2e6), "x_z": (-0.003, 0.002)}, {"k_w": 0.5, "x_z": 0.01}
+    )
+    np.testing.assert_allclose(found.low, [np.log(0.2) / 0.5, -0.4], rtol=1e-12)
+    np.testing.assert_allclose(found.high, [np.log(4.0) / 0.5, 0.1], rtol=1e-12)
 
 
 @pytest.mark.slow

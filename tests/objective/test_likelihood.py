@@ -17,8 +17,10 @@ from jaxmuscle._common.arrays import as_arrays
 from jaxmuscle.objective._arguments import FitOptions, planned
 from jaxmuscle.objective._covariance import residual_covariance
 from jaxmuscle.objective._likelihood import _gamma_level, likeliest_offset, log_density, log_marginal, measured_bins
+from jaxmuscle.objective._problem import target_variation
 from jaxmuscle.response._expected import expected_moments
-from jaxmuscle.spectra._bin_law import bin_rows, welch_law
+from jaxmuscle.spectra._bin_law import bin_rows, trial_samples, welch_law
+from jaxmuscle.spectra._settings import WINDOW
 
 SEGMENTS = 6
 
@@ -199,6 +201,20 @@ def recording():
     seconds = 60.0
     runs = jm.ensemble(jm.settled(jm.Isometric()), jax.random.key(3), seeds=1, duration=5 + seconds, control=False)
     return jm.Recording(np.asarray(runs.output[0]), 100, window=(5, 5 + seconds))
+
+
+@pytest.mark.slow
+def test_a_coefficient_of_variation_adds_its_gaussian_density():
+    target = jm.load_target("vastus-lateralis-26mvc")
+    bare = jm.Target("the spectrum", target.proportional_power, segments=target.segments)
+    task = jm.settled(jm.Isometric(settings=bare.settings))
+    moments = expected_moments(as_arrays(task), bare.settings, WINDOW, trial_samples(bare))[0]
+    for measured in (0.01, 0.03):
+        data = jm.Target("both", target.proportional_power, segments=target.segments, coefficient_of_variation=measured)
+        logs, sd = target_variation(data, task)
+        density = scipy.stats.norm.logpdf(np.log(moments.variation), np.log(measured), sd) + 0.5 * np.log(2 * np.pi)
+        assert logs == pytest.approx(np.log(measured))
+        assert float(jm.log_likelihood(task, data) - jm.log_likelihood(task, bare)) == pytest.approx(density, rel=1e-6)
 
 
 @pytest.mark.slow

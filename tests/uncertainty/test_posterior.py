@@ -30,6 +30,7 @@ from jaxmuscle.response._transfer import harmonic_system
 from jaxmuscle.uncertainty._chains import Chains, sample
 from jaxmuscle.uncertainty._posterior_checks import diagnosed, modes_of, verdict
 from jaxmuscle.uncertainty._posterior_density import density_about
+from jaxmuscle.uncertainty._profile import _in_words
 
 FREE = ("c_w", "noise_K_z", "harmonic_amplitude", "harmonic_frequency")
 
@@ -223,6 +224,15 @@ def sloppy():
     target = jm.load_target("vastus-lateralis-26mvc")
     with without_intervals():
         return jm.fit(jm.task_for(target), target, starts=8, check_seeds=0, rungs=0)
+
+
+@pytest.mark.parametrize(
+    ("ends", "words"),
+    [((None, None), "open"), ((None, 2.0), "below 2 N (open downwards)"), ((1.0, None), "above 1 N (open upwards)"),
+     ((1.0, 2.0), "1 to 2 N")],
+)  # fmt: skip
+def test_an_interval_says_which_end_is_open(ends, words):
+    assert _in_words(*ends, " N") == words
 
 
 @pytest.mark.slow
